@@ -9,6 +9,7 @@ process; age is how much older a smoothed pose is, when it arrives, than the new
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -29,7 +30,7 @@ from benchmarks.nodes import PROFILE
 from hmt_ros.app import make_bag
 from hmt_ros.app.bag_scores import score_bag
 from hmt_ros.app.replay import command as replay
-from hmt_ros.app.replay.live_node import LiveNode
+from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
 from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER
 from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment, environment
 from hmt_ros.app.truth import read_truth
@@ -37,7 +38,7 @@ from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from msg_tools import BagWriter
+from msg_tools import BagReader, BagWriter
 from msg_tools.messages.headers import stamp_in
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
@@ -52,6 +53,7 @@ PATIENCE = 3.0  # s, after the last image
 OLDEST = 1.0  # s, of a smoothed pose
 # Standard deviation of keypoints, as a share of the height of the person in the image.
 NOISE = 0.01
+PERSON, TRACKED_INTERVAL = 'person_node', 0.2
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
@@ -64,6 +66,8 @@ class Case:
         transport: of the images.
         room: whether Fast DDS has room for raw images.
         keypoints: whether there are any; then there is no BME.
+        together: whether the nodes run in one process.
+        smoothed: whether there is a smoother.
         filter, bme: parameters that are not the usual ones.
     """
 
@@ -71,6 +75,8 @@ class Case:
     transport: str = 'raw'
     room: bool = True
     keypoints: bool = False
+    together: bool = False
+    smoothed: bool = True
     filter: Mapping[str, Any] = field(default_factory=dict)
     bme: Mapping[str, Any] = field(default_factory=dict)
 
@@ -82,6 +88,12 @@ CASES = {
     'compressed': Case('JPEG', transport='compressed'),
     'gravity': Case('gravity given', filter={'gravity': (0.0, 1.0, 0.0)}),
     'keypoints': Case('images and keypoints', keypoints=True),
+    'together': Case('one process', together=True),
+    'together, filter': Case('one process, filter and experts', together=True, smoothed=False),
+    'together, keypoints': Case('one process, keypoints', keypoints=True, together=True),
+    'together, keypoints, filter': Case(
+        'one process, keypoints, filter alone', keypoints=True, together=True, smoothed=False
+    ),
     'usual DDS': Case('without fastdds.xml', room=False),
 }
 OFFLINE = {'offline': 'offline, every image', 'upright': 'offline, gravity given'}
@@ -132,7 +144,9 @@ def offline(clip: Path, target: Path, *given: str) -> dict[str, Any]:
 
 def _errors(bag: Path, truth: Truth) -> dict[str, Any]:
     """Errors of the mixtures in a bag, mm."""
-    found = score_bag(bag, truth, topics=[POSTERIOR, SMOOTHED])
+    with BagReader(bag) as opened:
+        topics = [x for x in (POSTERIOR, SMOOTHED) if opened.topics[f'/{x}'].message_count]
+    found = score_bag(bag, truth, topics=topics)
     return {
         name.strip('/'): {
             what: scores.scores.summary()[what] for what in ('heaviest_mm', 'best_mm')
@@ -162,16 +176,23 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
         nodes = _nodes(player, opened, clip, case)
         for node in nodes:
             node.wait_until_active()
+        processes = list({node.process.pid: node for node in nodes}.values())
         arrived = _listen(player)
         told = [str(_detections(clip, truth))] if case.keypoints else []
-        camera = _Camera(opened, player.domain, clip, case.transport, len(truth.joints), told)
+        camera = _Camera(
+            opened, player.domain, clip, case.transport, len(truth.joints), told,
+            subscribers=1 if case.keypoints or case.together else 2,
+        )  # fmt: skip
         # The kernels are compiled and the track has started before the clip moves.
         camera.spin(player, lambda: len(arrived[POSTERIOR]) > 2, START_SECONDS)
         shift, start_ns = camera.begin(player)
-        before = [_cpu_seconds(node) for node in nodes]
+        before = [_cpu_seconds(node) for node in processes]
         received = _received(player)
         camera.spin(player, camera.ended, len(truth.joints) / RATE + PATIENCE)
-        spent = [_cpu_seconds(node) - past for node, past in zip(nodes, before, strict=True)]
+        spent = [
+            _cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)
+        ]
+        memory = sum(_memory(node) for node in processes)
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             player.executor.spin_once(timeout_sec=0.1)
@@ -192,7 +213,7 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
     # The newest image is the one that was due last.
     ages = [1e-9 * min(when - stamp - offset, last - stamp) for stamp, _, when in shown[SMOOTHED]]
     count = len(latencies)
-    if not count or not ages:
+    if not count or (case.smoothed and not ages):
         raise LiveNodeError(f'{count} images of the clip were answered, {len(ages)} smoothed')
     return {
         'images': len(truth.joints),
@@ -203,12 +224,14 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
             what: float(np.percentile(latencies, p)) for what, p in (('median', 50), ('95 %', 95))
         },
         'age_s': {
-            what: float(np.percentile(ages, p)) for what, p in (('median', 50), ('95 %', 95))
+            what: float(np.percentile(ages, p)) if ages else math.nan
+            for what, p in (('median', 50), ('95 %', 95))
         },
-        'cpu_s': dict(zip((node.name for node in nodes), spent, strict=True)),
+        'memory_mb': memory,
+        'cpu_s': dict(zip((node.name for node in processes), spent, strict=True)),
         'cpu_ms_per_pose': 1e3 * sum(spent) / count,
         'wanted': f'95 % of the smoothed poses at most {OLDEST:g} s old',
-        'met': float(np.percentile(ages, 95)) <= OLDEST,
+        'met': bool(ages) and float(np.percentile(ages, 95)) <= OLDEST,
         **_errors(target, truth),
     }
 
@@ -222,14 +245,24 @@ def _nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> list[Li
     used = {'use_keypoints': True} if case.keypoints else {'use_predictions': True}
     chosen: dict[str, Any] = {
         FILTER: replace(FilterParameters(), **images, **used, **case.filter),
-        SMOOTHER: SmootherParameters(),
     }
+    if case.smoothed:
+        chosen[SMOOTHER] = SmootherParameters()
     if not case.keypoints:
-        chosen[BME] = replace(BmeParameters(), **images, **case.bme)
-    return [
-        LiveNode(player, opened, name, parameters, inputs={}, topics={}, write=_ignored)
+        interval = {'tracked_interval': TRACKED_INTERVAL}
+        chosen[BME] = replace(BmeParameters(), **{**images, **interval, **case.bme})
+    process = None
+    if case.together:
+        process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', tuple(chosen))
+    nodes = [
+        LiveNode(
+            player, opened, name, parameters, inputs={}, topics={}, within=process, write=_ignored
+        )
         for name, parameters in chosen.items()
     ]
+    if process is not None:
+        process.start()
+    return nodes
 
 
 def _detections(clip: Path, truth: Truth) -> Path:
@@ -277,10 +310,12 @@ class _Camera:
         transport: str,
         images: int,
         more: Sequence[str] = (),
+        *,
+        subscribers: int,
     ) -> None:
         command = [sys.executable, '-m', 'benchmarks.camera', str(clip), transport]
         self._process = subprocess.Popen(
-            [*command, f'{RATE:g}', str(images), '1' if more else '2', *more],
+            [*command, f'{RATE:g}', str(images), str(subscribers), *more],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, **environment(domain)},
@@ -337,6 +372,14 @@ def _cpu_seconds(node: LiveNode) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
+def _memory(node: LiveNode) -> float:
+    """Memory of the process of a node that no other shares, MB."""
+    text = Path(f'/proc/{node.process.pid}/smaps_rollup').read_text('utf-8')
+    return sum(
+        int(line.split()[1]) for line in text.splitlines() if line.startswith('Pss:')
+    ) / 1e3
+
+
 def _shifted(data: bytes, stamp_ns: int) -> bytes:
     """A mixture with the stamp of its image in the bag, as it is stored."""
     from benchmarks.publisher import with_stamp
@@ -367,7 +410,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
             continue
         errors = [
             f'{found[POSTERIOR]["heaviest_mm"]:.0f} mm', f'{found[POSTERIOR]["best_mm"]:.0f} mm',
-            f'{found[SMOOTHED]["heaviest_mm"]:.0f} mm',
+            f'{found[SMOOTHED]["heaviest_mm"]:.0f} mm' if SMOOTHED in found else '',
         ]  # fmt: skip
         if stage in OFFLINE:
             rows.append([what, str(found['images']), '0', '100 %', *[''] * 5, *errors])

@@ -32,7 +32,8 @@ def in_threads(
         work: on the poses from one number up to another.
         count: number of poses.
         least: number of poses that are worth a thread.
-        threads: their number at most; 0: as many as there are cores, up to `MOST_THREADS`.
+        threads: their number at most; 0: one a core, up to `MOST_THREADS`, but one core, where a
+            camera, a smoother and whoever listens run.
     """
     threads = min(threads or _cores(), _most, count // least)
     if threads < 2:
@@ -69,4 +70,4 @@ def _pool() -> ThreadPoolExecutor:
 
 @lru_cache(maxsize=1)
 def _cores() -> int:
-    return len(os.sched_getaffinity(0))
+    return max(len(os.sched_getaffinity(0)) - 1, 1)

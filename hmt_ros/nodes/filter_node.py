@@ -35,10 +35,10 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
     SESSION = FilterSession
     DEFAULTS = FilterParameters()
 
-    def _defaults(self) -> FilterParameters:
+    def _in_namespace(self, defaults: FilterParameters) -> FilterParameters:
         """Persons in namespaces have frames of their own."""
         namespace = self.get_namespace().strip('/')
-        return replace(self.DEFAULTS, frame_prefix=f'{namespace}/') if namespace else self.DEFAULTS
+        return replace(defaults, frame_prefix=f'{namespace}/') if namespace else defaults
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield Reset, '~/reset', self._on_reset

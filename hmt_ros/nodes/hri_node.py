@@ -102,14 +102,14 @@ class HriNode(SessionNode[HriSession, HriParameters]):
 
     def _look_for_people(self) -> None:
         thread = self._thread
-        if thread is None or self._settings.named or not self._inputs:
+        if thread is None or self._settings.named or not self._listeners:
             return
         end = f'/{self._settings.mixture_topic}'
-        for subscription in list(self._inputs):
-            if subscription.topic_name.endswith(end) and not subscription.get_publisher_count():
-                self._inputs.remove(subscription)
-                self.destroy_subscription(subscription)
-        known = {subscription.topic_name for subscription in self._inputs}
+        for listener in list(self._listeners):
+            one = listener.subscription
+            if listener.topic.endswith(end) and one is not None and not one.get_publisher_count():
+                self._leave(listener)
+        known = {listener.topic for listener in self._listeners}
         for namespace in self._found():
             one = self._mixtures_in(namespace)
             if one.topic in known:

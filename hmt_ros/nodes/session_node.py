@@ -28,6 +28,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from hmt_ros.compiled_code import prepare
 from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, trouble_of_period
 from hmt_ros.nodes.estimating_thread import EstimatingThread, InnerFaults
+from hmt_ros.nodes.local_topics import Listener, LocalTopics
 from hmt_ros.nodes.node_parameters import (
     QOS_OVERRIDES,
     as_in_ros,
@@ -64,6 +65,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     """A node around a session; its parameters are those of a settings dataclass.
 
     Args:
+        defaults: of the parameters; None: those of the class.
+        local: topics between the nodes of this process; None: it has no other nodes.
         options: of `rclpy.lifecycle.LifecycleNode`.
 
     Attributes:
@@ -80,9 +83,12 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     SESSION: ClassVar[Any]
     DEFAULTS: ClassVar[Any]
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(
+        self, defaults: Any = None, local: LocalTopics | None = None, **options: Any
+    ) -> None:
         super().__init__(self.NAME, **options)
-        declared = declared_parameters(defaults := self._defaults())
+        defaults = self._in_namespace(self.DEFAULTS if defaults is None else defaults)
+        declared = declared_parameters(defaults)
         self.declare_parameters(
             '', [(p.name, as_in_ros(p.default), descriptor(p)) for p in declared]
         )
@@ -98,7 +104,11 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._outputs: dict[str, Any] = {}
         self._handled: Any = None
         self._offered: list[Any] = []
-        self._inputs: list[Any] = []
+        self._local = LocalTopics() if local is None else local
+        self._local_names: dict[str, str] = {}
+        self._listeners: list[Listener] = []
+        for topic in map(self._local_name, self.SESSION.TOPICS):
+            self._local.offer(topic)
         # Topics that the node both publishes and subscribes to, and what it published there.
         self._heard: set[str] = set()
         self._own = OwnMessages()
@@ -121,8 +131,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     # What a node decides.
 
-    def _defaults(self) -> Any:
-        return self.DEFAULTS
+    def _in_namespace(self, defaults: Any) -> Any:
+        """Default values of the parameters in the namespace of the node."""
+        return defaults
 
     @abstractmethod
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
@@ -229,7 +240,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         for one in inputs:
             self._subscribe(one)
         self._warn_of_unknown(qos=True)
-        topic = self._inputs[-1].topic_name
+        topic = self._listeners[-1].topic
         wants = session.state.wants
         self.get_logger().info(f'{self._counted} from {topic}; waits for {wants}')
         return result
@@ -268,23 +279,36 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self._silent.arrived(wanted.source, now)
             thread.put(wanted.source, data, now)
 
-        events = self._events.of_subscription(self.resolve_topic_name(wanted.topic))
-        self._inputs.append(
-            self.create_subscription(
+        topic = self.resolve_topic_name(wanted.topic)
+        name = self._local_name(wanted.topic)
+
+        def connect() -> Any:
+            return self.create_subscription(
                 message_class(wanted.msgtype),
                 wanted.topic,
-                receive,
+                lambda data: self._local.deliver(name, data),
                 wanted.qos,
                 raw=True,
-                event_callbacks=events,
+                event_callbacks=self._events.of_subscription(topic),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
-        )
+
+        self._listeners.append(listener := Listener(name, receive, connect))
+        self._local.listen(listener)
+
+    def _leave(self, listener: Listener) -> None:
+        self._listeners.remove(listener)
+        if (subscription := self._local.leave(listener)) is not None:
+            self.destroy_subscription(subscription)
+
+    @property
+    def _connected(self) -> list[Any]:
+        """The subscriptions that this node has by itself."""
+        return [one.subscription for one in self._listeners if one.subscription is not None]
 
     def _unsubscribe(self) -> None:
-        for subscription in self._inputs:
-            self.destroy_subscription(subscription)
-        self._inputs.clear()
+        for listener in list(self._listeners):
+            self._leave(listener)
         self._events.forget()
         self._silent.listen(())
 
@@ -360,9 +384,23 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if output.topic in self._heard:
             self._own.sent(output.data)
         self._outputs[output.topic].publish(output.data)
+        self._local.deliver(self._local_name(output.topic), output.data)
 
     def _is_wanted(self, topic: str) -> bool:
-        return bool(self._outputs[topic].get_subscription_count())
+        return bool(self._subscribers(topic))
+
+    def _subscribers(self, topic: str) -> int:
+        """How many subscribe to a topic of this node, in this process and in others."""
+        others = self._outputs[topic].get_subscription_count()
+        return int(others) + self._local.listeners(self._local_name(topic))
+
+    def _local_name(self, topic: str) -> str:
+        """Name of a topic among nodes of this process; topics of all, as /tf, go over ROS."""
+        if topic not in self._local_names:
+            own = f'{self.get_fully_qualified_name()} {topic}'
+            name = own if topic.startswith('/') else self.resolve_topic_name(topic)
+            self._local_names[topic] = name
+        return self._local_names[topic]
 
     # Diagnostics.
 
@@ -376,7 +414,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         latencies = [] if self._thread is None else self._thread.take_latencies()
         durations = [] if self._thread is None else self._thread.take_durations()
         self._rates.next_period(counts, latencies, durations)
-        if self._session is not None and self._inputs:
+        if self._session is not None and self._listeners:
             self._silent.look(self._session.needed_inputs())
         self._diagnose()
         self._log_status(counts)
@@ -399,7 +437,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return DiagnosticStatus.OK, label
         trouble = (
             state.trouble()
-            or self._events.deaf_topic(self._inputs)
+            or self._events.deaf_topic(self._connected)
             or trouble_of_period(state, self._rates, self._silent)
         )
         if trouble:
@@ -410,7 +448,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """The camera: the frame that its messages name, or else the topic that they come on."""
         if state is not None and state.frame_id:
             return state.frame_id
-        return self._inputs[-1].topic_name if self._inputs else ''
+        return self._listeners[-1].topic if self._listeners else ''
 
     def _diagnose(self) -> None:
         label = self._state_machine.current_state[1]
@@ -436,8 +474,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
                 *self._events.values(),
                 *self._rates.values(),
                 *(
-                    (f'{SUBSCRIBERS}{topic}', str(publisher.get_subscription_count()))
-                    for topic, publisher in self._outputs.items()
+                    (f'{SUBSCRIBERS}{topic}', str(self._subscribers(topic)))
+                    for topic in self._outputs
                 ),
             ]
         status.values = [KeyValue(key=key, value=value) for key, value in values]

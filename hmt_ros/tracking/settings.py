@@ -60,7 +60,8 @@ class TrackerSettings:
         lifter: Experts that tell from the keypoints of the last images how deep the joints are:
             'keypoints', which ships, or a file that learn-lifter wrote; if empty, keypoints count
             by themselves.
-        threads: Number of threads that share the poses of an image; 0 takes one a core, 8 at most.
+        threads: Number of threads that share the poses of an image; 0 takes one a core, 8 at most,
+            and leaves one core to others.
             Results do not depend on it.
         likelihood: settings of the likelihood.
         search: settings of the search of limbs.

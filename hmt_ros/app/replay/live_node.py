@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,84 @@ STOP_SECONDS = 20.0
 LATCHED_SOURCES = (TF_STATIC,)
 
 
+class NodeProcess:
+    """A process in which nodes run.
+
+    Args:
+        player: the participant that its nodes talk to.
+        opened: stack that ends the process.
+        name: of its files.
+        module: that runs the nodes.
+        words: for its command line, before those of ROS.
+    """
+
+    def __init__(
+        self, player: Player, opened: ExitStack, name: str, module: str, words: Sequence[str] = ()
+    ) -> None:
+        self._player, self._name = player, name
+        self._module, self._words = module, words
+        self._options: list[str] = []
+        self._process: subprocess.Popen[bytes] | None = None
+        opened.callback(self.stop)
+
+    def add(self, *options: str) -> None:
+        """Gives options of ROS to the process, before it starts."""
+        self._options += options
+
+    def start(self) -> None:
+        """Starts the process."""
+        sources = str(Path(hmt_ros.__file__).resolve().parents[1])
+        command = [sys.executable, '-m', self._module, *self._words, '--ros-args', *self._options]
+        # Without status lines the last line of its output is the one that matters.
+        command += ['--log-level', 'warn']
+        with self._file.open('wb') as output:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={
+                    **os.environ,
+                    **environment(self._player.domain),
+                    'PYTHONPATH': os.pathsep.join(
+                        [sources, *filter(None, [os.environ.get('PYTHONPATH')])]
+                    ),
+                    'ROS_LOG_DIR': str(self._player.folder),
+                    # As `hmt_ros.nodes.run_node.OWNER`: a killed replay leaves no nodes.
+                    'HMT_ROS_OWNER': str(os.getpid()),
+                },
+                # The interrupt key is for this process; it stops the node itself.
+                start_new_session=True,
+            )
+
+    @property
+    def popen(self) -> subprocess.Popen[bytes]:
+        """The process itself, once it has started."""
+        assert self._process is not None
+        return self._process
+
+    def stop(self) -> int | None:
+        """Ends the process as the interrupt key does, and gives its exit code."""
+        process = self._process
+        if process is None:
+            return None
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            return process.wait(STOP_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return process.wait()
+
+    def output(self) -> str:
+        """All that it has written to its console."""
+        return self._file.read_text('utf-8', 'replace')
+
+    @property
+    def _file(self) -> Path:
+        return self._player.folder / f'{self._name}.output'
+
+
 class LiveNode:
     """A running node.
 
@@ -51,6 +129,7 @@ class LiveNode:
             reliable.
         namespace: namespace of the node and of all its topics, '/humans/bodies/7' for example.
         module: module that runs the node; empty: the one in `hmt_ros.nodes` with its name.
+        within: a process of several nodes, which the caller starts; None: one of its own.
         write: takes topic, stamp and bytes of each message of the node, in its order.
 
     Raises:
@@ -69,18 +148,22 @@ class LiveNode:
         sensors: tuple[str, ...] = (),
         namespace: str = '',
         module: str = '',
+        within: NodeProcess | None = None,
         write: Callable[[str, int, bytes], None],
     ) -> None:
         self.name = name
         self.full_name = f'{namespace}/{name}'.strip('/')
-        self._namespace, self._module = namespace, module or f'hmt_ros.nodes.{name}'
+        self._namespace = namespace
         self._player, self._topics, self._write = player, topics, write
         self._arrived: dict[str, deque[bytes]] = {topic: deque() for topic in topics}
         self._answers: deque[bytes] = deque()
-        self._process: subprocess.Popen[bytes] | None = None
         self._open_topics(inputs)
-        opened.callback(self.stop)
-        self._process = self._start(parameters, sensors)
+        self._process = within or NodeProcess(
+            player, opened, self._file_name, module or f'hmt_ros.nodes.{name}'
+        )
+        self._process.add(*self._options(parameters, sensors))
+        if within is None:
+            self._process.start()
 
     def publish(self, source: str, message: Any) -> None:
         """Hands a message over."""
@@ -147,12 +230,11 @@ class LiveNode:
     @property
     def process(self) -> subprocess.Popen[bytes]:
         """The process of the node."""
-        assert self._process is not None
-        return self._process
+        return self._process.popen
 
     def output(self) -> str:
-        """All that the node has written to its console."""
-        return self._output.read_text('utf-8', 'replace')
+        """All that the process of the node has written to its console."""
+        return self._process.output()
 
     @property
     def title(self) -> str:
@@ -216,16 +298,7 @@ class LiveNode:
 
     def stop(self) -> int | None:
         """Ends the node as the interrupt key does, and gives its exit code."""
-        process = self._process
-        if process is None:
-            return None
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        try:
-            return process.wait(STOP_SECONDS)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            return process.wait()
+        return self._process.stop()
 
     def stop_well(self) -> None:
         """Ends the node.
@@ -237,45 +310,22 @@ class LiveNode:
         if code != 0:
             raise LiveNodeError(f'the {self.title} ended with code {code}: {self._last_words()}')
 
-    def _start(self, parameters: Any, sensors: tuple[str, ...]) -> subprocess.Popen[bytes]:
+    def _options(self, parameters: Any, sensors: tuple[str, ...]) -> list[str]:
+        """Options of ROS that give the node its parameters and names."""
         values = {name: yaml_scalar(value) for name, value in values_of(parameters).items()}
         for topic in sensors:
             values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
         lines = [f'    {name}: {text}' for name, text in values.items()]
         file = self._player.folder / f'{self._file_name}.yaml'
-        file.write_text('\n'.join(['/**:', '  ros__parameters:', *lines, '']), encoding='utf-8')
-        sources = str(Path(hmt_ros.__file__).resolve().parents[1])
-        command = [sys.executable, '-m', self._module, '--ros-args', '--params-file', str(file)]
-        # Without status lines the last line of its output is the one that matters.
-        command += ['--log-level', 'warn']
+        head = [f'/**/{self.name}:', '  ros__parameters:']
+        file.write_text('\n'.join([*head, *lines, '']), encoding='utf-8')
+        options = ['--params-file', str(file)]
         if self._namespace:
-            command += ['-r', f'__ns:={self._namespace}']
+            options += ['-r', f'__ns:={self._namespace}']
         for topic in self._topics:
             if topic.startswith('/'):
-                command += ['-r', f'{topic}:={self._topic(topic)}']
-        with self._output.open('wb') as output:
-            return subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env={
-                    **os.environ,
-                    **environment(self._player.domain),
-                    'PYTHONPATH': os.pathsep.join(
-                        [sources, *filter(None, [os.environ.get('PYTHONPATH')])]
-                    ),
-                    'ROS_LOG_DIR': str(self._player.folder),
-                    # As `hmt_ros.nodes.run_node.OWNER`: a killed replay leaves no nodes.
-                    'HMT_ROS_OWNER': str(os.getpid()),
-                },
-                # The interrupt key is for this process; it stops the node itself.
-                start_new_session=True,
-            )
-
-    @property
-    def _output(self) -> Path:
-        return self._player.folder / f'{self._file_name}.output'
+                options += ['-r', f'{self.name}:{topic}:={self._topic(topic)}']
+        return options
 
     @property
     def _file_name(self) -> str:
@@ -330,8 +380,7 @@ class LiveNode:
         end = time.monotonic() + seconds
         while not done():
             self._player.executor.spin_once(timeout_sec=0.1)
-            assert self._process is not None
-            code = self._process.poll()
+            code = self.process.poll()
             if code is not None and not done():
                 raise LiveNodeError(
                     f'the {self.title} ended with code {code}: {self._last_words()}'

@@ -1,0 +1,100 @@
+"""person_node: filter, smoother, experts and a detector's client in one process.
+
+The nodes are the same as in processes of their own: names, parameters, topics, services and bytes.
+What one publishes another gets without the middleware (`hmt_ros.nodes.local_topics`), images come in
+once, and the libraries are in memory once. Which nodes run is said by their names on the command
+line; what they use of each other is the default of their parameters.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from hmt_ros.nodes.bme_node import BmeNode
+from hmt_ros.nodes.filter_node import FilterNode
+from hmt_ros.nodes.keypoints_adapter_node import KeypointsAdapterNode
+from hmt_ros.nodes.keypoints_node import KeypointsNode
+from hmt_ros.nodes.local_topics import LocalTopics
+from hmt_ros.nodes.run_node import run_together
+from hmt_ros.nodes.session_node import SessionNode
+from hmt_ros.nodes.smoother_node import SmootherNode
+from hmt_ros.nodes.usage import wants_help
+
+NAME = 'person_node'
+NODES: Mapping[str, type[SessionNode[Any, Any]]] = {
+    node.NAME: node
+    for node in (FilterNode, SmootherNode, BmeNode, KeypointsNode, KeypointsAdapterNode)
+}
+USUAL = (FilterNode.NAME, SmootherNode.NAME, BmeNode.NAME)
+DETECTORS = (KeypointsNode.NAME, KeypointsAdapterNode.NAME)
+# Interval between two predictions while the filter tracks the person, s.
+TRACKED_INTERVAL = 0.2
+_RENAMED = ('__node:=', '__name:=')
+_USAGE = f"""usage: ros2 run hmt_ros {NAME} [NODE ...] [--ros-args ...]
+
+Filter, smoother, experts and a detector's client in one process.
+
+Each NODE is one of {', '.join(NODES)};
+without any these run: {', '.join(USUAL)}. They have the names, parameters, topics and
+services that they have in processes of their own: see "ros2 run hmt_ros NODE --help".
+The filter uses the predictions of bme_node, and the keypoints of a detector, where these run.
+"""
+
+
+def used_of_each_other(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Parameters by node that follow from which nodes run together."""
+    values: dict[str, dict[str, Any]] = {name: {} for name in names}
+    if FilterNode.NAME in names:
+        used = {
+            'use_predictions': BmeNode.NAME in names,
+            'use_keypoints': any(name in names for name in DETECTORS),
+            'use_keypoints_3d': KeypointsNode.NAME in names,
+        }
+        values[FilterNode.NAME] = {name: use for name, use in used.items() if use}
+        if BmeNode.NAME in names:
+            # While the person is tracked the filter needs the processor more.
+            values[BmeNode.NAME] = {'tracked_interval': TRACKED_INTERVAL}
+    return values
+
+
+def nodes_together(names: Sequence[str], **options: Any) -> list[SessionNode[Any, Any]]:
+    """Nodes that hand their messages to each other.
+
+    Args:
+        names: of the nodes.
+        options: of all of them, see `SessionNode`.
+    """
+    local, values = LocalTopics(), used_of_each_other(names)
+    return [
+        NODES[name](replace(NODES[name].DEFAULTS, **values[name]), local, **options)
+        for name in names
+    ]
+
+
+def main(args: list[str] | None = None) -> int:
+    """Runs the nodes until a signal stops them; returns 0, 1 if one could not start, 2 on misuse."""
+    arguments = sys.argv[1:] if args is None else args
+    if wants_help(arguments):
+        sys.stdout.write(_USAGE)
+        return 0
+    own = arguments[: arguments.index('--ros-args')] if '--ros-args' in arguments else arguments
+    names = tuple(dict.fromkeys(own)) or USUAL
+    unknown = [name for name in names if name not in NODES]
+    if unknown:
+        sys.stderr.write(f'{NAME}: wanted some of {", ".join(NODES)}, saw {unknown[0]!r}\n')
+        return 2
+    renamed = [word for word in arguments if word.startswith(_RENAMED)]
+    if renamed:
+        sys.stderr.write(
+            f'{NAME}: {renamed[0]} would give all nodes one name; wanted none, or '
+            f'{names[0]}:{renamed[0]} for one of them\n'
+        )
+        return 2
+    return run_together(NAME, lambda: nodes_together(names), arguments)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
