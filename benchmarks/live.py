@@ -189,9 +189,7 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
         before = [_cpu_seconds(node) for node in processes]
         received = _received(player)
         camera.spin(player, camera.ended, len(truth.joints) / RATE + PATIENCE)
-        spent = [
-            _cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)
-        ]
+        spent = [_cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)]
         memory = sum(_memory(node) for node in processes)
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
@@ -375,9 +373,7 @@ def _cpu_seconds(node: LiveNode) -> float:
 def _memory(node: LiveNode) -> float:
     """Memory of the process of a node that no other shares, MB."""
     text = Path(f'/proc/{node.process.pid}/smaps_rollup').read_text('utf-8')
-    return sum(
-        int(line.split()[1]) for line in text.splitlines() if line.startswith('Pss:')
-    ) / 1e3
+    return sum(int(line.split()[1]) for line in text.splitlines() if line.startswith('Pss:')) / 1e3
 
 
 def _shifted(data: bytes, stamp_ns: int) -> bytes:

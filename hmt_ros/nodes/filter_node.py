@@ -7,27 +7,30 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
-from hmt_msgs.srv import Reset
+from hmt_msgs.msg import PoseMixture
+from hmt_msgs.srv import ForecastPose, Reset
+from rclpy.serialization import deserialize_message
 
 from hmt_ros.nodes.run_node import run
-from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
-    DEPTH_TOPIC,
-    MASK_TOPICS,
     RELIABLE,
-    TRANSFORM_TOPICS,
     SubscribedTopic,
     image_topic,
 )
+from hmt_ros.nodes.tracking_node import TrackingNode
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D, PREDICTION, FilterSession
-from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.track_start import TrackStart, prepare_start
+from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
 from msg_tools.messages import keypoints
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.pose_mixtures import pose_mixture_message
 
 
-class FilterNode(SessionNode[FilterSession, FilterParameters]):
+class FilterNode(TrackingNode[FilterSession, FilterParameters]):
     """The node; its parameters are the fields of `FilterParameters`."""
 
     NAME = 'filter_node'
@@ -41,45 +44,46 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
         return replace(defaults, frame_prefix=f'{namespace}/') if namespace else defaults
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
-        yield Reset, '~/reset', self._on_reset
+        yield from super()._offered_services()
+        yield ForecastPose, '~/forecast_pose', self._on_forecast_pose
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield CAMERA_INFO_TOPIC
         yield SubscribedTopic(KEYPOINTS, KEYPOINTS, keypoints.KEYPOINTS_2D)
         yield SubscribedTopic(KEYPOINTS_3D, KEYPOINTS_3D, keypoints.KEYPOINTS_3D)
         yield SubscribedTopic(PREDICTION, 'pose_prediction', 'hmt_msgs/msg/PoseMixture', RELIABLE)
-        yield from MASK_TOPICS
-        yield DEPTH_TOPIC
-        if self._session is not None and self._session.frames.wanted:
-            yield from TRANSFORM_TOPICS
+        yield from self._inputs_of_images()
         yield image_topic(self._settings.image_transport)
 
-    def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
-        session, thread = self._session, self._thread
-        if session is None or thread is None:
-            response.success, response.message = False, 'the node is not active'
-            return response
-        try:
-            start = prepare_start(
-                session.parameters, request.initial, session.state.body, request.box
-            )
-        except ValueError as error:
-            response.success, response.message = False, error_line(error)
-            self.get_logger().warn(f'~/reset is refused: {response.message}')
-            return response
-        thread.restart(lambda: session.restart(start))
-        response.success = True
+    def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
+        assert self._session is not None
+        state = self._session.state
+        start = prepare_start(self._settings, request.initial, state.body, request.box)
         sources = start.parameters.sources
         if start.box is not None or start.initial is not None:
-            response.message = 'the next image starts a new track'
-        elif sources:
-            response.message = f'the next image with {" or ".join(sources)} starts a new track'
-        else:
-            response.message = (
-                'the track is dropped; nothing starts a new one without subject_file, '
-                'use_keypoints, use_mask or use_predictions'
-            )
-        self.get_logger().info(f'~/reset: {response.message}')
+            return start, 'the next image starts a new track'
+        if sources:
+            return start, f'the next image with {" or ".join(sources)} starts a new track'
+        return start, (
+            'the track is dropped; nothing starts a new one without subject_file, use_keypoints, '
+            'use_mask or use_predictions'
+        )
+
+    def _on_forecast_pose(
+        self, request: ForecastPose.Request, response: ForecastPose.Response
+    ) -> ForecastPose.Response:
+        session = self._session
+        if session is None:
+            response.success, response.message = False, 'the node is not configured'
+            return response
+        try:
+            content = session.robot.forecast(time_ns(request.stamp))
+            data = serialise(pose_mixture_message(RosbagsMessages(), content))
+        except ValueError as error:
+            response.success, response.message = False, error_line(error)
+            return response
+        response.success = True
+        response.mixture = deserialize_message(data, PoseMixture)
         return response
 
 

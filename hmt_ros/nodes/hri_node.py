@@ -54,8 +54,8 @@ class HriNode(SessionNode[HriSession, HriParameters]):
     SESSION = HriSession
     DEFAULTS = HriParameters()
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
         # Of bodies: by topic. They belong to the thread that estimates.
         self._of_bodies: dict[str, Any] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)

@@ -7,36 +7,32 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hmt_msgs.srv import Reset
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from hmt_ros.nodes.run_node import run
-from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
-    DEPTH_TOPIC,
-    MASK_TOPICS,
-    TRANSFORM_TOPICS,
     SubscribedTopic,
     image_topic,
     published_with,
 )
+from hmt_ros.nodes.tracking_node import TrackingNode
 from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.people_parameters import SOURCES, PeopleParameters
 from hmt_ros.sessions.people_session import DETECTIONS, PeopleSession, published_topic
 from hmt_ros.sessions.person_session import person_of
-from hmt_ros.sessions.track_start import prepare_start
-from msg_tools.files.error_line import error_line
+from hmt_ros.sessions.track_start import TrackStart, prepare_start
 
 # Periods of the diagnostics after which the topics of somebody who has left are closed: the last
 # messages are still on their way.
 STAYS_OPEN = 5
 
 
-class PeopleNode(SessionNode[PeopleSession, PeopleParameters]):
+class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
     """The node; its parameters are the fields of `PeopleParameters`."""
 
     NAME = 'people_node'
@@ -44,11 +40,11 @@ class PeopleNode(SessionNode[PeopleSession, PeopleParameters]):
     SESSION = PeopleSession
     DEFAULTS = PeopleParameters()
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, *args: Any, **options: Any) -> None:
         # The thread that estimates opens topics, that of the executor closes them.
         self._opening = threading.Lock()
         self._left: dict[str, int] = {}
-        super().__init__(**options)
+        super().__init__(*args, **options)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listens no more; the topics of all people are closed."""
@@ -59,37 +55,16 @@ class PeopleNode(SessionNode[PeopleSession, PeopleParameters]):
     def _messages_of_others(self, settings: PeopleParameters) -> Mapping[str, str]:
         return {SOURCES[settings.source]: f'source {settings.source}'}
 
-    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
-        yield Reset, '~/reset', self._on_reset
-
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield CAMERA_INFO_TOPIC
         yield SubscribedTopic(DETECTIONS, DETECTIONS, SOURCES[self._settings.source])
-        yield from MASK_TOPICS
-        yield DEPTH_TOPIC
-        if self._session is not None and self._session.frames.wanted:
-            yield from TRANSFORM_TOPICS
+        yield from self._inputs_of_images()
         yield image_topic(self._settings.image_transport)
 
-    def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
-        session, thread = self._session, self._thread
-        if session is None or thread is None:
-            response.success, response.message = False, 'the node is not active'
-            return response
+    def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
         if len(request.initial.components) or request.box.width:
-            response.success = False
-            response.message = 'a mixture or a box is of one person: wanted an empty request'
-            return response
-        try:
-            start = prepare_start(session.parameters)
-        except ValueError as error:
-            response.success, response.message = False, error_line(error)
-            self.get_logger().warn(f'~/reset is refused: {response.message}')
-            return response
-        thread.restart(lambda: session.restart(start))
-        response.success, response.message = True, 'the next detections start new tracks'
-        self.get_logger().info(f'~/reset: {response.message}')
-        return response
+            raise ValueError('a mixture or a box is of one person: wanted an empty request')
+        return prepare_start(self._settings), 'the next detections start new tracks'
 
     # Called by the thread that estimates.
 

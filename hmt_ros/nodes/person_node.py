@@ -1,8 +1,8 @@
 """person_node: filter, smoother, experts and a detector's client in one process.
 
 The nodes are the same as in processes of their own: names, parameters, topics, services and bytes.
-What one publishes another gets without the middleware (`hmt_ros.nodes.local_topics`), images come in
-once, and the libraries are in memory once. Which nodes run is said by their names on the command
+What one publishes another gets without the middleware (`hmt_ros.nodes.local_topics`), images come
+in once, and the libraries are in memory once. Which nodes run is said by their names on the command
 line; what they use of each other is the default of their parameters.
 """
 
@@ -75,7 +75,7 @@ def nodes_together(names: Sequence[str], **options: Any) -> list[SessionNode[Any
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the nodes until a signal stops them; returns 0, 1 if one could not start, 2 on misuse."""
+    """Runs the nodes until a signal stops them; returns 0, 1 if one does not start, 2 on misuse."""
     arguments = sys.argv[1:] if args is None else args
     if wants_help(arguments):
         sys.stdout.write(_USAGE)

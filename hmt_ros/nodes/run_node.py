@@ -81,7 +81,8 @@ def run_together(
     while not stopped.is_set() and owner in (None, str(os.getppid())):
         _spin_once(executor, nodes[0])
     end = time.monotonic() + _LAST_ESTIMATE
-    if not all([node.stop(max(end - time.monotonic(), 0.0)) for node in nodes]):
+    ended = [node.stop(max(end - time.monotonic(), 0.0)) for node in nodes]
+    if not all(ended):
         sys.stderr.flush()
         os._exit(0)
     executor.shutdown()

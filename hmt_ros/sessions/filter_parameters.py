@@ -97,6 +97,13 @@ class FilterParameters(CameraNodeParameters):
             camera_upright where gravity is known.
         frame_prefix: Prefix of the names of the links on /tf and in human_description, which tells
             several persons apart; in a namespace the node takes the namespace for default.
+        keep_out_probability: Probability with which keep_out holds the person, of each part of the
+            body and of the modes.
+        stale_time: Time without an answered image after which keep_out says so and grows, s.
+        forecast_rate: Number of poses a second on pose_forecast, at times after the images; 0
+            switches it off.
+        forecast_horizon: Time after an image up to which it is the first to be predicted from, s;
+            it covers the time until the next image is answered.
         tracker: settings of the tracker.
         background: settings of the background subtraction.
     """
@@ -120,6 +127,10 @@ class FilterParameters(CameraNodeParameters):
     overlay_modes: int = parameter_field(3, AT_ONCE, (0, 64))
     publish_tf: bool = parameter_field(True, AT_ONCE)
     frame_prefix: str = parameter_field('human/', AT_ONCE)
+    keep_out_probability: float = parameter_field(0.99, AT_ONCE, (0.5, 0.9999))
+    stale_time: float = parameter_field(0.5, AT_ONCE, (0.05, 3600.0))
+    forecast_rate: float = parameter_field(0.0, AT_ONCE, (0.0, 1000.0))
+    forecast_horizon: float = parameter_field(0.15, AT_ONCE, (0.0, 10.0))
     tracker: TrackerSettings = field(
         default_factory=lambda: TrackerSettings(evaluation_budget=LIVE),
         metadata=nested_parameters(NEXT_TRACK, _TRACKER),

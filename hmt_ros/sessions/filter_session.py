@@ -49,12 +49,14 @@ from hmt_ros.sessions.filter_state import FilterState
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
+from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
 from hmt_ros.sessions.session import NeededInput, everything
 from hmt_ros.sessions.track_messages import (
-    TOPICS,
+    TOPICS_OF_NODE,
     Presentation,
     TrackedImage,
     nobody_messages,
+    robot_messages,
     track_messages,
 )
 from hmt_ros.sessions.track_reports import TrackCondition, report_change
@@ -65,7 +67,9 @@ from hmt_ros.tracking import PosePrediction, Status, Tracker
 from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
+from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
+from msg_tools.messages.keep_out import KeepOutState
 from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_of
 
 __all__ = [
@@ -85,6 +89,12 @@ PREDICTION = 'pose_prediction'
 
 # Change of a length above which a body is described anew, m.
 RESHAPED = 0.005
+_STATES = {
+    Status.WAITING: KeepOutState.UNKNOWN,
+    Status.TRACKING: KeepOutState.TRACKING,
+    Status.LOST: KeepOutState.LOST,
+    Status.NOBODY: KeepOutState.NOBODY,
+}
 
 
 class FilterSession(CameraSession[FilterParameters, FilterState]):
@@ -93,9 +103,11 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     Attributes:
         start: what the present track started from.
         frames: that transforms lead to from the camera.
+        robot: what a robot acts on; may be read by any thread.
+        answered: number of images of which a robot was told.
     """
 
-    TOPICS = TOPICS
+    TOPICS = TOPICS_OF_NODE
     DONE = 'tracked'
     ESTIMATE = 'the track'
     CHECKED = ('subject_file', 'background_file', 'body_model', 'lifter')
@@ -117,6 +129,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._keypoints = KeypointInputs(self._log)
         self._depths = DepthInputs(self._log)
         self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
+        self.robot = RobotOutputs()
+        self.answered = 0
         # Of an image that was left out since the last estimate.
         self._late_prediction: PosePrediction | None = None
         self.state = self._present_state()
@@ -172,6 +186,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         super()._forget_inputs(stamp)
         # Where time begins again, so do the numbers of the tracks.
         self._tracker, self._tracks = None, 0
+        self.robot.forget()
         self._keypoints.clear()
         self._depths.images.clear()
         self._predictions.clear()
@@ -313,6 +328,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
                 self._publish_nobody(self._tracker, waiting)
+            self._tell_robot(self._tracker, waiting, posterior)
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
             if not starts:
@@ -394,6 +410,45 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._shown_frames = (frame, p.frame_prefix)
         self._weights = posterior.weights
         self._log.counts['tracked'] += 1
+
+    def _tell_robot(
+        self, tracker: Tracker, waiting: WaitingImage, posterior: GaussianMixture | None
+    ) -> None:
+        """Publishes what a robot acts on; of every image, whatever it shows."""
+        p, seen, frame, fixed = self.parameters, None, waiting.frame_id, None
+        placed = True
+        if p.publish_in_fixed_frame:
+            frame, placed = p.fixed_frame, self.frames.pose is not None
+            if self.frames.pose is not None:
+                fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
+        state = _STATES[tracker.status]
+        if state is KeepOutState.TRACKING:
+            if placed and posterior is not None:
+                seen = LastSeen(
+                    waiting.stamp_ns, waiting.frame_id, tracker.body, posterior, tracker.forecaster,
+                    fixed, p.keep_out_probability,
+                )  # fmt: skip
+            else:
+                state = KeepOutState.LOST
+        self.robot.tell(
+            waiting.stamp_ns, frame, state, tracker.track_id, tracker.existence_probability, seen
+        )
+        robot_messages(self._messages, self.robot, p, self._wanted, self._publish)
+        self.answered += 1
+
+    def stale(self, silence: float) -> list[Output]:
+        """What a robot is told where no image is answered; may be called by any thread.
+
+        Args:
+            silence: time since the newest image was answered, s.
+        """
+        found: list[Output] = []
+
+        def publish(topic: str, stamp: int, message: Any) -> None:
+            found.append(Output(topic, stamp, serialise(message)))
+
+        robot_messages(self._messages, self.robot, self.parameters, self._wanted, publish, silence)
+        return found
 
     def _publish_nobody(self, tracker: Tracker, waiting: WaitingImage) -> None:
         """The end of a track whose person is no longer in view."""

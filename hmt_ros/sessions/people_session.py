@@ -42,7 +42,7 @@ from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_state import PeopleState
 from hmt_ros.sessions.person_session import BODIES, PersonSession, person_of
 from hmt_ros.sessions.session import NeededInput, PublishedTopic, everything
-from hmt_ros.sessions.track_messages import TOPICS
+from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from hmt_ros.sessions.warm_up import warm_up_tracking
@@ -67,7 +67,7 @@ def published_topic(topic: str) -> PublishedTopic:
     """What is published on a topic of the node or of a person."""
     if topic in PeopleSession.TOPICS:
         return PeopleSession.TOPICS[topic]
-    return TOPICS[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
+    return TOPICS_OF_NODE[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
 
 
 # Less of somebody in the image, px, is not worth a track.
@@ -98,12 +98,13 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
 
     Attributes:
         frames: that transforms lead to from the camera.
+        answered: number of images of which a robot was told.
     """
 
     # Each person has those of `track_messages` besides, with the prefix of `person_session`.
     TOPICS: ClassVar[Mapping[str, PublishedTopic]] = {
         PEOPLE: PublishedTopic(PEOPLE_2D),
-        '/tf': TOPICS['/tf'],
+        '/tf': TOPICS_OF_NODE['/tf'],
     }
     DONE = 'tracked'
     ESTIMATE = 'every track'
@@ -123,7 +124,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         self._start = prepare_start(p)
         self._detections: StampedInputs[list[DetectedPerson]] = StampedInputs()
         self._depths = DepthInputs(self._log)
-        self._info_stamp = 0
+        self._info_stamp = self.answered = 0
         self._forget()
         self.state = self._present_state()
 
@@ -155,6 +156,10 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         self._scene: Silhouettes | None = None
         self._watch = SceneWatch()
         self._next, self._detected, self._begun = 1, 0, False
+
+    def stale(self, silence: float) -> list[Output]:
+        """As `FilterSession.stale`, of everybody who is followed."""
+        return [output for person in self._people for output in person.session.stale(silence)]
 
     def _start_anew(self) -> None:
         try:
@@ -274,6 +279,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
             self._look_at_scene(waiting, self._scene.background, 'call ~/reset')
         skipped, tracked = self._log.counts['skipped'], self._log.counts['tracked']
         self._follow_all(waiting, camera, own, left, answered=detected is not None)
+        self.answered += 1
         # Those are counts of images, not of people.
         any_tracked = self._log.counts['tracked'] > tracked
         any_skipped = self._log.counts['skipped'] > skipped and not any_tracked

@@ -19,8 +19,10 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.overlay import draw_modes
+from hmt_ros.sessions.robot_outputs import RobotOutputs
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.tracking.ground import Ground
 from msg_tools import MessageFactory
@@ -28,6 +30,7 @@ from msg_tools.messages.bodies import description_message, message_of_body
 from msg_tools.messages.ground import GROUND, GroundState, ground_message
 from msg_tools.messages.ground_markers import ground_markers, removed_ground
 from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.keep_out import KEEP_OUT, keep_out_markers, keep_out_message
 from msg_tools.messages.markers import skeleton_markers
 from msg_tools.messages.person_poses import PERSON_POSE, person_pose, person_pose_message
 from msg_tools.messages.pose_mixtures import (
@@ -52,6 +55,13 @@ TOPICS = {
     '/tf': PublishedTopic('tf2_msgs/msg/TFMessage'),
     'markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
     'overlay/compressed': PublishedTopic('sensor_msgs/msg/CompressedImage'),
+    'keep_out': PublishedTopic(KEEP_OUT),
+    'pose_forecast': PublishedTopic('hmt_msgs/msg/PoseMixture'),
+}
+# Bags have none: it is large, and follows from keep_out.
+TOPICS_OF_NODE = {
+    **TOPICS,
+    'keep_out_markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
 }
 
 # Frame at the camera with x forward and z up, where gravity is known; a prefix stands before it.
@@ -254,6 +264,37 @@ def nobody_messages(
     if image is not None and wanted('overlay/compressed'):
         picture = compressed_image_message(messages, image, stamp_ns, frame_id)
         publish('overlay/compressed', picture)
+
+
+def robot_messages(
+    messages: MessageFactory,
+    robot: RobotOutputs,
+    parameters: FilterParameters,
+    wanted: Callable[[str], bool],
+    publish: Callable[[str, int, Any], None],
+    silence: float | None = None,
+) -> None:
+    """Makes the messages that robots act on.
+
+    Args:
+        messages: factory.
+        robot: knows the newest image.
+        parameters: how.
+        wanted: whether a topic is to be made.
+        publish: takes topic, stamp and message, one after the other.
+        silence: time since the newest image was answered, s, where none comes any more; None: it
+            is being answered.
+    """
+    if wanted('keep_out') or wanted('keep_out_markers'):
+        content = robot.keep_out(parameters.keep_out_probability, silence)
+        if wanted('keep_out'):
+            publish('keep_out', content.stamp_ns, keep_out_message(messages, content))
+        if wanted('keep_out_markers'):
+            publish('keep_out_markers', content.stamp_ns, keep_out_markers(messages, content))
+    if silence is None and wanted('pose_forecast'):
+        for stamp in robot.due(parameters.forecast_rate, parameters.forecast_horizon):
+            made = pose_mixture_message(messages, robot.forecast(stamp))
+            publish('pose_forecast', stamp, made)
 
 
 def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixture]:

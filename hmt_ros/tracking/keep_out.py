@@ -7,8 +7,8 @@ model and what is not known of its place,
 
 s the deviation of its ends in the second direction in which they are known least; along the first,
 which is depth, it is repeated, side by side, over q times the deviation there. Modes are taken,
-heaviest first, until they weigh `probability` together. Whoever is lost may have moved since: all
-capsules are wider by `reach`. Capsules that others hold are left out.
+heaviest first, until they weigh `probability` together. Capsules that others hold are left out.
+Whoever is lost may have moved since: all capsules are wider by `reach_after` the time since then.
 
 What is promised is what `benchmarks/keep_out.py` measures on clips, and no more: people whom the
 tracker has lost without knowing, or who hold long things, are outside.
@@ -21,6 +21,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
@@ -37,6 +38,8 @@ BARE = 0.07
 SPACING = 1.2
 # Share of a radius that is added to it rather than covered by capsules side by side.
 LITTLE = 0.15
+# How fast a hand can be that strikes, and how far it goes, m/s and m; and how fast a person runs.
+FASTEST, ARM, RUNNER = 7.0, 0.7, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,18 +85,14 @@ class Capsules:
 
     def without_held(self) -> Capsules:
         """Those that are not inside of larger ones together, by a few points of their surface."""
-        left = np.argsort(-self._sizes, kind='stable')
-        points = self._surfaces()
-        outside = np.ones(points.shape[:2], dtype=bool)
-        kept: list[int] = []
-        while len(left):
-            largest, left = left[0], left[1:]
-            kept.append(int(largest))
-            which, place = np.nonzero(outside[left])
-            held = self[[largest]].contain(points[left[which], place])
-            outside[left[which[held]], place[held]] = False
-            left = left[outside[left].any(1)]
-        return self[np.array(sorted(kept), dtype=np.intp)]
+        order = np.argsort(-self._sizes, kind='stable')
+        some = self[order]
+        kept = _not_held(some.starts, some.ends, some.radii, some._surfaces())
+        return self[np.sort(order[kept])]
+
+    def grown(self, reach: float) -> Capsules:
+        """The same, wider by a reach, m."""
+        return Capsules(self.starts, self.ends, self.radii + reach)
 
     @property
     def _sizes(self) -> Array:
@@ -119,26 +118,26 @@ class Capsules:
         )
 
 
-def keep_out_capsules(
-    body: Body, mixture: GaussianMixture, probability: float = 0.99, reach: float = 0.0
-) -> Capsules:
+def reach_after(time: float) -> float:
+    """How far any part of a person may be from where it was, m, after a time, s."""
+    return min(FASTEST * time, ARM + RUNNER * time)
+
+
+def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float = 0.99) -> Capsules:
     """Capsules that hold the person with about a probability.
 
     Args:
         body: of the poses.
         mixture: over the pose (d,), the posterior of an image, or a forecast.
         probability: of each part of the person, and of the modes; below 1.
-        reach: added to all radii, m: how far the person may have moved since.
 
     Raises:
-        ValueError: no modes, a probability that is not between 0 and 1, or a negative reach.
+        ValueError: no modes, or a probability that is not between 0 and 1.
     """
     if not len(mixture):
         raise ValueError('no modes; wanted those of a person who is tracked')
     if not 0.0 < probability < 1.0:
         raise ValueError(f'probability must be between 0 and 1, saw {probability}')
-    if not reach >= 0.0:
-        raise ValueError(f'reach must be a distance of at least 0 m, saw {reach}')
     some = mixture.sorted().normalised()
     count = int(np.searchsorted(np.cumsum(some.weights), probability)) + 1
     some = some[np.arange(min(count, len(some)))]
@@ -157,7 +156,7 @@ def keep_out_capsules(
     # Both ends go the same way.
     same = np.where((deep[:, :, 0] * deep[:, :, 1]).sum(2) < 0.0, -1.0, 1.0)
     deep[:, :, 1] *= same[:, :, None]
-    radius = radii + MARGIN + reach + wide * across
+    radius = radii + MARGIN + wide * across
     beyond = wide * np.maximum(along - across, 0.0)
     # A little is width, and not worth a second capsule.
     little = beyond < LITTLE * radius
@@ -194,3 +193,28 @@ def _parts(body: Body) -> tuple[Index, Array, Array]:
             ends += [skeleton.joint_offsets[joint] for joint in joints]
             radii.append(BARE)
     return np.array(segments, dtype=np.intp), np.array(ends), np.array(radii)
+
+
+@njit(cache=True, nogil=True)
+def _not_held(starts, ends, radii, points):  # type: ignore[no-untyped-def]
+    """Which of N capsules, the largest first, have points (N, P, 3) outside of those before."""
+    n, count = points.shape[0], points.shape[1]
+    outside = np.ones((n, count), np.bool_)
+    kept = np.zeros(n, np.bool_)
+    for i in range(n):
+        if not outside[i].any():
+            continue
+        kept[i] = True
+        ax, ay, az = starts[i, 0], starts[i, 1], starts[i, 2]
+        dx, dy, dz = ends[i, 0] - ax, ends[i, 1] - ay, ends[i, 2] - az
+        square = max(dx * dx + dy * dy + dz * dz, 1e-18)
+        limit = radii[i] * radii[i]
+        for j in range(i + 1, n):
+            for p in range(count):
+                if outside[j, p]:
+                    x, y, z = points[j, p, 0] - ax, points[j, p, 1] - ay, points[j, p, 2] - az
+                    along = min(max((x * dx + y * dy + z * dz) / square, 0.0), 1.0)
+                    x, y, z = x - along * dx, y - along * dy, z - along * dz
+                    if x * x + y * y + z * z <= limit:
+                        outside[j, p] = False
+    return kept

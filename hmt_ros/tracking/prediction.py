@@ -8,7 +8,7 @@ The optical flow then corrects the means, before shapes are compared.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from hmt_ros.image.surface import lens_of
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.energy import Quadratic
+from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
@@ -82,6 +83,38 @@ def expected_poses(
     states = predicted_states(modes, known, body, dynamics_of(body, motion), dt)
     means = np.clip(states.poses, body.lower, body.upper)
     return GaussianMixture(weights, means, states.pose_covariances)
+
+
+@dataclass(frozen=True, eq=False)
+class Forecaster:
+    """Predicts a track from one image on; nothing in it changes, so that any thread may ask.
+
+    Attributes:
+        modes: of that image.
+        weights: (K,) of the modes, as they were published.
+        body: with the limits.
+        motion: the setting.
+        stamp_ns: of the image.
+    """
+
+    modes: Modes
+    weights: Array
+    body: Body
+    motion: str
+    stamp_ns: int
+
+    def at(self, stamp_ns: int) -> GaussianMixture:
+        """The mixture over poses at a time of which no image speaks, as `expected_poses`.
+
+        Raises:
+            ValueError: the time is before the image.
+        """
+        if stamp_ns < self.stamp_ns:
+            raise ValueError(
+                f'{stamp_ns} ns is before the image of {self.stamp_ns} ns that is predicted from'
+            )
+        dt = seconds(stamp_ns - self.stamp_ns)
+        return expected_poses(self.modes, self.weights, self.body, self.motion, dt)
 
 
 def follow_flow(

@@ -39,7 +39,7 @@ from hmt_ros.tracking.initialisation import check_box
 from hmt_ros.tracking.misfit import SILHOUETTE
 from hmt_ros.tracking.observer import Observer
 from hmt_ros.tracking.point_estimate import PointEstimate
-from hmt_ros.tracking.prediction import expected_poses
+from hmt_ros.tracking.prediction import Forecaster
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes
@@ -331,6 +331,17 @@ class Tracker:
         return self._point.pose
 
     @property
+    def forecaster(self) -> Forecaster:
+        """Predicts the track from the last image that it followed.
+
+        Raises:
+            ValueError: there is no track.
+        """
+        assert self._followed is not None
+        weights = self.posterior.weights
+        return Forecaster(self.modes, weights, self.body, self.settings.motion, self._followed)
+
+    @property
     def origins(self) -> Array:
         """Probabilities (K, M) that component k of the posterior continues component m before.
 
@@ -512,10 +523,8 @@ class Tracker:
     def _expected(self, stamp: int) -> GaussianMixture:
         """The posterior of a time at which nothing is seen."""
         assert self._followed is not None
-        dt = seconds(stamp - self._followed)
-        motion = self.settings.motion
-        self._point.expect(self.body, self._track.dynamics, dt)
-        return expected_poses(self.modes, self.posterior.weights, self.body, motion, dt)
+        self._point.expect(self.body, self._track.dynamics, seconds(stamp - self._followed))
+        return self.forecaster.at(stamp)
 
     def _begin(self, observation: Observation, beginning: Beginning, stamp: int) -> None:
         """Starts the track."""

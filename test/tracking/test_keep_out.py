@@ -10,7 +10,7 @@ import pytest
 from hmt_ros.body import load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking.keep_out import BARE, MARGIN, Capsules, keep_out_capsules
+from hmt_ros.tracking.keep_out import BARE, MARGIN, Capsules, keep_out_capsules, reach_after
 
 BODY = load_body('human37')
 
@@ -88,11 +88,12 @@ def test_more_is_held_where_less_is_known():
     # Along the line of sight, and not to all sides.
     # A ball of this radius has 30 m^3.
     assert volumes[2] < 8.0
-    grown = keep_out_capsules(BODY, posterior(), reach=0.3)
-    np.testing.assert_allclose(
-        grown.radii.min(), keep_out_capsules(BODY, posterior()).radii.min() + 0.3, atol=0.2
-    )
+    grown = keep_out_capsules(BODY, posterior()).grown(0.3)
     assert grown.volume() > volumes[0]
+
+
+def test_a_hand_is_the_fastest_and_then_the_person():
+    assert [reach_after(t) for t in (0.0, 0.1, 1.0, 3.0)] == pytest.approx([0.0, 0.7, 3.7, 9.7])
 
 
 def test_a_body_without_flesh_has_its_bones():
@@ -108,8 +109,6 @@ def test_a_body_without_flesh_has_its_bones():
     [
         ({'probability': 1.0}, 'probability must be between 0 and 1, saw 1.0'),
         ({'probability': np.nan}, 'probability must be between 0 and 1, saw nan'),
-        ({'reach': -0.1}, 'reach must be a distance of at least 0 m, saw -0.1'),
-        ({'reach': np.nan}, 'reach must be a distance of at least 0 m, saw nan'),
     ],
 )
 def test_what_is_refused(how, text):

@@ -33,6 +33,7 @@ from msg_tools.messages.cdr import canonical, deserialise, serialise
 START_SECONDS = 600.0  # kernels may have to be compiled first
 MESSAGE_SECONDS = 120.0
 STOP_SECONDS = 20.0
+STALE_SECONDS = 3600.0
 # Sources whose messages late subscribers get, too.
 LATCHED_SOURCES = (TF_STATIC,)
 
@@ -313,6 +314,9 @@ class LiveNode:
     def _options(self, parameters: Any, sensors: tuple[str, ...]) -> list[str]:
         """Options of ROS that give the node its parameters and names."""
         values = {name: yaml_scalar(value) for name, value in values_of(parameters).items()}
+        if 'stale_time' in values:
+            # In lock step an image may take as long as it wants.
+            values['stale_time'] = yaml_scalar(STALE_SECONDS)
         for topic in sensors:
             values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
         lines = [f'    {name}: {text}' for name, text in values.items()]

@@ -36,6 +36,7 @@ class Player:
                 Body,
                 Ground,
                 Handled,
+                KeepOut,
                 Keypoints2D,
                 Keypoints3D,
                 PoseMixture,
@@ -52,8 +53,8 @@ class Player:
                 f'--live needs a sourced ROS 2 workspace ({error}): source install/setup.bash'
             ) from error
         kinds = (
-            Body, CameraInfo, CompressedImage, Ground, Handled, Image, JointState, Keypoints2D,
-            Keypoints3D, MarkerArray, PoseMixture, PoseWithCovarianceStamped, String, TFMessage,
+            Body, CameraInfo, CompressedImage, Ground, Handled, Image, JointState, KeepOut,
+            Keypoints2D, Keypoints3D, MarkerArray, PoseMixture, PoseWithCovarianceStamped, String, TFMessage,
             TrajectoryMixture,
         )  # fmt: skip
         self.classes: dict[str, Any] = {

@@ -70,7 +70,9 @@ class OfflineTrack(PlayedTrack):
         if parameters.bme is not None:
             self._bme = BmeSession(parameters.bme, self._predict, bme_session.TOPICS.__contains__)
         self._seen, self._heard = _seen_by_bme(parameters), _heard_by_bme(parameters)
-        self._filter = FilterSession(parameters.filter, self._filtered)
+        self._filter = FilterSession(
+            parameters.filter, self._filtered, track_messages.TOPICS.__contains__
+        )
         if parameters.smoother is not None:
             self._smoother = SmootherSession(parameters.smoother, lambda output: write(*output))
 
@@ -130,7 +132,7 @@ class PeopleTrack(PlayedTrack):
         assert isinstance(parameters.filter, PeopleParameters)
         self._write, self._add_topic = write, add_topic
         self._known: set[str] = set()
-        self._session = PeopleSession(parameters.filter, self._take_output)
+        self._session = PeopleSession(parameters.filter, self._take_output, _is_recorded)
 
     def __exit__(self, *_: object) -> None:
         """See `PlayedTrack`; nothing is open."""
@@ -248,6 +250,13 @@ class LiveTrack(PlayedTrack):
             return Handled(FINISH, 0, (), (), ())
         self._smoother.deactivate()
         return self._smoother.answer(FINISH)
+
+
+def _is_recorded(topic: str) -> bool:
+    """Whether bags have a topic of `PeopleSession`."""
+    return topic.rpartition('/')[2] not in track_messages.TOPICS_OF_NODE.keys() - (
+        track_messages.TOPICS.keys()
+    )
 
 
 def _seen_by_bme(parameters: NodeParameters) -> tuple[str, ...]:

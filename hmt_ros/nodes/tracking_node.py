@@ -1,0 +1,95 @@
+"""A node that tracks people: what nodes of one person and of several have in common.
+
+A watchdog tells robots where no image was answered for `stale_time`, by a clock that does not jump.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+from hmt_msgs.srv import Reset
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+
+from hmt_ros.nodes.session_node import SessionNode
+from hmt_ros.nodes.subscribed_topic import (
+    DEPTH_TOPIC,
+    MASK_TOPICS,
+    TRANSFORM_TOPICS,
+    SubscribedTopic,
+)
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.track_start import TrackStart
+from msg_tools.files.error_line import error_line
+
+AnySession = TypeVar('AnySession', bound=Any)
+Parameters = TypeVar('Parameters', bound=FilterParameters)
+
+# Period of the watchdog, s.
+_GLANCE = 0.05
+
+
+class TrackingNode(SessionNode[AnySession, Parameters]):
+    """A node of a session that tracks; see `SessionNode`."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        # Images that were answered, and when that was last seen.
+        self._count, self._answered = 0, time.monotonic()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._watchdog = self.create_timer(_GLANCE, self._watch, clock=steady)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listens."""
+        self._answered = time.monotonic()
+        return super().on_activate(state)
+
+    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
+        yield Reset, '~/reset', self._on_reset
+
+    def _inputs_of_images(self) -> Iterable[SubscribedTopic]:
+        """Topics of what comes with the images of a camera."""
+        yield from MASK_TOPICS
+        yield DEPTH_TOPIC
+        if self._session is not None and self._session.frames.wanted:
+            yield from TRANSFORM_TOPICS
+
+    @abstractmethod
+    def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
+        """What tracks start from by a request, and what will start them, in words.
+
+        Raises:
+            ValueError: a request that can not be used.
+        """
+
+    def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
+        session, thread = self._session, self._thread
+        if session is None or thread is None:
+            response.success, response.message = False, 'the node is not active'
+            return response
+        try:
+            start, response.message = self._start_asked_for(request)
+        except ValueError as error:
+            response.success, response.message = False, error_line(error)
+            self.get_logger().warn(f'~/reset is refused: {response.message}')
+            return response
+        thread.restart(lambda: session.restart(start))
+        response.success = True
+        self.get_logger().info(f'~/reset: {response.message}')
+        return response
+
+    def _watch(self) -> None:
+        """Tells robots of images that are not answered."""
+        session, thread = self._session, self._thread
+        if session is None or thread is None:
+            return
+        now = time.monotonic()
+        if session.answered != self._count:
+            self._count, self._answered = session.answered, now
+        silence = now - self._answered
+        if silence >= self._settings.stale_time:
+            for output in session.stale(silence):
+                self._publish(output)

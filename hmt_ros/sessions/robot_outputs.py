@@ -1,0 +1,186 @@
+"""What a robot acts on: where the person is at a time to come, and the space to keep out of.
+
+Both are made of the last image that showed the person. While no image does, because the track is
+lost, or no image comes, the space grows as fast as people move; only an image that says that nobody
+is in view frees it. Times are those of the stamps, so that the same images give the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+
+from hmt_ros.body import Body
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions.fixed_frame import FixedFrame
+from hmt_ros.tracking.keep_out import Capsules, keep_out_capsules, reach_after
+from hmt_ros.tracking.prediction import Forecaster
+from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.keep_out import KeepOut, KeepOutState
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, TrackState
+
+# Time after the newest image that is predicted at most, s: a person may be anywhere by then.
+LONGEST_FORECAST = 10.0
+# Forecasts that one image leads to at most: after a gap those between are of no use.
+MOST_FORECASTS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class LastSeen:
+    """A track in the last image that showed the person; nothing in it changes.
+
+    Attributes:
+        stamp_ns, frame_id: of the image; the frame is that of the camera.
+        body: of the track.
+        posterior: over poses, in the frame of the camera.
+        forecaster: of the track.
+        fixed: frame that is published in; None: the frame of the camera.
+        probability: of the capsules.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    body: Body
+    posterior: GaussianMixture
+    forecaster: Forecaster
+    fixed: FixedFrame | None
+    probability: float
+
+    @cached_property
+    def capsules(self) -> Capsules:
+        """That hold the person, in the frame that is published in."""
+        held = keep_out_capsules(self.body, self.posterior, self.probability)
+        if self.fixed is None:
+            return held
+        rotation, translation = self.fixed.camera
+        return Capsules(
+            held.starts @ rotation.T + translation, held.ends @ rotation.T + translation, held.radii
+        )
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What the newest image said; replaced as a whole, so that any thread may read it."""
+
+    state: KeepOutState = KeepOutState.UNKNOWN
+    stamp_ns: int = 0
+    frame_id: str = ''
+    track_id: int = 0
+    existence: float = math.nan
+    seen: LastSeen | None = None
+
+
+class RobotOutputs:
+    """Makes the outputs for robots.
+
+    `tell` and `forget` are for the thread that estimates, the others for any.
+    """
+
+    def __init__(self) -> None:
+        self._told = _Told()
+        self._forecast_until = 0
+
+    def forget(self) -> None:
+        """Time begins anew: what was seen tells nothing of it."""
+        self._told, self._forecast_until = _Told(), 0
+
+    def tell(
+        self,
+        stamp_ns: int,
+        frame_id: str,
+        state: KeepOutState,
+        track_id: int,
+        existence: float,
+        seen: LastSeen | None = None,
+    ) -> None:
+        """Takes what an image says.
+
+        Args:
+            stamp_ns, frame_id: of the image; the frame is the one that is published in.
+            state: of the track.
+            track_id: its number.
+            existence: probability that a person is in view; NaN: unknown.
+            seen: the track, in an image that shows the person; None: as in the image before.
+        """
+        before = self._told.seen
+        if state is KeepOutState.NOBODY:
+            before = None
+        elif state is KeepOutState.UNKNOWN and before is not None:
+            # A track was dropped; whom it followed has gone on.
+            state = KeepOutState.LOST
+        self._told = _Told(state, stamp_ns, frame_id, track_id, existence, seen or before)
+
+    def keep_out(self, probability: float, silence: float | None = None) -> KeepOut:
+        """The space to keep out of.
+
+        Args:
+            probability: that is asked for, where there are no capsules.
+            silence: time since the newest image was answered, s; None: it is being answered.
+        """
+        told = self._told
+        seen, state, stamp = told.seen, told.state, told.stamp_ns
+        if silence is not None:
+            state = KeepOutState.STALE
+            stamp += round(silence * SECOND_NS) if told.stamp_ns else 0
+        none = Capsules(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+        held, unseen = none, math.nan
+        if seen is not None:
+            unseen = (stamp - seen.stamp_ns) / SECOND_NS
+            held = seen.capsules.grown(reach_after(unseen))
+            probability = seen.probability
+        return KeepOut(
+            stamp, told.frame_id, state, held.starts, held.ends, held.radii, told.track_id,
+            told.existence, unseen, probability,
+        )  # fmt: skip
+
+    def forecast(self, stamp_ns: int) -> PoseMixture:
+        """The pose at a time after the newest image.
+
+        Raises:
+            ValueError: there is no track, or the time is before the image or long after.
+        """
+        told = self._told
+        seen = told.seen
+        if seen is None:
+            raise ValueError('nobody is tracked')
+        if not told.stamp_ns <= stamp_ns <= told.stamp_ns + LONGEST_FORECAST * SECOND_NS:
+            raise ValueError(
+                f'the newest image is of {told.stamp_ns} ns; wanted a time from then to '
+                f'{LONGEST_FORECAST:g} s later, saw {stamp_ns} ns'
+            )
+        mixture, frame = seen.forecaster.at(stamp_ns), seen.frame_id
+        if seen.fixed is not None:
+            mixture, _ = seen.fixed.placed(seen.body, mixture)
+            frame = seen.fixed.optical
+        tracking = told.state is KeepOutState.TRACKING
+        return PoseMixture.of_body(
+            seen.body, mixture, MixtureKind.FORECAST, stamp_ns, frame,
+            state=TrackState.TRACKING if tracking else TrackState.LOST,
+            track_id=told.track_id,
+            existence_probability=told.existence,
+            identities=seen.forecaster.modes.identities,
+        )  # fmt: skip
+
+    def due(self, rate: float, horizon: float) -> Iterable[int]:
+        """Times of which the newest image is the first to tell, by a horizon: a grid, ns.
+
+        Args:
+            rate: times a second; 0: none.
+            horizon: how long after an image a time is that it tells of, s.
+        """
+        told = self._told
+        if rate <= 0.0 or told.seen is None:
+            return ()
+        # Whole numbers: times since 1970 in ns are too large for products of floats.
+        every = SECOND_NS / Fraction(rate).limit_denominator(1000)
+        until = told.stamp_ns + round(horizon * SECOND_NS)
+        last = int(until // every)
+        first = int(max(self._forecast_until, told.stamp_ns) // every) + 1
+        first = max(first, last + 1 - MOST_FORECASTS)
+        self._forecast_until = max(until, self._forecast_until)
+        return (math.ceil(k * every) for k in range(first, last + 1))
