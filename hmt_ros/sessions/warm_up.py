@@ -19,6 +19,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.tracking import KnownGround, Subject, Tracker
+from hmt_ros.tracking.keep_out import keep_out_capsules
 from msg_tools import RosbagsMessages
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
@@ -82,6 +83,7 @@ def warm_up_tracking() -> None:
         tracker.step(image, _stamp(t), shown.keypoints(t))
         depth = np.where(mask, DISTANCE, 2.0 * DISTANCE).astype(np.float32)
         other.step(image, _stamp(t), depth=usable_depths(depth))
+    keep_out_capsules(tracker.body, tracker.posterior)
 
 
 def likelihoods(body: Body) -> list[Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_tools.messages.headers import header_message, time_ns
-from msg_tools.messages.message_error import MessageError, check_finite, numbers
+from msg_tools.messages.message_error import MessageError, check_finite, freeze_arrays, numbers
 from msg_tools.messages.message_types import MessageFactory
 
 KEEP_OUT = 'hmt_msgs/msg/KeepOut'
@@ -68,11 +68,10 @@ class KeepOut:
 
     def __post_init__(self) -> None:
         n = len(self.radii)
-        for name, shape in (('starts', (n, 3)), ('ends', (n, 3)), ('radii', (n,))):
-            values = numbers(getattr(self, name), shape, f'keep out: {name}')
-            check_finite(values, f'keep out: {name}')
-            values.flags.writeable = False
-            object.__setattr__(self, name, values)
+        shapes = {'starts': (n, 3), 'ends': (n, 3), 'radii': (n,)}
+        freeze_arrays(self, shapes, 'keep out')
+        for name in shapes:
+            check_finite(getattr(self, name), f'keep out: {name}')
         if n and self.radii.min() < 0:
             raise MessageError(f'keep out: a radius is {self.radii.min()}, wanted 0 or more')
         if n and self.state is KeepOutState.NOBODY:

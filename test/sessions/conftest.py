@@ -91,6 +91,18 @@ class StubTracker:
         return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]), identities=identities)
 
     @property
+    def forecaster(self):
+        """To the right by 1 m/s."""
+        stamp, before = self.seen[-1][0], self.posterior
+
+        def at(later):
+            means = before.means.copy()
+            means[:, 0] += 1e-9 * (later - stamp)
+            return replace(before, means=means)
+
+        return SimpleNamespace(at=at, modes=self.modes)
+
+    @property
     def velocities(self):
         """To the right, from the second image on."""
         moving = np.zeros((2, self.body.dimension))
@@ -130,10 +142,12 @@ class StubTracker:
         means[:, 2] = 4.0
         means[:, 0] = [0.1 * len(self.seen), -0.1]
         covariances = np.tile(1e-3 * np.eye(self.body.dimension), (2, 1, 1))
-        return tuple(
+        found = tuple(
             GaussianMixture(np.array([share, 1 - share]), means, covariances)
             for share in (0.75, 0.5)
         )
+        self.posterior = found[0]
+        return found
 
 
 @pytest.fixture

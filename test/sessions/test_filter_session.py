@@ -11,11 +11,12 @@ from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE,
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
-from hmt_ros.sessions.track_messages import TOPICS
+from hmt_ros.sessions.track_messages import TOPICS, TOPICS_OF_NODE
 from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.tracking import Status
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.keep_out import KeepOutState, keep_out_of
 from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 from test.sessions.conftest import JOINTS, Likelihoods
 
@@ -29,6 +30,7 @@ ONE_IMAGE = [
     '/tf',
     'markers',
     'overlay/compressed',
+    *(ROBOT := ['keep_out', 'keep_out_markers']),
 ]
 
 
@@ -329,7 +331,7 @@ def test_messages_that_can_not_be_read_are_counted(session):
 
 
 def read(output):
-    return deserialise(output.data, TOPICS[output.topic].msgtype)
+    return deserialise(output.data, TOPICS_OF_NODE[output.topic].msgtype)
 
 
 def test_nobody_in_view_is_told_once(session, outputs, small_camera, stub_tracker):
@@ -339,9 +341,10 @@ def test_nobody_in_view_is_told_once(session, outputs, small_camera, stub_tracke
     stub_tracker.empty |= {small_camera.stamp(index) for index in (1, 2)}
     del outputs[:]
     handled = [one.take(IMAGE, small_camera.image(index)) for index in (1, 2)]
-    shown = [*MIXTURES, 'markers', 'overlay/compressed']
+    shown = [*MIXTURES, 'markers', 'overlay/compressed', *ROBOT]
     assert handled[0].published == tuple((topic, small_camera.stamp(1)) for topic in shown)
-    assert handled[1].published == ()
+    # Robots are told of every image.
+    assert handled[1].published == tuple((topic, small_camera.stamp(2)) for topic in ROBOT)
     assert handled[0].faults == handled[0].warnings == ()
     messages = {output.topic: read(output) for output in outputs}
     for topic, kind in zip(MIXTURES, (MixtureKind.POSTERIOR, MixtureKind.LIKELIHOOD), strict=True):
@@ -779,7 +782,8 @@ def test_bad_predictions_are_told_and_not_used(session, small_camera, likelihood
 def test_waits_for_the_image_of_the_subject(session, outputs, small_camera):
     one = session()
     one.take(CAMERA_INFO, small_camera.info())
-    assert one.take(IMAGE, small_camera.image(-1)).published == ()
+    handled = one.take(IMAGE, small_camera.image(-1))
+    assert [topic for topic, _ in handled.published] == ROBOT
     assert one.state.status == 'waiting'
     assert f'image of {small_camera.stamp(0)} ns or later' in one.state.wants
     one.take(IMAGE, small_camera.image(0))
@@ -988,5 +992,77 @@ def test_dropped_images_are_counted(session, small_camera):
 
 
 def test_topics_are_those_of_the_architecture():
-    assert set(TOPICS) == {*STARTS, *ONE_IMAGE}
+    assert set(TOPICS_OF_NODE) == {*STARTS, *ONE_IMAGE, 'pose_forecast'}
+    assert TOPICS_OF_NODE.keys() - TOPICS.keys() == {'keep_out_markers'}
     assert [topic for topic, published in TOPICS.items() if published.latched] == STARTS
+
+
+# What a robot acts on.
+
+
+def kept_out(outputs):
+    return [keep_out_of(read(one)) for one in outputs if one.topic == 'keep_out']
+
+
+def test_robots_are_told_of_every_image(session, outputs, small_camera, stub_tracker):
+    one = session(keep_out_probability=0.9)
+    one.take(CAMERA_INFO, small_camera.info())
+    stub_tracker.empty |= {small_camera.stamp(2)}
+    for index in (-1, 0, 1, 2):
+        one.take(IMAGE, small_camera.image(index))
+    found = kept_out(outputs)
+    states = [KeepOutState.UNKNOWN, *2 * [KeepOutState.TRACKING], KeepOutState.NOBODY]
+    assert [content.state for content in found] == states
+    assert [content.stamp_ns for content in found] == [small_camera.stamp(i) for i in range(-1, 3)]
+    assert [len(content.radii) > 0 for content in found] == [False, True, True, False]
+    assert {content.probability for content in found} == {0.9}
+    assert found[1].existence_probability == 0.875
+    assert one.answered == 4
+
+
+def test_a_camera_that_stops_makes_the_space_grow(session, outputs, small_camera):
+    one = session()
+    (before,) = [keep_out_of(read(x)) for x in one.stale(1.0) if x.topic == 'keep_out']
+    assert (before.state, len(before.radii)) == (KeepOutState.STALE, 0)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    (last,) = kept_out(outputs)
+    markers, capsules = sorted(one.stale(0.2), key=lambda x: x.topic == 'keep_out')
+    assert markers.topic == 'keep_out_markers'
+    after = keep_out_of(read(capsules))
+    assert (after.state, after.unseen) == (KeepOutState.STALE, 0.2)
+    assert (after.radii - last.radii).tolist() == pytest.approx([1.3] * len(last.radii))
+    # It is told by whoever watches, and not as the answer to an image.
+    assert len(kept_out(outputs)) == 1
+
+
+def test_a_reset_does_not_free_the_space(session, outputs, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(1))
+    one.restart(replace(one.start, initial=None, box=None))
+    one.take(IMAGE, small_camera.image(2))
+    found = kept_out(outputs)
+    assert [content.state for content in found] == [KeepOutState.TRACKING, KeepOutState.LOST]
+    assert found[1].unseen == pytest.approx(0.1)
+
+
+def test_where_time_begins_again_nothing_is_known(session, outputs, small_camera):
+    one = session(reset_on_time_jump=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(1))
+    one.take(IMAGE, small_camera.image(-5))
+    found = kept_out(outputs)
+    assert [content.state for content in found] == [KeepOutState.TRACKING, KeepOutState.UNKNOWN]
+    assert len(found[1].radii) == 0
+
+
+def test_forecasts_lie_on_a_grid_of_time(session, outputs, small_camera):
+    one = session(forecast_rate=20.0, forecast_horizon=0.1)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in (0, 1):
+        one.take(IMAGE, small_camera.image(index))
+    found = [pose_mixture_of(read(x)) for x in outputs if x.topic == 'pose_forecast']
+    assert [x.stamp_ns for x in found] == [small_camera.stamp(i) for i in (0.5, 1, 1.5, 2)]
+    assert {x.kind for x in found} == {MixtureKind.FORECAST}
+    assert found[0].means[0, 0] - found[1].means[0, 0] == pytest.approx(-0.05)

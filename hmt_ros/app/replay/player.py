@@ -54,8 +54,8 @@ class Player:
             ) from error
         kinds = (
             Body, CameraInfo, CompressedImage, Ground, Handled, Image, JointState, KeepOut,
-            Keypoints2D, Keypoints3D, MarkerArray, PoseMixture, PoseWithCovarianceStamped, String, TFMessage,
-            TrajectoryMixture,
+            Keypoints2D, Keypoints3D, MarkerArray, PoseMixture, PoseWithCovarianceStamped, String,
+            TFMessage, TrajectoryMixture,
         )  # fmt: skip
         self.classes: dict[str, Any] = {
             f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}': kind for kind in kinds
