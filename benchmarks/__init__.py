@@ -16,6 +16,7 @@ BENCHMARKS = {
     'error_model': 'how far the errors of each cue are independent, in an image and in time',
     'experts': 'conditional densities: a toy, motions of people apart, clips, speed',
     'flips': 'time per leaf of the interpretation trees',
+    'forecast': 'where a person is said to be soon, against holding the last pose',
     'gate': 'whether a step of the tracker costs more than a table that is checked in says',
     'hypotheses': 'what it brings to keep more modes',
     'joint_errors': 'what joints err by in every pose, and what all images leave of a covariance',

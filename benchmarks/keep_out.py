@@ -3,7 +3,8 @@
 The tracker follows all clips with known truth, gravity given, at several rates of images. In each
 image that it answers, a joint is missed that lies in none of `keep_out_capsules`. Beside the misses
 stands the volume, against that of the capsules of the heaviest mode, which are exact and wider by
-0.1 m: a curve over the probability that is asked for.
+0.1 m: a curve over the probability that is asked for. So it is in the second after a second without
+images, too.
 """
 
 from __future__ import annotations
@@ -22,9 +23,12 @@ from benchmarks.runs import BOTH, GIVEN, IMAGES, in_processes, true_joints
 from benchmarks.smoothing_clips import tracked
 from benchmarks.tracking_means import GROUPS, group_of
 from hmt_ros.tracking.keep_out import MARGIN, Capsules, keep_out_capsules
+from msg_tools.messages.headers import SECOND_NS
 
 PROBABILITIES = (0.9, 0.95, 0.99, 0.997)
-RATES = (30.0, 8.0, 3.0)
+AFTER_GAPS = 0.0  # in place of a rate
+RATES = (30.0, 8.0, 3.0, AFTER_GAPS)
+GAP = SECOND_NS  # that images and gaps last, in turn
 # Images a second that are looked at, at most.
 LOOKS = 5.0
 # By how much the capsules are wider that volumes are compared with, m; random points of a volume.
@@ -43,9 +47,19 @@ class Work(NamedTuple):
 
 def of_clip(work: Work) -> dict[str, list[float]]:
     """Shares of images with a missed joint, and median volumes, by probability."""
-    clip = at_rate(read_clip(work.folder, work.limit), work.rate)
-    seen = [x for x in tracked(clip, work.inputs, GIVEN) if x.stamp in clip.truth.joints]
-    seen = seen[:: max(round(work.rate / LOOKS), 1)]
+    clip = read_clip(work.folder, work.limit)
+    if work.rate == AFTER_GAPS:
+        start = clip.stamps[0]
+        kept = [i for i, stamp in enumerate(clip.stamps) if (stamp - start) // GAP % 2 == 0]
+        stamps, images = ([x[i] for i in kept] for x in (clip.stamps, clip.images))
+        clip = replace(clip, stamps=stamps, images=images)
+        answered = tracked(clip, work.inputs, GIVEN)
+        seen = [x for x in answered if x.stamp - start >= GAP and x.stamp in clip.truth.joints]
+    else:
+        clip = at_rate(clip, work.rate)
+        answered = tracked(clip, work.inputs, GIVEN)
+        seen = [x for x in answered if x.stamp in clip.truth.joints]
+    seen = seen[:: max(round((work.rate or 30.0) / LOOKS), 1)]
     missed: list[list[bool]] = [[] for _ in PROBABILITIES]
     volumes: list[list[float]] = [[] for _ in PROBABILITIES]
     for one, joints in zip(seen, true_joints(clip, [x.stamp for x in seen]), strict=True):
@@ -59,8 +73,8 @@ def of_clip(work: Work) -> dict[str, list[float]]:
             missed[i].append(not capsules.contain(known).all())
             volumes[i].append(capsules.volume(SAMPLES) / usual)
     return {
-        'missed': [float(np.mean(x)) for x in missed],
-        'volume': [float(np.median(x)) for x in volumes],
+        'missed': [float(np.mean(x)) if x else np.nan for x in missed],
+        'volume': [float(np.median(x)) if x else np.nan for x in volumes],
     }
 
 
@@ -91,7 +105,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
                         {
                             'clips': group, 'rate': rate, 'inputs': given,
                             **{
-                                name: np.mean([x[name] for x in own], axis=0).tolist()
+                                name: np.nanmean([x[name] for x in own], axis=0).tolist()
                                 for name in ('missed', 'volume')
                             },
                         }
@@ -106,13 +120,18 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     ]
     for group in dict.fromkeys(x['clips'] for x in result['means']):
         rows.append([group, *[''] * (len(rows[0]) - 1)])
-        for one in result['means']:
-            if one['clips'] == group:
-                cells = [
+        rows += [
+            [
+                one['inputs'],
+                f'{one["rate"]:g}' if one['rate'] else '30, after a gap',
+                *(
                     f'{100 * missed:.1f} %, {volume:.1f}'
                     for missed, volume in zip(one['missed'], one['volume'], strict=True)
-                ]
-                rows.append([one['inputs'], f'{one["rate"]:g}', *cells])
+                ),
+            ]
+            for one in result['means']
+            if one['clips'] == group
+        ]
     return table(rows, markdown=markdown)
 
 

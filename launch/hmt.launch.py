@@ -31,6 +31,8 @@ DETECTORS = ('keypoints_node', 'keypoints_adapter_node')
 # Several people: its topics are in the root namespace.
 PEOPLE = 'people_node'
 NODES = (*USUAL_NODES, *DETECTORS, PEOPLE)
+# Runs nodes of one person in one process.
+TOGETHER = 'person_node'
 # Default frame of images in the nodes; and the frame for views, which need z up.
 OPTICAL, UPRIGHT = 'camera_optical_frame', 'camera_upright'
 # Rotation from (x right, y down, z forward) to (x forward, y left, z up).
@@ -55,6 +57,12 @@ ARGUMENTS = (
         ' '.join(USUAL_NODES),
         f'nodes to start, separated by blanks; besides these {" or ".join(DETECTORS)}, whose '
         f'keypoints the filter then uses; {PEOPLE} alone tracks several people',
+    ),
+    (
+        'one_process',
+        'true',
+        f"'false': each node has a process of its own, which takes twice the memory and is faster "
+        f'with three cores or more; {PEOPLE} always has one',
     ),
     ('image', '/camera/image_raw', 'topic of the images, without /compressed'),
     ('camera_info', '', 'topic of the calibration; empty: camera_info beside the images'),
@@ -202,20 +210,39 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
     }
     own = [given['params_file']] if given['params_file'] else []
     env = _room_for_images(share) if transport == 'raw' else {}
-    actions: list[Any] = [
-        Node(
-            package=PACKAGE,
-            executable=name,
-            name=name,
-            namespace=namespace,
-            parameters=[str(share / 'config' / f'{name}.yaml'), _file(name, values[name]), *own],
-            remappings=[] if name == 'smoother_node' else remappings,
-            ros_arguments=['--log-level', f'{_logger(namespace, name)}:={given["log_level"]}'],
-            output='both',
-            additional_env=env,
-        )
-        for name in names
-    ]
+    files = {
+        name: [str(share / 'config' / f'{name}.yaml'), _file(name, values[name])] for name in names
+    }
+    levels = {name: f'{_logger(namespace, name)}:={given["log_level"]}' for name in names}
+    if _truth(given, 'one_process') and PEOPLE not in names:
+        actions: list[Any] = [
+            Node(
+                package=PACKAGE,
+                executable=TOGETHER,
+                namespace=namespace,
+                arguments=names,
+                parameters=[file for name in names for file in files[name]] + own,
+                remappings=remappings,
+                ros_arguments=[x for name in names for x in ('--log-level', levels[name])],
+                output='both',
+                additional_env=env,
+            )
+        ]
+    else:
+        actions = [
+            Node(
+                package=PACKAGE,
+                executable=name,
+                name=name,
+                namespace=namespace,
+                parameters=[*files[name], *own],
+                remappings=[] if name == 'smoother_node' else remappings,
+                ros_arguments=['--log-level', levels[name]],
+                output='both',
+                additional_env=env,
+            )
+            for name in names
+        ]
     if _truth(given, 'hri'):
         _installed('hri_msgs', 'hri')
         actions.append(_hri_node(given, share, namespace, common, remappings, env))

@@ -302,7 +302,8 @@ def test_command_line(capsys, tmp_path):
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
         "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, distance, "
-        'error_model, experts, flips, gate, hypotheses, joint_errors, keep_out, keypoint_noise, '
+        'error_model, experts, flips, forecast, gate, hypotheses, joint_errors, keep_out, '
+        'keypoint_noise, '
         'kernels, kjs, lifting, live, motion_prior, nodes, people, real_video, smoothing, soak, '
         'tracking, vertical, votes'
     ]

@@ -52,7 +52,7 @@ PAGE_IDS = [str(path.relative_to(ROOT)) for path in PAGES]
 BLOCK = re.compile(r'^(<!-- run -->\n)?```(\w+)\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 # Parameters and published topics of the nodes.
 NODES = {
-    'filter_node': (FilterParameters(), track_messages.TOPICS),
+    'filter_node': (FilterParameters(), track_messages.TOPICS_OF_NODE),
     'smoother_node': (SmootherParameters(), smoothed_messages.TOPICS),
     'bme_node': (BmeParameters(), bme_session.BmeSession.TOPICS),
     'keypoints_node': (KeypointsParameters(), keypoints_session.TOPICS),

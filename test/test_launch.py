@@ -47,7 +47,7 @@ OF_ALL_NODES = (
     r'list_parameters|set_parameters|set_parameters_atomically|change_state|get_state|'
     r'get_available_states|get_available_transitions|get_transition_graph|transition_event)$'
 )
-TOPICS = {**track_messages.TOPICS, **smoothed_messages.TOPICS, **bme_session.TOPICS}
+TOPICS = {**track_messages.TOPICS_OF_NODE, **smoothed_messages.TOPICS, **bme_session.TOPICS}
 SETTINGS = {
     'filter_node': FilterParameters(),
     'smoother_node': SmootherParameters(),
@@ -105,7 +105,8 @@ def actions(description, tmp_path, monkeypatch):
         *declared, function = entities
         context = {one.arguments[0]: one.options['default_value'] for one in declared}
         assert given.keys() <= context.keys()
-        made = function.options['function']({**context, **given})
+        # One by one, unless a test is about the process of all.
+        made = function.options['function']({**context, 'one_process': 'false', **given})
         return {one.options.get('executable', 'bag'): one.options for one in made}
 
     return make
@@ -153,6 +154,35 @@ def test_three_nodes_in_the_namespace_of_a_person(actions):
     alone = parameters(actions(nodes='bme_node')['bme_node'])
     assert alone['tracked_interval'] == 0.0
     assert made['smoother_node']['remappings'] == []
+
+
+def test_one_process_for_all(actions, description):
+    defaults = {name: default for name, default, _ in description['ARGUMENTS']}
+    assert defaults['one_process'] == 'true'
+    made = actions(
+        one_process='true', nodes='bme_node filter_node', params_file='own.yaml', hri='true',
+        keypoints='/pose2d',
+    )  # fmt: skip
+    assert list(made) == ['person_node', 'hri_node']
+    one, apart = made['person_node'], actions(nodes='bme_node filter_node', keypoints='/pose2d')
+    # Nodes keep the names that parameter files know: a name would be that of all of them.
+    assert 'name' not in one
+    assert one['arguments'] == ['bme_node', 'filter_node']
+    assert one['namespace'] == NAMESPACE
+    assert one['remappings'] == apart['filter_node']['remappings']
+    *files, own = one['parameters']
+    assert own == 'own.yaml'
+    for number, name in enumerate(one['arguments']):
+        config, values = files[2 * number : 2 * number + 2]
+        assert config == str(ROOT / 'hmt_ros' / 'config' / f'{name}.yaml')
+        assert read_parameter_file(values, name) == parameters(apart[name])
+    assert one['ros_arguments'] == [
+        word
+        for name in one['arguments']
+        for word in ('--log-level', f'humans.bodies.p1.{name}:=info')
+    ]
+    # Several people have a node, and so a process, of their own.
+    assert list(actions(one_process='true', nodes='people_node')) == ['people_node']
 
 
 def test_nodes_that_find_keypoints(actions):
@@ -424,7 +454,7 @@ def test_the_real_launch_package_understands_the_file(tmp_path, monkeypatch):
     *declared, function = made.entities
     for one in declared:
         one.execute(context)
-    assert [type(one).__name__ for one in function.execute(context)] == ['Node'] * 3
+    assert [type(one).__name__ for one in function.execute(context)] == ['Node']
 
 
 # The nodes, started with what the launch file gives launch_ros.
@@ -576,6 +606,7 @@ def started(description, tmp_path_factory):
         # What the user's own file says goes before it.
         subject_file='12',
         background_file=str(REACH / 'background.png'),
+        one_process='false',
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, 'tempdir', str(folder))

@@ -77,8 +77,8 @@ class SmootherParameters(NodeParameters):
             one; if empty, that name.
         method: Smoothing method: 'paths', the most probable paths in closed form, or 'variational',
             refined as in VMS, which takes seconds for an image.
-        fixed_lag: Time by which a smoothed pose is older than the newest image at most, at any rate
-            of images, s; 0 is filtering.
+        fixed_lag: Time by which a smoothed pose is older than the newest image, at any rate of
+            images, and a fifth of it more at most, s; 0 is filtering.
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
         max_trajectories: Maximum number of components of a mixture over trajectories.
         max_hypotheses: Maximum number of components of smoothed_pose_mixture.

@@ -3,9 +3,10 @@
 The node and offline replay give their messages to a `SmootherSession`; the same messages in the
 same order give the same bytes. The rules:
 
-- Mixtures are smoothed in the order of their stamps, in a sliding window. A pose is published as
-  smoothed before it is older than the newest by more than `fixed_lag`; those that are still open
-  when the window ends are published then: at the end of the stream (`finish`), where time jumps
+- Mixtures are smoothed in the order of their stamps, in a sliding window, ten times a second at
+  most: neighbours tell nearly the same. A pose is published as smoothed before it is older than the
+  newest by more than `fixed_lag` and a fifth of it; those that are still open when the window ends
+  are published then: at the end of the stream (`finish`), where time jumps
   back, at a new body.
 - A mixture that is not younger than the one before is skipped, or starts a new window with
   `reset_on_time_jump`.
@@ -78,6 +79,8 @@ FINISH = 'finish'  # what `finish` calls the end of the stream
 NOBODY = 'nobody'  # status while nobody is in view
 # Change of a length from one mixture to the next above which it is another person's, m.
 SAME_PERSON = 0.02
+# Time between two smoothings, as a share of the lag, and at most, s: neighbours tell the same.
+SHARE_OF_LAG, RARELY = 0.2, 0.1
 
 
 @dataclass(frozen=True)
@@ -227,16 +230,17 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         )
         self._log.counts['smoothed'] += 1
         self.kept = KeptMixtures(of, (*self.kept.items, evidence)[-p.window_length :])
-        self._weights = update.trajectories.weights
-        window_messages(
-            self._messages,
-            update.trajectories,
-            of,
-            covariances=p.publish_covariances,
-            shapes=_shapes((at, one.shape) for at, one in self._open.items()),
-            wanted=self._wanted,
-            publish=lambda topic, made: self._publish(topic, stamp, made),
-        )
+        if update.trajectories is not None:
+            self._weights = update.trajectories.weights
+            window_messages(
+                self._messages,
+                update.trajectories,
+                of,
+                covariances=p.publish_covariances,
+                shapes=_shapes((at, one.shape) for at, one in self._open.items()),
+                wanted=self._wanted,
+                publish=lambda topic, made: self._publish(topic, stamp, made),
+            )
         for pose in update.final:
             self._publish_final(pose, of)
 
@@ -317,6 +321,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             p.fixed_lag,
             p.random_seed,
             first_identity=self._first_identity,
+            every=min(SHARE_OF_LAG * p.fixed_lag, RARELY),
         )
 
     def _smoother(self, body: Body) -> MixtureSmoother:

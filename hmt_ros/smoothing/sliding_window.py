@@ -4,7 +4,7 @@ The window holds the newest poses, and the paths through their modes that are pr
 filtered one by one (`path_hypotheses`). What came before it are the states of these paths at its
 first time: the window is smoothed with their density in the place of the first likelihood, so that
 a new image costs the same however long the sequence is. A pose is final before it is older than the
-newest one by more than the lag.
+newest one by more than the lag, and the time between two smoothings.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ class WindowUpdate:
     """What a new observation changes.
 
     Attributes:
-        trajectories: the mixture over the poses in the window.
+        trajectories: the mixture over the poses in the window; None: it was not smoothed.
         final: poses that have become final, oldest first.
     """
 
-    trajectories: TrajectoryMixture
+    trajectories: TrajectoryMixture | None
     final: tuple[FinalPose, ...]
 
 
@@ -85,6 +85,8 @@ class SlidingWindow:
             it older. 0 is filtering; infinite: nothing is final before the end.
         seed: of all randomness.
         first_identity: of the first trajectory.
+        every: least time between two smoothings, s; poses that become final meanwhile wait for
+            the next.
 
     Attributes:
         next_identity: that no trajectory has had.
@@ -100,11 +102,12 @@ class SlidingWindow:
         seed: int = 0,
         *,
         first_identity: int = 1,
+        every: float = 0.0,
     ) -> None:
         if not fixed_lag >= 0:
             raise ValueError(f'fixed_lag must be a time that is not negative, saw {fixed_lag} s')
         self.smoother, self.fixed_lag, self.seed = smoother, fixed_lag, seed
-        self.first_identity = first_identity
+        self.first_identity, self.every = first_identity, every
         self.reset()
 
     def reset(self) -> None:
@@ -159,12 +162,22 @@ class SlidingWindow:
         self._lasting.append(lasting)
         for _ in range(self._final):
             self._advance()
+        self._final = 0
+        if not self._is_due(interval):
+            return WindowUpdate(None, ())
         found = self._smooth()
         self._final = self._number_of_final()
         if self._final:
             found = replace(found, final_until_ns=self._stamps[self._final - 1])
         self._last = found
         return WindowUpdate(found, _final_poses(found, range(self._final)))
+
+    def _is_due(self, interval: float) -> bool:
+        """Whether the window is smoothed now, an interval after the pose before, s."""
+        if self._last is None or self._last.stamps_ns is None:
+            return True
+        since = (self._stamps[-1] - self._last.stamps_ns[-1]) / SECOND_NS
+        return since >= self.every - TREMBLE * interval
 
     def _number_of_final(self) -> int:
         """How many poses of the window, the oldest, are not to be revised."""
@@ -183,12 +196,14 @@ class SlidingWindow:
 
     def finish(self) -> tuple[FinalPose, ...]:
         """The poses that are still open, as final as they will be, and forgets everything."""
-        last = self._last
+        last, stamps = self._last, self._stamps
         if last is None or last.stamps_ns is None:
             return ()
         until = last.final_until_ns
-        stamps = enumerate(last.stamps_ns)
-        result = _final_poses(last, [t for t, stamp in stamps if until is None or stamp > until])
+        if last.stamps_ns[-1] != stamps[-1]:
+            last = self._smooth()
+        open_ones = [t for t, stamp in enumerate(stamps) if until is None or stamp > until]
+        result = _final_poses(last, open_ones)
         self.reset()
         return result
 

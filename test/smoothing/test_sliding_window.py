@@ -219,3 +219,28 @@ def test_an_endless_lag_keeps_all_poses_open(modes, walk):
     )
     assert all(update.final == () for update in updates)
     assert len(final) == 4
+
+
+def test_neighbours_are_smoothed_together(modes):
+    mixtures = modes(2.0, times=40)
+    stamps = [round(33_333_333.3 * t) for t in range(len(mixtures))]
+
+    def final(every):
+        window = SlidingWindow(MixtureSmoother(FAST), fixed_lag=0.3, every=every)
+        updates = [window.step(at, one) for at, one in zip(stamps, mixtures, strict=True)]
+        poses = [(t, pose) for t, update in enumerate(updates) for pose in update.final]
+        smoothed = sum(update.trajectories is not None for update in updates)
+        last = [(len(mixtures) - 1, pose) for pose in window.finish()]
+        return smoothed, [*poses, *last]
+
+    count, always = final(0.0)
+    fewer, rarely = final(0.1)
+    assert (count, fewer) == (40, 14)
+    assert [pose.stamp_ns for _, pose in rarely] == stamps
+    assert [pose.stamp_ns for _, pose in always] == stamps
+    ages = [(stamps[t] - pose.stamp_ns) / 1e9 for t, pose in rarely]
+    assert 0.3 < max(ages) <= 0.4 + 1e-6
+    # Those that wait know more, and those that do not know the same.
+    for (_, one), (_, other) in zip(always, rarely, strict=True):
+        near = np.abs(one.mixture.mean() - other.mixture.mean())
+        assert near.max() < 3.0 * np.sqrt(np.diag(one.mixture.covariance()).max())

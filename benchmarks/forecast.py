@@ -1,0 +1,154 @@
+"""forecast: where the tracker says that a person will be, against holding the last pose.
+
+The tracker follows all clips with known truth, gravity given. From each image it predicts the pose
+at times after it: `forecast`, as `pose_forecast` has it. Beside it stand the pose of that image,
+held, and moved on at the velocity of the mode; and what the pose errs by in its own image, which no
+forecast from it can do without.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.clips import find_clips, read_clip, read_detections, table
+from benchmarks.command import benchmark_parser, show
+from benchmarks.machine import description
+from benchmarks.runs import BOTH, IMAGES, in_processes, new_tracker
+from benchmarks.tracking_means import GROUPS, group_of
+from hmt_ros.body import Body, load_body
+from hmt_ros.evaluation.track_scores import Estimate, TrackScorer
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.tracking import TrackerSettings
+from msg_tools.messages.headers import SECOND_NS
+
+AHEAD = (0.1, 0.2, 0.5)  # s
+FORECAST, HELD, CONSTANT, THEN = 'forecast', 'held', 'constant velocity', 'in its own image'
+WAYS = (FORECAST, HELD, CONSTANT, THEN)
+QUICK = 12  # images
+# The truth nearest to a time that is asked for is at most so far away, s.
+NEAR = 0.02
+
+
+class Work(NamedTuple):
+    """A clip, and how it is seen."""
+
+    folder: Path
+    inputs: str
+    limit: int | None
+
+
+def of_clip(work: Work) -> dict[str, dict[str, float]]:
+    """Error of the heaviest mode, mm, and coverage of 90 % regions, by time ahead and way."""
+    clip = read_clip(work.folder, work.limit)
+    found = {} if work.inputs == IMAGES else read_detections(clip.folder).keypoints
+    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    scorers = {f'{way} {ahead:g}': TrackScorer(way, clip.truth) for way in WAYS for ahead in AHEAD}
+    stamps = np.array(sorted(clip.truth.joints))
+    for stamp, image in zip(clip.stamps, clip.images, strict=True):
+        if stamp in clip.ups:
+            tracker.set_gravity(clip.ups[stamp])
+        posterior, _ = tracker.step(image, stamp, found.get(stamp))
+        if posterior is None:
+            continue
+        for ahead in AHEAD:
+            then = int(stamps[np.argmin(abs(stamps - stamp - round(ahead * SECOND_NS)))])
+            if abs(then - stamp - ahead * SECOND_NS) > NEAR * SECOND_NS:
+                continue
+            interval = (then - stamp) / SECOND_NS
+            velocities = tracker.velocities
+            moved = posterior.means.copy()
+            if velocities is not None:
+                moved += interval * velocities
+            made = {
+                FORECAST: (then, tracker.forecaster.at(then)),
+                HELD: (then, posterior),
+                CONSTANT: (then, replace(posterior, means=moved)),
+                THEN: (stamp, posterior),
+            }
+            for way, (at, mixture) in made.items():
+                scorers[f'{way} {ahead:g}'].take(_estimate(at, mixture, tracker.body))
+    scores = {}
+    for name, scorer in scorers.items():
+        summary = scorer.finish().scores.summary()
+        scores[name] = {
+            'mm': float(summary['heaviest_mm']),
+            'region': float(summary['joint_coverage_90']),
+        }
+    return scores
+
+
+def _estimate(stamp: int, mixture: GaussianMixture, body: Body) -> Estimate:
+    return Estimate(
+        stamp, mixture.weights, mixture, body.joint_positions(mixture.means), body.joint_names, body
+    )
+
+
+def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
+    """What `of_clip` finds on the clips, and means over groups of clips.
+
+    Raises:
+        ValueError: there are none, or one can not be read.
+    """
+    folders = find_clips(clips, moving=False)[0]
+    folders = [x for x in folders if clips is not None or (x / 'keypoints_mediapipe.npz').exists()]
+    inputs, limit = (IMAGES, BOTH), None
+    if quick:
+        folders, inputs, limit = folders[:1], (IMAGES,), QUICK + 6
+    work = [Work(x, given, limit) for given in inputs for x in folders]
+    found = in_processes(of_clip, work, 0, 'forecast')
+    means = []
+    for group in GROUPS:
+        for given in inputs:
+            own = [
+                scores for one, scores in zip(work, found, strict=True)
+                if one.inputs == given and group_of(one.folder.name) == group
+            ]  # fmt: skip
+            means += [
+                {
+                    'clips': group, 'inputs': given, 'ahead': ahead,
+                    **{way: _mean(own, f'{way} {ahead:g}') for way in WAYS},
+                }
+                for ahead in AHEAD if own
+            ]  # fmt: skip
+    return {'machine': description(), 'means': means}
+
+
+def _mean(scores: list[dict[str, dict[str, float]]], name: str) -> dict[str, float]:
+    return {
+        what: float(np.nanmean([one[name][what] for one in scores])) for what in ('mm', 'region')
+    }
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """A table for people."""
+    rows = [['inputs', 'ahead', *WAYS, 'forecast : held', '90 % regions']]
+    for group in dict.fromkeys(x['clips'] for x in result['means']):
+        rows.append([group, *[''] * (len(rows[0]) - 1)])
+        rows += [
+            [
+                one['inputs'], f'{one["ahead"]:g} s',
+                *(f'{one[way]["mm"]:.0f} mm' for way in WAYS),
+                f'{one[FORECAST]["mm"] / one[HELD]["mm"]:.2f}',
+                f'{100 * one[FORECAST]["region"]:.0f} %',
+            ]
+            for one in result['means'] if one['clips'] == group
+        ]  # fmt: skip
+    return table(rows, markdown=markdown)
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark."""
+    parser = benchmark_parser('forecast', __doc__, quick=f'{QUICK} images of one clip')
+    parser.add_argument('--clips', type=Path, help='folder of clips')
+    options = parser.parse_args(argv)
+    try:
+        result = measure(options.clips, quick=options.quick)
+    except ValueError as error:
+        print(f'forecast: {error}', file=sys.stderr)
+        return 1
+    return show(result, as_text, as_json=options.json)

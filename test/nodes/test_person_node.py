@@ -1,0 +1,184 @@
+"""Nodes in one process: the same topics and bytes, without the way through DDS."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.sessions.bme_session import PREDICTION
+from msg_tools.messages.cdr import serialise
+from test.nodes.conftest import PATIENCE
+
+pytestmark = pytest.mark.ros
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def together(stub_tracker, stub_predictor, background_file):
+    """Filter, smoother and experts of one process, an executor, and somebody who talks to them."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.parameter import Parameter
+
+    from hmt_ros.nodes.person_node import USUAL, nodes_together
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    reliable = {
+        f'qos_overrides./{topic}.subscription.reliability': 'reliable'
+        for topic in ('image', 'camera_info')
+    }
+    values = {'background_file': str(background_file), **reliable}
+    made = []
+
+    def make(**more):
+        overrides = [Parameter(k, value=v) for k, v in {**values, **more}.items()]
+        made.extend(nodes_together(USUAL, context=context, parameter_overrides=overrides))
+        executor = SingleThreadedExecutor(context=context)
+        other = rclpy.create_node('other', context=context)
+        for node in (*made, other):
+            executor.add_node(node)
+        for node in made:
+            node.start()
+        made.append(other)
+        return {node.get_name(): node for node in made}, other, executor
+
+    yield make
+    for node in made:
+        if hasattr(node, 'stop'):
+            node.stop()
+        node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def spin_until(executor, done, what):
+    end = time.monotonic() + PATIENCE
+    while not done():
+        assert time.monotonic() < end, f'waited in vain for {what}'
+        executor.spin_once(timeout_sec=0.05)
+
+
+def test_what_one_publishes_the_next_gets_without_dds(together, small_camera):
+    from hmt_msgs.msg import PoseMixture
+    from sensor_msgs.msg import CameraInfo, Image
+
+    nodes, other, executor = together()
+    came = []
+    other.create_subscription(PoseMixture, 'pose_mixture', came.append, 100)
+    publishers = {
+        'camera_info': other.create_publisher(CameraInfo, 'camera_info', 100),
+        'image': other.create_publisher(Image, 'image', 100),
+    }
+    # The image comes in once, whatever number of nodes wants it, and predictions not at all.
+    spin_until(
+        executor,
+        lambda: all(p.get_subscription_count() == 1 for p in publishers.values()),
+        'a subscription',
+    )
+    assert other.count_subscribers(PREDICTION) == 0
+    assert other.count_subscribers('likelihood_mixture') == 0
+    spin_until(executor, lambda: other.count_publishers('pose_mixture') == 1, 'a publisher')
+    publishers['camera_info'].publish(serialise(small_camera.info()))
+    spin_until(
+        executor,
+        lambda: nodes['filter_node']._session._camera and nodes['bme_node']._session._camera,
+        'the calibration',
+    )
+    for index in range(4):
+        publishers['image'].publish(serialise(small_camera.image(index)))
+        spin_until(executor, lambda n=index: len(came) > n, 'a mixture')
+    assert [len(message.components) for message in came] == [2] * 4
+    spin_until(
+        executor, lambda: nodes['smoother_node']._session.state.counts['smoothed'] == 4, 'smoothing'
+    )
+    counts = {
+        name: node._subscribers(PREDICTION) for name, node in nodes.items() if name == 'bme_node'
+    }
+    assert counts == {'bme_node': 1}
+
+
+def test_parameters_follow_from_who_is_there():
+    from hmt_ros.nodes.person_node import USUAL, used_of_each_other
+
+    assert used_of_each_other(USUAL) == {
+        'filter_node': {'use_predictions': True},
+        'smoother_node': {},
+        'bme_node': {'tracked_interval': 0.2},
+    }
+    assert used_of_each_other(['filter_node', 'keypoints_node'])['filter_node'] == {
+        'use_keypoints': True,
+        'use_keypoints_3d': True,
+    }
+    assert used_of_each_other(['bme_node']) == {'bme_node': {}}
+
+
+def test_a_node_that_is_deactivated_leaves_the_images_to_the_others(together, small_camera):
+    from sensor_msgs.msg import CameraInfo, Image
+
+    nodes, other, executor = together()
+    info = other.create_publisher(CameraInfo, 'camera_info', 100)
+    image = other.create_publisher(Image, 'image', 100)
+    for publisher in (info, image):
+        spin_until(executor, lambda p=publisher: p.get_subscription_count() == 1, 'a subscription')
+    owner = next(
+        node
+        for node in nodes.values()
+        if any('image' in s.topic_name for s in getattr(node, '_connected', ()))
+    )
+    (left,) = {'filter_node', 'bme_node'} - {owner.get_name()}
+    owner.trigger_deactivate()
+    spin_until(executor, lambda: image.get_subscription_count() == 1, 'the other subscription')
+    time.sleep(0.2)
+    info.publish(serialise(small_camera.info()))
+    image.publish(serialise(small_camera.image(0)))
+    spin_until(executor, lambda: nodes[left]._session.state.counts['received'] == 1, 'the image')
+
+
+def run(*words, stop_at=''):
+    """Runs the executable, up to a text if one is given; its exit code and output."""
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'hmt_ros.nodes.person_node', *words],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if stop_at and stop_at in line:
+            process.send_signal(signal.SIGINT)
+            stop_at = ''
+    return process.wait(PATIENCE), ''.join(lines)
+
+
+def test_the_process_starts_and_ends_well():
+    code, said = run(
+        'smoother_node', 'keypoints_adapter_node', '--ros-args', '-r', '__ns:=/humans/bodies/p7',
+        stop_at='mixtures from',
+    )  # fmt: skip
+    assert code == 0, said
+    assert '[humans.bodies.p7.smoother_node]' in said
+
+
+@pytest.mark.parametrize(
+    ('words', 'text'),
+    [
+        (['--help'], 'usage: ros2 run hmt_ros person_node [NODE ...]'),
+        (['smother_node'], 'wanted some of filter_node, smoother_node, bme_node, keypoints_node, '),
+        (['--ros-args', '-r', '__node:=mine'], '__node:=mine would give all nodes one name'),
+    ],
+)
+def test_the_command_line(words, text):
+    code, said = run(*words)
+    assert code == (0 if '--help' in words else 2)
+    assert text in said
+
+
+def test_ros_arguments_that_are_wrong_end_it():
+    code, said = run('smoother_node', '--ros-args', '-p', 'method:=7')
+    assert code == 1
+    assert said.startswith('person_node: ')
+    assert np.char.count(said, '\n') == 1
