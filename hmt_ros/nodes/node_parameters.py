@@ -5,12 +5,13 @@ from __future__ import annotations
 import difflib
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from hmt_ros.sessions.declared_parameters import (
     AT_LAUNCH,
@@ -50,6 +51,23 @@ def descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
                 FloatingPointRange(from_value=float(low), to_value=float(high))
             ]
     return result
+
+
+def with_empty_lists(parameters: Iterable[Parameter], names: Set[str]) -> list[Parameter]:
+    """Parameters that are to be set, an empty list in the place of no value.
+
+    ROS tools write an empty list as no value, and rclpy takes away a parameter that has none.
+
+    Args:
+        parameters: that are to be set.
+        names: of those that are lists of numbers.
+    """
+    return [
+        Parameter(one.name, Parameter.Type.DOUBLE_ARRAY, [])
+        if one.name in names and one.type_ == Parameter.Type.NOT_SET
+        else one
+        for one in parameters
+    ]
 
 
 def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from hmt_ros.nodes.node_parameters import files_for_others
@@ -69,7 +69,7 @@ def run_together(
         sys.stderr.write(f'{name}: {error_line(error)}\n')
         rclpy.try_shutdown()
         return 1
-    executor = _new_executor()
+    executor = SingleThreadedExecutor()
     for node in nodes:
         executor.add_node(node)
         for text in files_for_others(arguments, node.get_fully_qualified_name()):
@@ -92,19 +92,7 @@ def run_together(
     return 0
 
 
-def _new_executor() -> Executor:
-    """An executor that does not look through all topics of a node for each message.
-
-    Early releases of Jazzy have but the one that does, which takes a tenth of the images.
-    """
-    try:
-        from rclpy.experimental import EventsExecutor
-    except ImportError:
-        return SingleThreadedExecutor()
-    return EventsExecutor()
-
-
-def _spin_once(executor: Executor, node: SessionNode[Any, Any]) -> None:
+def _spin_once(executor: SingleThreadedExecutor, node: SessionNode[Any, Any]) -> None:
     try:
         # A signal does not wake who waits for messages.
         executor.spin_once(timeout_sec=0.2)

@@ -14,6 +14,7 @@ import time
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -35,6 +36,7 @@ from hmt_ros.nodes.node_parameters import (
     descriptor,
     next_step,
     unknown_parameters,
+    with_empty_lists,
 )
 from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.nodes.subscribed_topic import (
@@ -96,6 +98,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._settings: Parameters = with_values(defaults, values)
         self._names = values.keys()
         self._warn_of_unknown(qos=False)
+        lists = {p.name for p in declared if isinstance(p.default, tuple)}
+        self.add_pre_set_parameters_callback(partial(with_empty_lists, names=lists))
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._refuse_impossible_transitions()
         self.preparing = False
@@ -107,8 +111,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._local = LocalTopics() if local is None else local
         self._local_names: dict[str, str] = {}
         self._listeners: list[Listener] = []
-        for topic in map(self._local_name, self.SESSION.TOPICS):
-            self._local.offer(topic)
+        for topic in self.SESSION.TOPICS:
+            if not topic.startswith('/'):
+                self._local.offer(self._local_name(topic))
         # Topics that the node both publishes and subscribes to, and what it published there.
         self._heard: set[str] = set()
         self._own = OwnMessages()
@@ -384,7 +389,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if output.topic in self._heard:
             self._own.sent(output.data)
         self._outputs[output.topic].publish(output.data)
-        self._local.deliver(self._local_name(output.topic), output.data)
+        if not output.topic.startswith('/'):
+            self._local.deliver(self._local_name(output.topic), output.data)
 
     def _is_wanted(self, topic: str) -> bool:
         return bool(self._subscribers(topic))
@@ -395,7 +401,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return int(others) + self._local.listeners(self._local_name(topic))
 
     def _local_name(self, topic: str) -> str:
-        """Name of a topic among nodes of this process; topics of all, as /tf, go over ROS."""
+        """Name of a topic among nodes of this process; those of all, as /tf, go over ROS."""
         if topic not in self._local_names:
             own = f'{self.get_fully_qualified_name()} {topic}'
             name = own if topic.startswith('/') else self.resolve_topic_name(topic)

@@ -127,7 +127,7 @@ def test_lost_messages_are_in_the_diagnostics(running, small_camera):
     running.send('image', small_camera.image(0))
     (callbacks,) = (
         handler.callback
-        for handler in running.node._inputs[-1].event_handlers
+        for handler in running.node._connected[-1].event_handlers
         if handler.event_type.name.endswith('MESSAGE_LOST')
     )
     callbacks(SimpleNamespace(total_count_change=4))

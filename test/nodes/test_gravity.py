@@ -114,3 +114,23 @@ def test_missing_frames_are_told_once(world, small_camera):
     assert "no transform from gravity_frame 'map' to 'lens'" in warning
     assert "there is no frame 'map'; there are: lens, world" in warning
     assert one.node._session.state.faults == {'no transform': 2}
+
+
+def test_no_value_is_an_empty_list_and_the_parameter_stays(world):
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+
+    one = world(gravity=[0.0, 1.0, 0.0]).start()
+    nothing = ParameterValue(type=ParameterType.PARAMETER_NOT_SET)
+    given = [Parameter(name='gravity', value=nothing), Parameter(name='flow_weight', value=nothing)]
+    emptied, refused = one.call(SetParameters, 'set_parameters', parameters=given).results
+    assert (emptied.successful, refused.successful) == (True, False)
+    assert one.node._settings.gravity == ()
+    names = one.call(ListParameters, 'list_parameters').result.names
+    assert {'gravity', 'flow_weight'} <= set(names)
+    (value,) = one.call(GetParameters, 'get_parameters', names=['gravity']).values
+    assert (value.type, list(value.double_array_value)) == (
+        ParameterType.PARAMETER_DOUBLE_ARRAY,
+        [],
+    )
+    assert one.set(gravity=[0.0, 2.0, 0.0]) == (True, '')

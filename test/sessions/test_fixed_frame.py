@@ -20,6 +20,7 @@ from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF, Transform
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.keep_out import KeepOutState, keep_out_of
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
@@ -191,7 +192,10 @@ def test_what_has_no_place_is_not_published(session, small_camera, outputs):
     handled = [one.take(IMAGE, small_camera.image(index)) for index in (1, 2)]
     texts = [text for each in handled for text in each.faults]
     assert any('its place in fixed_frame' in text for text in texts)
-    assert outputs == []
+    assert {output.topic for output in outputs} == {'keep_out', 'keep_out_markers'}
+    # The person goes on from where the place was last known.
+    states = [keep_out_of(message).state for message in read(outputs, 'keep_out')]
+    assert states == [KeepOutState.LOST] * 2
 
 
 def test_a_name_is_needed():

@@ -80,15 +80,19 @@ def both_ways(bag, tmp_path, capsys, *options, person=PERSON):
 def test_same_mixtures_of_every_image(tmp_path, capsys):
     bag = write(tmp_path / 'bag', recorded(3))
     # Filter and smoother tell of links on the same topic.
-    options = ['--set', 'smoother.publish_tf=true']
+    options = ['--set', 'smoother.publish_tf=true', '--set', 'forecast_rate=50.0']
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
     assert one[0] == 0
     assert len(messages(offline, '/tf')) == 6
     mixtures = ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture', 'trajectory_mixture')
     for topic in mixtures:
-        assert len(messages(offline, topic)) == 3
+        # Windows are smoothed ten times a second.
+        assert len(messages(offline, topic)) == (1 if topic == 'trajectory_mixture' else 3)
         assert messages(offline, topic) == messages(live, topic)
+    # What a robot acts on, too.
+    assert len(messages(offline, 'keep_out')) == 3
+    assert len(messages(offline, 'pose_forecast')) > 3
     # And everything else.
     assert content(offline) == content(live)
 
@@ -255,7 +259,7 @@ def test_node_that_is_silent_or_dies_is_told(parameters, monkeypatch):
             patch.setitem(running._publishers, KEYPOINTS, Nobody())
             with pytest.raises(LiveNodeError, match='waited 1 s for an answer to a keypoints; '):
                 track.take(KEYPOINTS, entries['camera_info'])
-        running._process.kill()
+        running.process.kill()
         with pytest.raises(LiveNodeError, match='the filter node ended with code -9: '):
             track.take(IMAGE, entries['image/compressed'])
         # It can not end well any more.
