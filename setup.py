@@ -208,7 +208,6 @@ setup(
             'lift = hmt_ros.app.lift:main',
             'subject = hmt_ros.app.subject:main',
             'keypoints_node = hmt_ros.nodes.keypoints_node:main',
-            'keypoints_adapter_node = hmt_ros.nodes.keypoints_adapter_node:main',
             'hri_node = hmt_ros.nodes.hri_node:main',
             'people_adapter_node = hmt_ros.nodes.people_adapter_node:main',
             'replay = hmt_ros.app.replay.command:main',

@@ -22,7 +22,6 @@ PAGES = {
     'smoother_node': 'nodes.md',
     'bme_node': 'nodes.md',
     'keypoints_node': 'nodes.md',
-    'keypoints_adapter_node': 'nodes.md',
     'hri_node': 'nodes.md',
     'people_adapter_node': 'nodes.md',
     'people_node': 'nodes.md',
@@ -101,7 +100,6 @@ def parameter_table(node: str) -> str:
     from hmt_ros.sessions.declared_parameters import declared_parameters
     from hmt_ros.sessions.filter_parameters import FilterParameters
     from hmt_ros.sessions.hri_parameters import HriParameters
-    from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
     from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
     from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
     from hmt_ros.sessions.people_parameters import PeopleParameters
@@ -112,7 +110,6 @@ def parameter_table(node: str) -> str:
         'smoother_node': SmootherParameters(),
         'bme_node': BmeParameters(),
         'keypoints_node': KeypointsParameters(),
-        'keypoints_adapter_node': KeypointsAdapterParameters(),
         'hri_node': HriParameters(),
         'people_adapter_node': PeopleAdapterParameters(),
         'people_node': PeopleParameters(),

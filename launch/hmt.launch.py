@@ -27,10 +27,10 @@ from launch_ros.actions import Node
 
 PACKAGE = 'hmt_ros'
 USUAL_NODES = ('filter_node', 'smoother_node', 'bme_node')
-DETECTORS = ('keypoints_node', 'keypoints_adapter_node')
+DETECTOR = 'keypoints_node'
 # Several people: its topics are in the root namespace.
 PEOPLE = 'people_node'
-NODES = (*USUAL_NODES, *DETECTORS, PEOPLE)
+NODES = (*USUAL_NODES, DETECTOR, PEOPLE)
 # Runs nodes of one person in one process.
 TOGETHER = 'person_node'
 # Default frame of images in the nodes; and the frame for views, which need z up.
@@ -55,8 +55,8 @@ ARGUMENTS = (
     (
         'nodes',
         ' '.join(USUAL_NODES),
-        f'nodes to start, separated by blanks; besides these {" or ".join(DETECTORS)}, whose '
-        f'keypoints the filter then uses; {PEOPLE} alone tracks several people',
+        f'nodes to start, separated by blanks; besides these {DETECTOR}, whose keypoints the '
+        f'filter then uses; {PEOPLE} alone tracks several people',
     ),
     (
         'one_process',
@@ -71,13 +71,13 @@ ARGUMENTS = (
     (
         'detections',
         'detections',
-        'topic of another detector, for keypoints_adapter_node or people_node',
+        'topic of another detector, with detections_source or people_node',
     ),
     (
         'detections_source',
-        'skeleton2d',
-        "their type: 'skeleton2d', 'yolo' or 'floats'; for people_node 'people' (which replaces "
-        "'skeleton2d'), 'yolo', 'boxes' or 'floats'",
+        '',
+        "their type: 'skeleton2d', 'yolo' or 'floats', whose keypoints the filter then uses; for "
+        "people_node 'people' (in place of nothing), 'yolo', 'boxes' or 'floats'; empty: none",
     ),
     ('mask', '', 'topic of the masks of a segmenter, without /compressed; empty: none'),
     ('depth', '', 'topic of depth images that are registered to the images; empty: none'),
@@ -162,7 +162,8 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         raise ValueError(f'nodes: {PEOPLE} stands alone, saw {given["nodes"]!r}')
     if PEOPLE in names:
         namespace = given['namespace']
-    if 'keypoints_adapter_node' in names or PEOPLE in names:
+    source = given['detections_source']
+    if source or PEOPLE in names:
         remappings.append(('detections', given['detections']))
     if given['keypoints']:
         remappings.append(('keypoints', given['keypoints']))
@@ -188,24 +189,25 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             **_named(given, 'fixed_frame'),
             'use_predictions': 'bme_node' in names,
             'use_depth': bool(given['depth']),
-            'use_keypoints': bool(given['keypoints']) or any(name in names for name in DETECTORS),
-            **({'use_keypoints_3d': True} if 'keypoints_node' in names else {}),
+            'use_keypoints': bool(given['keypoints'] or source) or DETECTOR in names,
+            **({'source': source} if source else {}),
+            **({'use_keypoints_3d': True} if DETECTOR in names else {}),
             'frame_prefix': f'{_frame(namespace)}/',
         },
         'smoother_node': common,
         'bme_node': {
             **camera,
             **_named(given, 'model_file'),
+            **({'source': source} if source else {}),
             # While the person is tracked the filter needs the processor more.
             'tracked_interval': TRACKED_INTERVAL if 'filter_node' in names else 0.0,
         },
-        'keypoints_node': {**common, 'image_transport': transport},
-        'keypoints_adapter_node': {**common, 'source': given['detections_source']},
+        DETECTOR: {**common, 'image_transport': transport},
         PEOPLE: {
             **camera,
             **_named(given, 'gravity_frame'),
             **_named(given, 'fixed_frame'),
-            'source': given['detections_source'].replace('skeleton2d', 'people'),
+            'source': source or 'people',
         },
     }
     own = [given['params_file']] if given['params_file'] else []

@@ -22,7 +22,6 @@ from hmt_ros.evaluation.pose_scores import Scores
 from hmt_ros.sessions import (
     bme_session,
     hri_session,
-    keypoints_adapter_session,
     keypoints_session,
     people_adapter_session,
     people_session,
@@ -33,7 +32,6 @@ from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import declared_parameters
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.hri_parameters import HriParameters
-from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
 from hmt_ros.sessions.people_parameters import PeopleParameters
@@ -56,7 +54,6 @@ NODES = {
     'smoother_node': (SmootherParameters(), smoothed_messages.TOPICS),
     'bme_node': (BmeParameters(), bme_session.BmeSession.TOPICS),
     'keypoints_node': (KeypointsParameters(), keypoints_session.TOPICS),
-    'keypoints_adapter_node': (KeypointsAdapterParameters(), keypoints_adapter_session.TOPICS),
     'people_adapter_node': (PeopleAdapterParameters(), people_adapter_session.TOPICS),
     'people_node': (PeopleParameters(), people_session.PeopleSession.TOPICS),
     'hri_node': (

@@ -28,7 +28,6 @@ from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import values_of, with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.hri_parameters import HriParameters
-from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
 from hmt_ros.sessions.people_parameters import PeopleParameters
@@ -192,22 +191,19 @@ def test_nodes_that_find_keypoints(actions):
     own = parameters(made['keypoints_node'])
     del own['use_sim_time']
     assert with_values(KeypointsParameters(), own).image_transport == 'compressed'
-    made = actions(
-        nodes='filter_node keypoints_adapter_node', detections='/yolo', detections_source='yolo'
-    )
-    tracks, adapts = made['filter_node'], made['keypoints_adapter_node']
-    assert parameters(tracks)['use_keypoints'] is True
-    assert 'use_keypoints_3d' not in parameters(tracks)
-    own = parameters(adapts)
-    del own['use_sim_time']
-    assert with_values(KeypointsAdapterParameters(), own).source == 'yolo'
-    assert dict(adapts['remappings'])['detections'] == '/yolo'
+    made = actions(nodes='filter_node bme_node', detections='/yolo', detections_source='yolo')
+    tracks = made['filter_node']
+    own = parameters(tracks)
+    assert (own['source'], own['use_keypoints']) == ('yolo', True)
+    assert 'use_keypoints_3d' not in own
+    assert parameters(made['bme_node'])['source'] == 'yolo'
+    assert dict(tracks['remappings'])['detections'] == '/yolo'
     allowed = policy()
     assert allowed['keypoints_node']['publish'] >= {
         f'{NAMESPACE}/{topic}' for topic in keypoints_session.TOPICS
     }
     assert f'{NAMESPACE}/keypoints_3d' in allowed['filter_node']['subscribe']
-    assert f'{NAMESPACE}/detections' in allowed['keypoints_adapter_node']['subscribe']
+    assert f'{NAMESPACE}/detections' in allowed['filter_node']['subscribe']
 
 
 def test_several_people(actions):

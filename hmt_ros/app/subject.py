@@ -139,7 +139,7 @@ def find_start(
     nearest: Seen | None = None
     best: Seen | None = None
     with BagReader(path) as bag:
-        topic = recorded_input(bag).keypoints
+        topic = recorded_input(bag).of('keypoints')
         if topic is None:
             raise ValueError(f'{path} has no keypoints: import them with the video')
         first: int | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from hmt_msgs.msg import PoseMixture
@@ -14,17 +14,16 @@ from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
-    MASK_TOPICS,
     RELIABLE,
     SubscribedTopic,
     image_topic,
+    input_topics,
+    types_of_others,
 )
-from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS, FROM_SILHOUETTES, BmeParameters
+from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS, BmeParameters
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
-from hmt_ros.sessions.keypoint_inputs import KEYPOINTS
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import serialise
-from msg_tools.messages.keypoints import KEYPOINTS_2D
 
 
 class BmeNode(SessionNode[BmeSession, BmeParameters]):
@@ -38,16 +37,16 @@ class BmeNode(SessionNode[BmeSession, BmeParameters]):
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield PredictPose, '~/predict_pose', self._on_predict_pose
 
+    def _messages_of_others(self, settings: BmeParameters) -> Mapping[str, str]:
+        return types_of_others(BmeSession.inputs_of(settings), settings.source)
+
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield CAMERA_INFO_TOPIC
         if self._settings.tracked_interval > 0:
             yield SubscribedTopic(TRACK, TRACK, 'hmt_msgs/msg/PoseMixture', RELIABLE)
-        if self._settings.predict_from != FROM_SILHOUETTES:
-            yield SubscribedTopic(KEYPOINTS, KEYPOINTS, KEYPOINTS_2D)
-        if self._settings.predict_from == FROM_KEYPOINTS:
-            return
-        yield from MASK_TOPICS
-        yield image_topic(self._settings.image_transport)
+        yield from input_topics(BmeSession.inputs_of(self._settings))
+        if self._settings.predict_from != FROM_KEYPOINTS:
+            yield image_topic(self._settings.image_transport)
 
     def _on_predict_pose(
         self, request: PredictPose.Request, response: PredictPose.Response

@@ -12,19 +12,12 @@ from hmt_msgs.srv import ForecastPose, Reset
 from rclpy.serialization import deserialize_message
 
 from hmt_ros.nodes.run_node import run
-from hmt_ros.nodes.subscribed_topic import (
-    CAMERA_INFO_TOPIC,
-    RELIABLE,
-    SubscribedTopic,
-    image_topic,
-)
 from hmt_ros.nodes.tracking_node import TrackingNode
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D, PREDICTION, FilterSession
+from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
-from msg_tools.messages import keypoints
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.pose_mixtures import pose_mixture_message
@@ -46,14 +39,6 @@ class FilterNode(TrackingNode[FilterSession, FilterParameters]):
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield from super()._offered_services()
         yield ForecastPose, '~/forecast_pose', self._on_forecast_pose
-
-    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
-        yield CAMERA_INFO_TOPIC
-        yield SubscribedTopic(KEYPOINTS, KEYPOINTS, keypoints.KEYPOINTS_2D)
-        yield SubscribedTopic(KEYPOINTS_3D, KEYPOINTS_3D, keypoints.KEYPOINTS_3D)
-        yield SubscribedTopic(PREDICTION, 'pose_prediction', 'hmt_msgs/msg/PoseMixture', RELIABLE)
-        yield from self._inputs_of_images()
-        yield image_topic(self._settings.image_transport)
 
     def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
         assert self._session is not None

@@ -7,23 +7,17 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hmt_msgs.srv import Reset
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from hmt_ros.nodes.run_node import run
-from hmt_ros.nodes.subscribed_topic import (
-    CAMERA_INFO_TOPIC,
-    SubscribedTopic,
-    image_topic,
-    published_with,
-)
+from hmt_ros.nodes.subscribed_topic import published_with
 from hmt_ros.nodes.tracking_node import TrackingNode
 from hmt_ros.sessions.handled import Output
-from hmt_ros.sessions.people_parameters import SOURCES, PeopleParameters
-from hmt_ros.sessions.people_session import DETECTIONS, PeopleSession, published_topic
+from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.people_session import PeopleSession, published_topic
 from hmt_ros.sessions.person_session import person_of
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 
@@ -51,15 +45,6 @@ class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
         result = super().on_deactivate(state)
         self._close_topics({name for topic in self._outputs if (name := person_of(topic))})
         return result
-
-    def _messages_of_others(self, settings: PeopleParameters) -> Mapping[str, str]:
-        return {SOURCES[settings.source]: f'source {settings.source}'}
-
-    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
-        yield CAMERA_INFO_TOPIC
-        yield SubscribedTopic(DETECTIONS, DETECTIONS, SOURCES[self._settings.source])
-        yield from self._inputs_of_images()
-        yield image_topic(self._settings.image_transport)
 
     def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
         if len(request.initial.components) or request.box.width:

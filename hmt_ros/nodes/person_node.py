@@ -15,7 +15,6 @@ from typing import Any
 
 from hmt_ros.nodes.bme_node import BmeNode
 from hmt_ros.nodes.filter_node import FilterNode
-from hmt_ros.nodes.keypoints_adapter_node import KeypointsAdapterNode
 from hmt_ros.nodes.keypoints_node import KeypointsNode
 from hmt_ros.nodes.local_topics import LocalTopics
 from hmt_ros.nodes.run_node import run_together
@@ -25,11 +24,9 @@ from hmt_ros.nodes.usage import wants_help
 
 NAME = 'person_node'
 NODES: Mapping[str, type[SessionNode[Any, Any]]] = {
-    node.NAME: node
-    for node in (FilterNode, SmootherNode, BmeNode, KeypointsNode, KeypointsAdapterNode)
+    node.NAME: node for node in (FilterNode, SmootherNode, BmeNode, KeypointsNode)
 }
 USUAL = (FilterNode.NAME, SmootherNode.NAME, BmeNode.NAME)
-DETECTORS = (KeypointsNode.NAME, KeypointsAdapterNode.NAME)
 # Interval between two predictions while the filter tracks the person, s.
 TRACKED_INTERVAL = 0.2
 _RENAMED = ('__node:=', '__name:=')
@@ -50,7 +47,7 @@ def used_of_each_other(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     if FilterNode.NAME in names:
         used = {
             'use_predictions': BmeNode.NAME in names,
-            'use_keypoints': any(name in names for name in DETECTORS),
+            'use_keypoints': KeypointsNode.NAME in names,
             'use_keypoints_3d': KeypointsNode.NAME in names,
         }
         values[FilterNode.NAME] = {name: use for name, use in used.items() if use}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,8 +10,8 @@ from typing import Any, NamedTuple
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 
-from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK
-from hmt_ros.sessions.depth_inputs import DEPTH
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.image_inputs import DETECTIONS, LARGEST, ImageInput
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS_TYPE
 from msg_tools.messages.images import MAX_PIXELS
@@ -27,13 +28,11 @@ LATCHED = QoSProfile(
 )
 
 
-# Largest messages that are taken, bytes. A mixture over the poses of a person is smaller.
-LARGEST_MESSAGE = 2**24
+# Largest image that is taken, bytes.
 LARGEST_IMAGE = 8 * MAX_PIXELS + 2**16
-LARGEST_MASK = MAX_PIXELS + 2**16
-LARGEST_DEPTH = 4 * MAX_PIXELS + 2**16
-# Messages that wait while an estimate is made: small ones, masks, and transforms of a whole robot.
-SMALL_QUEUE, MASK_QUEUE, TF_QUEUE = 100, 20, 2000
+# Messages that wait while an estimate is made: small ones, those that are as large as images, and
+# transforms of a whole robot.
+SMALL_QUEUE, LARGE_QUEUE, TF_QUEUE = 100, 20, 2000
 
 
 class SubscribedTopic(NamedTuple):
@@ -52,7 +51,7 @@ class SubscribedTopic(NamedTuple):
     topic: str
     msgtype: str
     qos: QoSProfile = qos_profile_sensor_data
-    largest: int = LARGEST_MESSAGE
+    largest: int = LARGEST
     waiting: int = SMALL_QUEUE
 
     @property
@@ -62,21 +61,6 @@ class SubscribedTopic(NamedTuple):
         return bool(first == 'std_msgs/Header')
 
 
-MASK_TOPICS = (
-    SubscribedTopic(
-        MASK, 'mask', 'sensor_msgs/msg/Image', largest=LARGEST_MASK, waiting=MASK_QUEUE
-    ),
-    SubscribedTopic(
-        COMPRESSED_MASK,
-        'mask/compressed',
-        'sensor_msgs/msg/CompressedImage',
-        largest=LARGEST_MASK,
-        waiting=MASK_QUEUE,
-    ),
-)
-DEPTH_TOPIC = SubscribedTopic(
-    DEPTH, 'depth', 'sensor_msgs/msg/Image', largest=LARGEST_DEPTH, waiting=MASK_QUEUE
-)
 # As the listener of tf2 has them.
 _TF_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 _TF_STATIC_QOS = QoSProfile(
@@ -98,6 +82,25 @@ def image_topic(image_transport: str) -> SubscribedTopic:
     if image_transport == 'compressed':
         topic, kind = ('image/compressed', 'CompressedImage')
     return SubscribedTopic(IMAGE, topic, f'sensor_msgs/msg/{kind}', largest=LARGEST_IMAGE)
+
+
+def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
+    """Topics of what comes with the images, by the table of inputs."""
+    for row in rows:
+        for source, msgtype in row.types.items():
+            yield SubscribedTopic(
+                source,
+                source,
+                msgtype,
+                RELIABLE if row.reliable else qos_profile_sensor_data,
+                row.largest,
+                LARGE_QUEUE if row.pixels is not None else SMALL_QUEUE,
+            )
+
+
+def types_of_others(rows: Iterable[ImageInput], source: str) -> dict[str, str]:
+    """Types of messages of other packages that a `source` needs, and what needs each."""
+    return {row.types[DETECTIONS]: f'source {source}' for row in rows if DETECTIONS in row.types}
 
 
 def published_with(published: PublishedTopic) -> tuple[str, QoSProfile]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 from hmt_msgs.srv import Reset
@@ -16,16 +16,19 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
-    DEPTH_TOPIC,
-    MASK_TOPICS,
+    CAMERA_INFO_TOPIC,
     TRANSFORM_TOPICS,
     SubscribedTopic,
+    image_topic,
+    input_topics,
+    types_of_others,
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.track_start import TrackStart
+from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.files.error_line import error_line
 
-AnySession = TypeVar('AnySession', bound=Any)
+AnySession = TypeVar('AnySession', bound=TrackingSession[Any, Any])
 Parameters = TypeVar('Parameters', bound=FilterParameters)
 
 # Period of the watchdog, s.
@@ -50,12 +53,15 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield Reset, '~/reset', self._on_reset
 
-    def _inputs_of_images(self) -> Iterable[SubscribedTopic]:
-        """Topics of what comes with the images of a camera."""
-        yield from MASK_TOPICS
-        yield DEPTH_TOPIC
+    def _messages_of_others(self, settings: Parameters) -> Mapping[str, str]:
+        return types_of_others(self.SESSION.inputs_of(settings), settings.source)
+
+    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
+        yield CAMERA_INFO_TOPIC
+        yield from input_topics(self.SESSION.inputs_of(self._settings))
         if self._session is not None and self._session.frames.wanted:
             yield from TRANSFORM_TOPICS
+        yield image_topic(self._settings.image_transport)
 
     @abstractmethod
     def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from hmt_ros.experts.lifter import SHIPPED as LIFTER
 from hmt_ros.experts.pose_predictor import ALONE, PROPAGATIONS
 from hmt_ros.image.background import BackgroundSettings
-from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_CONFIGURE,
@@ -21,7 +20,7 @@ from hmt_ros.sessions.declared_parameters import (
     nested_parameters,
     parameter_field,
 )
-from hmt_ros.sessions.filter_parameters import BACKGROUND, check_keypoint_scheme
+from hmt_ros.sessions.filter_parameters import BACKGROUND
 from hmt_ros.sessions.parameter_file import parameter_file_text
 
 # What a prediction is from.
@@ -45,7 +44,6 @@ class BmeParameters(CameraNodeParameters):
         predict_from: What poses are predicted from, 'silhouettes', 'keypoints' of a detector (topic
             keypoints; no image is needed), or 'both', keypoints where they show a person and
             silhouettes elsewhere; an image then waits for the keypoints of its stamp.
-        keypoint_scheme: What the names of keypoints mean, as for filter_node.
         lifter: Experts that predict from keypoints, 'keypoints', which ships, or a file that
             learn-lifter wrote.
         propagation: How a prediction depends on that of the image before, 'none', 'dynamics' by
@@ -65,7 +63,6 @@ class BmeParameters(CameraNodeParameters):
     stature: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3.0))
     least_height: int = parameter_field(40, AT_ONCE, (1, 10_000))
     predict_from: str = parameter_field(FROM_SILHOUETTES, NEXT_CONFIGURE)
-    keypoint_scheme: str = parameter_field(AUTO, NEXT_CONFIGURE)
     lifter: str = parameter_field(LIFTER, NEXT_CONFIGURE)
     propagation: str = parameter_field(ALONE, NEXT_CONFIGURE)
     longest_interval: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
@@ -78,7 +75,6 @@ class BmeParameters(CameraNodeParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_keypoint_scheme(self.keypoint_scheme)
         if self.propagation not in PROPAGATIONS:
             raise ValueError(
                 f'propagation is {self.propagation!r}, wanted one of {", ".join(PROPAGATIONS)}'

@@ -31,7 +31,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,13 +70,15 @@ from hmt_ros.sessions.camera_session import (
     read_picture,
 )
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KeypointInputs, known_lifter
+from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS, MASK_INPUT, ImageInput
+from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input, known_lifter
 from hmt_ros.sessions.session import (
     NeededInput,
     Order,
     PublishedTopic,
     SessionState,
     everything,
+    frame_id_of,
 )
 from hmt_ros.sessions.warm_up import film
 from msg_tools.files.error_line import error_line
@@ -184,7 +186,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._lifter = None
         if parameters.predict_from != FROM_SILHOUETTES:
             self._lifter = known_lifter(parameters.lifter)
-        self._keypoints = KeypointInputs(self._log)
+        self._keypoints = KeypointReader(parameters.source, self._log)
         self._by_keypoints: KeypointPredictor | None = None
         self.state = self._present_state()
 
@@ -192,7 +194,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         """See `Session`."""
         shown, previous = film(), None
         if self._lifter is not None:
-            self._keypoints.plane.put(0, shown.keypoints(0))
+            self._inputs[KEYPOINTS].put(0, shown.keypoints(0))
             self._lifted(0, shown.camera)
             self._by_keypoints = None
         if self.parameters.predict_from == FROM_KEYPOINTS:
@@ -206,57 +208,55 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._looked = self._tracked = None
         self._by_keypoints = None
 
+    @classmethod
+    def inputs_of(cls, parameters: BmeParameters) -> tuple[ImageInput, ...]:
+        """See `CameraSession`."""
+        cue, own = parameters.predict_from, keypoints_input(parameters.source)
+        own = replace(own, parameter='', together=True)
+        if cue == FROM_KEYPOINTS:
+            return (own,)
+        return (MASK_INPUT,) if cue == FROM_SILHOUETTES else (own, MASK_INPUT)
+
     def needed_inputs(self) -> list[NeededInput]:
         """See `Session`."""
-        needed, cue = super().needed_inputs(), self.parameters.predict_from
-        if cue == FROM_KEYPOINTS:
-            return [NeededInput((KEYPOINTS,)), *(x for x in needed if x.sources == (CAMERA_INFO,))]
-        return [*needed, NeededInput((KEYPOINTS,), with_each=True)] if cue == FROM_BOTH else needed
-
-    def _waits_for_inputs(self) -> bool:
-        return super()._waits_for_inputs() or self.parameters.predict_from == FROM_BOTH
-
-    def _is_ready(self, waiting: WaitingImage) -> bool:
-        return super()._is_ready(waiting) and self._has_keypoints(waiting.stamp_ns)
-
-    def _missing_input(self, stamp: int) -> Fault:
-        if not self._has_keypoints(stamp):
-            return Fault.NO_KEYPOINTS
-        return super()._missing_input(stamp)
-
-    def _has_keypoints(self, stamp: int) -> bool:
-        """Whether an image need not wait for keypoints."""
-        p = self.parameters
-        return p.predict_from != FROM_BOTH or self._has(
-            self._keypoints.plane, stamp, p.input_timeout
-        )
+        needed = super().needed_inputs()
+        if self.parameters.predict_from != FROM_KEYPOINTS:
+            return needed
+        own = NeededInput(tuple(self._rows[0].types))
+        return [own, *(x for x in needed if x.sources == (CAMERA_INFO,))]
 
     def _forget_inputs(self, stamp: int) -> None:
         super()._forget_inputs(stamp)
-        self._keypoints.clear()
+        self._keypoints.forget()
+
+    def _stamp_of(self, source: str, message: Any) -> int:
+        if source == DETECTIONS:
+            told = self._keypoints.stamp_of(message, self._info_stamp)
+            if told is not None:
+                return told
+        return super()._stamp_of(source, message)
+
+    def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
+        if row.name != KEYPOINTS:
+            return super()._read_input(row, message, stamp)
+        return self._keypoints.read(
+            message, stamp, self.parameters, self._predictor.body, self._camera
+        )
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
-        cue = self.parameters.predict_from
-        if source == KEYPOINTS:
-            if cue == FROM_KEYPOINTS:
-                self._take_keypoints(message, stamp)
-            elif cue == FROM_BOTH:
-                read = self._keypoints.read(message, self._predictor.body, self._scheme)
-                self._keypoints.plane.put(stamp, read)
+        row = self._inputs.row(source)
+        if row is not None and self.parameters.predict_from == FROM_KEYPOINTS:
+            self._take_keypoints(row, message, stamp)
         elif source != TRACK:
             super()._take(source, message, stamp)
         elif self._tracked is None or stamp > self._tracked:
             tracked = message.state == TrackState.TRACKING and len(message.components)
             self._tracked = stamp if tracked else None
 
-    @property
-    def _scheme(self) -> str:
-        return self.parameters.keypoint_scheme
-
-    def _take_keypoints(self, message: Any, stamp: int) -> None:
+    def _take_keypoints(self, row: ImageInput, message: Any, stamp: int) -> None:
         """Predicts from keypoints and those of the last second, without an image."""
         self._log.counts['received'] += 1
-        self._frame_id = str(message.header.frame_id)
+        self._frame_id = frame_id_of(message)
         order = self._order(stamp, self._newest)
         if order is Order.SKIPPED:
             return
@@ -270,11 +270,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             )
             return
         self._newest = stamp
-        content = self._keypoints.read(message, self._predictor.body, self._scheme)
-        if content is None:
-            self._log.counts['skipped'] += 1
+        try:
+            content = self._read_input(row, message, stamp)
+        except ValueError as error:
+            self._log.skip(Fault.KEYPOINTS, error_line(error))
             return
-        self._keypoints.plane.put(stamp, content)
+        self._inputs[KEYPOINTS].put(stamp, content)
         frame = self._frame_id or self._frame or FRAME_ID
         try:
             mixture = self._lifted(stamp, camera)
@@ -293,11 +294,13 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 self._lifter, self._predictor.body, camera,
                 size_known=self.parameters.stature > 0,
             )  # fmt: skip
-        taken = self._keypoints.plane.take_all(stamp)
+        taken = self._inputs[KEYPOINTS].take_all(stamp)
         for each, keypoints in taken.items():
             # Some may come after those of a later image.
             if keypoints is not None and each / SECOND_NS > made.newest:
-                known, _ = keypoints.named_for(self._predictor.body, self._scheme)
+                known, _ = keypoints.named_for(
+                    self._predictor.body, self.parameters.keypoint_scheme
+                )
                 made.add(known, each / SECOND_NS)
         found = made.predict() if taken.get(stamp) is not None else None
         return None if found is None else found[: self.parameters.max_hypotheses].normalised()

@@ -1,12 +1,9 @@
 """Sessions that estimate from the images of one camera.
 
 Images are taken in the order of their stamps. They wait until a calibrated camera_info has come,
-and for other inputs; at most `MOST_INCOMPLETE` wait, the oldest are dropped. A session is late
-where messages have come during an estimate while images waited for it: of the images that need not
-wait for anything else the newest `queue_size` are estimated from. With `use_mask` an image also
-waits for the mask of exactly its stamp, for a mask of a later stamp, or for an image that is
-`input_timeout` younger. A mask that can not be used counts as none; one without a pixel that is not
-zero says that nobody was seen.
+and for other inputs (`image_inputs`); at most `MOST_INCOMPLETE` wait, the oldest are dropped. A
+session is late where messages have come during an estimate while images waited for it: of the
+images that need not wait for anything else the newest `queue_size` are estimated from.
 """
 
 from __future__ import annotations
@@ -14,9 +11,11 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import takewhile
-from typing import Any, Generic, NamedTuple, TypeVar
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,26 +27,31 @@ from hmt_ros.inference.arrays import Image, Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters
 from hmt_ros.sessions.handled import Fault, Handled, Output
+from hmt_ros.sessions.image_inputs import (
+    DEPTH,
+    MASK,
+    MASK_INPUT,
+    REMEMBERED,
+    ImageInput,
+    ImageInputs,
+    StampedInputs,
+    Taken,
+)
 from hmt_ros.sessions.named_frames import NamedFrames
 from hmt_ros.sessions.session import NeededInput, Order, Session, State, everything
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, UncalibratedError, camera_from_info
-from msg_tools.messages.headers import SECOND_NS
-from msg_tools.messages.images import ImageError, decode_image, decode_mask, decode_picture
+from msg_tools.messages.headers import SECOND_NS, time_ns
+from msg_tools.messages.images import ImageError, decode_image, decode_picture
 
 CAMERA_INFO, IMAGE = 'camera_info', 'image'
-MASK, COMPRESSED_MASK = 'mask', 'mask/compressed'
-MASKS = (MASK, COMPRESSED_MASK)
 CAMERA_MOVED = 'the camera has moved since the background was taken'
 FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
 
-T = TypeVar('T')
 CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 
 # Images that may wait for other inputs: half a second of a usual camera.
 MOST_INCOMPLETE = 16
-# Inputs that `StampedInputs` remembers, and masks, which are large.
-_REMEMBERED, _REMEMBERED_MASKS = 256, 64
 _LARGEST_PICTURE_FILE = 2**28  # bytes
 
 
@@ -58,15 +62,29 @@ class WaitingImage(NamedTuple):
         image: (H, W, 3) BGR.
         stamp_ns: of the image.
         frame_id: optical frame of the camera.
-        mask: (H, W) where a segmenter sees the person; None: no mask has come.
-        depth: (H, W) of what each pixel shows, m; None: unknown.
+        given: what has come with it, by the name of the input.
     """
 
     image: Image
     stamp_ns: int
     frame_id: str
-    mask: Mask | None = None
-    depth: NDArray[np.float32] | None = None
+    given: Mapping[str, Taken] = MappingProxyType({})
+
+    def content(self, name: str) -> Any:
+        """What an input says of the image; None: nothing."""
+        return self.given[name].content if name in self.given else None
+
+    @property
+    def mask(self) -> Mask | None:
+        """Where a segmenter sees the person, (H, W); without a pixel: nobody was seen."""
+        mask: Mask | None = self.content(MASK)
+        return mask
+
+    @property
+    def depth(self) -> NDArray[np.float32] | None:
+        """Of what each pixel shows, (H, W) m; None: unknown."""
+        depth: NDArray[np.float32] | None = self.content(DEPTH)
+        return depth
 
 
 class CameraSession(Session[CameraParameters, State]):
@@ -89,21 +107,31 @@ class CameraSession(Session[CameraParameters, State]):
         self._watch = SceneWatch()
         self._waiting: deque[WaitingImage] = deque()
         self._newest: int | None = None
-        self._masks: StampedInputs[Mask] = StampedInputs(_REMEMBERED_MASKS)
+        self._rows = self.inputs_of(parameters)
+        self._inputs = ImageInputs(self._rows, self._log)
+        self._info_stamp = 0
         # Images that have come since the last estimate; whether some were left when it was
         # interrupted; and stamps of those that were dropped.
         self._fresh = 0
         self._left = False
-        self._dropped: deque[int] = deque(maxlen=_REMEMBERED)
+        self._dropped: deque[int] = deque(maxlen=REMEMBERED)
 
     def needed_inputs(self) -> list[NeededInput]:
         """What has to come at present; may be called by any thread."""
         needed = super().needed_inputs()
         if self._camera is None and not self._uncalibrated:
             needed.append(NeededInput((CAMERA_INFO,)))
-        if self.parameters.use_mask:
-            needed.append(NeededInput(MASKS, with_each=True))
+        needed += [NeededInput(tuple(row.types), with_each=True) for row in self._awaited()]
         return needed
+
+    @classmethod
+    def inputs_of(cls, parameters: Any) -> tuple[ImageInput, ...]:
+        """What may come with the images, by the parameters."""
+        return (MASK_INPUT,)
+
+    def _awaited(self) -> list[ImageInput]:
+        """The inputs that images wait for."""
+        return [row for row in self._rows if row.is_used(self.parameters)]
 
     @abstractmethod
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
@@ -126,23 +154,23 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _waits_for_inputs(self) -> bool:
         """Whether images have to wait for other inputs than camera_info."""
-        return self.parameters.use_mask
+        return bool(self._awaited())
 
     def _is_ready(self, waiting: WaitingImage) -> bool:
         """Whether an image need not wait for anything but a camera_info."""
-        return self._has_mask(waiting.stamp_ns)
+        return self._missing(waiting.stamp_ns) is None
 
-    def _missing_input(self, stamp: int) -> Fault:
-        """What an image is waiting for, besides a camera_info."""
-        return Fault.NO_MASK
+    def _missing(self, stamp: int) -> ImageInput | None:
+        """The first input that an image waits for."""
+        timeout = self.parameters.input_timeout
+        for row in self._awaited():
+            if not self._has(self._inputs[row.name], stamp, timeout):
+                return row
+        return None
 
     def _forget_inputs(self, stamp: int) -> None:
         """Drops what belongs to the images before time jumped back to a stamp."""
-        self._masks.clear()
-
-    def _has_mask(self, stamp: int) -> bool:
-        p = self.parameters
-        return not p.use_mask or self._has(self._masks, stamp, p.input_timeout)
+        self._inputs.clear()
 
     def _has(self, inputs: StampedInputs[Any], stamp: int, timeout: float) -> bool:
         """Whether an image need not wait any longer for an input."""
@@ -160,15 +188,21 @@ class CameraSession(Session[CameraParameters, State]):
         )
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
+        row = self._inputs.row(source)
         if source == CAMERA_INFO:
             self._take_camera_info(message)
-        elif source in MASKS:
-            if self.parameters.use_mask:
-                self._masks.put(stamp, self._mask_in(message, stamp))
-        else:
+        elif row is None:
             self._take_image(message, stamp)
+        elif row in self._awaited():
+            self._inputs.put(source, message, stamp, partial(self._read_input, row))
+
+    def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
+        """The content of a message, as `ImageInput.read`."""
+        assert row.read is not None
+        return row.read(message, stamp)
 
     def _take_camera_info(self, message: Any) -> None:
+        self._info_stamp = time_ns(message.header.stamp)
         self._see_frame(CAMERA_INFO, message)
         try:
             camera = camera_from_info(message)
@@ -211,44 +245,6 @@ class CameraSession(Session[CameraParameters, State]):
             return
         self._newest, self._fresh = stamp, self._fresh + 1
         self._waiting.append(WaitingImage(image, stamp, str(message.header.frame_id)))
-
-    def _mask_in(self, message: Any, stamp: int) -> Mask | None:
-        """The mask in a message; None where it can not be used."""
-        try:
-            mask = decode_mask(message)
-        except ImageError as error:
-            self._log.fault(Fault.MASK, str(error))
-            return None
-        if mask.all():
-            self._log.fault(
-                Fault.MASK,
-                f'mask of {stamp} ns is zero nowhere, wanted zero where the person is not',
-            )
-            return None
-        return mask
-
-    def _mask_of(self, image: Image, stamp: int) -> Mask | None:
-        """The mask of an image; None where there is none that fits."""
-        lone = [each for each in self._masks.before(stamp) if each not in self._dropped]
-        for each in lone:
-            self._log.note(
-                Fault.LONE_MASK,
-                f'mask of {each} ns belongs to no image, or comes too late: wanted the stamp of '
-                'an image',
-            )
-        known = stamp in self._masks
-        mask = self._masks.take(stamp)
-        if not known:
-            self._log.note(Fault.NO_MASK, f'no mask has come for the image of {stamp} ns')
-        if mask is None or mask.shape == image.shape[:2]:
-            return mask
-        (height, width), (rows, columns) = mask.shape, image.shape[:2]
-        self._log.fault(
-            Fault.MASK,
-            f'mask of {stamp} ns has {width}x{height} pixels, wanted the {columns}x{rows} of its '
-            'image',
-        )
-        return None
 
     def _look_at_scene(
         self, waiting: WaitingImage, background: BackgroundModel, remedy: str
@@ -299,7 +295,8 @@ class CameraSession(Session[CameraParameters, State]):
                     f'image of {stamp} ns is dropped: it waited for a calibrated camera_info',
                 )
             else:
-                kind = self._missing_input(stamp)
+                row = self._missing(stamp)
+                kind = Fault.NO_TRANSFORM if row is None else row.none
                 self._log.give_up(
                     kind,
                     kind.value.removeprefix('no '),
@@ -314,11 +311,16 @@ class CameraSession(Session[CameraParameters, State]):
         except ValueError as error:
             self._log.skip(Fault.IMAGE_SIZE, str(error))
             return
-        frame = self._frame_of(waiting)
-        mask = None
-        if self.parameters.use_mask:
-            mask = self._mask_of(waiting.image, waiting.stamp_ns)
-        self._estimate(waiting._replace(frame_id=frame, mask=mask), camera)
+        frame, given = self._frame_of(waiting), self._given_with(waiting)
+        self._estimate(waiting._replace(frame_id=frame, given=given), camera)
+
+    def _given_with(self, waiting: WaitingImage) -> dict[str, Taken]:
+        """What has come with an image, by the name of the input."""
+        return {
+            row.name: self._inputs.take(row, waiting.stamp_ns, waiting.image, self._dropped)
+            for row in self._awaited()
+            if not row.together
+        }
 
     def _frame_of(self, waiting: WaitingImage) -> str:
         """Optical frame of the camera, as the image names it, or else the camera_info."""
@@ -352,53 +354,6 @@ def camera_moved_fault(shift: float, stamp_ns: int, remedy: str) -> str:
         f'{CAMERA_MOVED}: at the image of {stamp_ns} ns the scene is {far}; fix the camera, take '
         f'background_file anew, or let the background be learned, and {remedy}'
     )
-
-
-class StampedInputs(Generic[T]):
-    """Inputs that belong to the image of exactly their stamp; of several the last counts.
-
-    None stands for an input that says nothing, as of a detector that saw nobody.
-
-    Args:
-        most: number of inputs that are remembered.
-    """
-
-    def __init__(self, most: int = _REMEMBERED) -> None:
-        self._most = most
-        self._content: dict[int, T | None] = {}
-        self._newest = -1
-
-    def __contains__(self, stamp_ns: int) -> bool:
-        return stamp_ns in self._content
-
-    def put(self, stamp_ns: int, content: T | None) -> None:
-        """Keeps an input for its image."""
-        self._newest = max(self._newest, stamp_ns)
-        self._content[stamp_ns] = content
-        while len(self._content) > self._most:
-            del self._content[min(self._content)]
-
-    def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the input for an image has come, or a later one."""
-        return stamp_ns in self._content or self._newest > stamp_ns
-
-    def before(self, stamp_ns: int) -> list[int]:
-        """Stamps of the inputs that are older than an image."""
-        return [stamp for stamp in self._content if stamp < stamp_ns]
-
-    def take(self, stamp_ns: int) -> T | None:
-        """The input for an image, None where there is none; drops it and all that are older."""
-        return self.take_all(stamp_ns).get(stamp_ns)
-
-    def take_all(self, stamp_ns: int) -> dict[int, T | None]:
-        """The inputs by stamp, in order, for an image and all that are older; drops them."""
-        taken = sorted(stamp for stamp in self._content if stamp <= stamp_ns)
-        return {stamp: self._content.pop(stamp) for stamp in taken}
-
-    def clear(self) -> None:
-        """Drops all inputs."""
-        self._content.clear()
-        self._newest = -1
 
 
 def check_size(image: Image, camera: Camera) -> None:

@@ -18,7 +18,9 @@ import textwrap
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
+
+from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, schemes
 
 # A tuple is a list of numbers.
 Value = bool | int | float | str | tuple[float, ...]
@@ -43,6 +45,8 @@ FRACTION = (0.0, 1.0)
 
 TRANSPORTS = ('raw', 'compressed')
 LONGEST_TIMEOUT = 60.0  # s
+# Value of `source` for messages of this package.
+OWN_KEYPOINTS = 'keypoints'
 
 # Parameters that nodes had before, and what is there instead.
 _TRACKER = 'programs set it in TrackerSettings'
@@ -155,13 +159,41 @@ class CameraNodeParameters(ImageNodeParameters):
     Attributes:
         use_mask: If true, masks of a segmenter replace background subtraction, and an image waits
             for the mask of its stamp.
+        source: Type of the messages with keypoints, 'keypoints' (hmt_msgs/Keypoints2D, on the topic
+            keypoints), or on the topic detections 'skeleton2d' (hri_msgs/Skeleton2D), 'yolo'
+            (yolo_msgs/DetectionArray) or 'floats' (std_msgs/Float32MultiArray).
+        scheme: Scheme whose order the keypoints of 'yolo' and 'floats' follow: 'coco17', 'halpe26',
+            'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
+        person_id: Identity that the detector gives the person who is tracked; if empty, it is the
+            largest person at first, and then the one nearest to where this person was last.
+        keypoint_scheme: What the names of keypoints mean, 'auto' (recognised by the names),
+            'joints' (the joints of the body themselves), or a scheme of detectors: 'coco17',
+            'halpe26', 'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
         input_timeout: Maximum time that an image waits for each other input of its stamp that is
             used, measured by the stamps of later messages, s; an input of a later stamp ends the
             wait for its kind at once.
     """
 
     use_mask: bool = parameter_field(False, AT_ONCE)
+    source: str = parameter_field(OWN_KEYPOINTS, NEXT_CONFIGURE)
+    scheme: str = parameter_field('coco17', NEXT_CONFIGURE)
+    person_id: str = parameter_field('', AT_ONCE)
+    keypoint_scheme: str = parameter_field(AUTO, AT_ONCE)
     input_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, LONGEST_TIMEOUT))
+
+    # Values of `source`.
+    SOURCES: ClassVar[tuple[str, ...]] = (OWN_KEYPOINTS, 'skeleton2d', 'yolo', 'floats')
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known = {
+            'source': self.SOURCES,
+            'scheme': tuple(schemes()),
+            'keypoint_scheme': (AUTO, JOINTS, *schemes()),
+        }
+        for name, values in known.items():
+            if (value := getattr(self, name)) not in values:
+                raise ValueError(f'{name} must be one of {values}, saw {value!r}')
 
 
 class ParameterError(ValueError):

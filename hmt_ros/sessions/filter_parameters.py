@@ -11,7 +11,6 @@ import sys
 from dataclasses import dataclass, field
 
 from hmt_ros.image.background import BackgroundSettings
-from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, schemes
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.declared_parameters import (
@@ -43,13 +42,6 @@ _TRACKER = {
 BACKGROUND = {'method': None}
 
 
-def check_keypoint_scheme(scheme: str) -> None:
-    """Raises ValueError where there is no such scheme."""
-    known = (AUTO, JOINTS, *schemes())
-    if scheme not in known:
-        raise ValueError(f'keypoint_scheme must be one of {known}, saw {scheme!r}')
-
-
 @dataclass(frozen=True)
 class FilterParameters(CameraNodeParameters):
     """All parameters of the filter node.
@@ -64,9 +56,6 @@ class FilterParameters(CameraNodeParameters):
         random_seed: Seed of all random numbers; the same images give the same results.
         use_keypoints: If true, keypoints are a measurement and start the track where there is no
             subject_file, and an image waits for the keypoints of its stamp.
-        keypoint_scheme: What the names of keypoints mean, 'auto' (recognised by the names),
-            'joints' (the joints of the body themselves), or a scheme of detectors: 'coco17',
-            'halpe26', 'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
         use_keypoints_3d: If true, positions of the same landmarks in space (topic keypoints_3d) are
             weak evidence of depth, and an image waits for those of its stamp.
         keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px; 0
@@ -113,7 +102,6 @@ class FilterParameters(CameraNodeParameters):
     body_model: str = parameter_field('human37', NEXT_TRACK)
     random_seed: int = parameter_field(0, NEXT_TRACK, (0, 2**31 - 1))
     use_keypoints: bool = parameter_field(False, AT_ONCE)
-    keypoint_scheme: str = parameter_field(AUTO, AT_ONCE)
     use_keypoints_3d: bool = parameter_field(False, AT_ONCE)
     keypoint_sigma_px: float = parameter_field(0.0, AT_ONCE, (0.0, 1000.0))
     use_depth: bool = parameter_field(False, AT_ONCE)
@@ -144,7 +132,6 @@ class FilterParameters(CameraNodeParameters):
         super().__post_init__()
         if not self.body_model:
             raise ValueError("body_model must be a name or a file, saw ''")
-        check_keypoint_scheme(self.keypoint_scheme)
         if self.use_keypoints_3d and not self.use_keypoints:
             raise ValueError('use_keypoints_3d needs use_keypoints, which is false')
         if self.gravity and unit_vector(self.gravity, 'gravity')[1] < UPSIDE_DOWN:

@@ -1,22 +1,14 @@
 """The filter behind its topics.
 
 The node and offline replay give their messages to a `FilterSession`; the same messages in the same
-order give the same bytes. The rules, besides those of `CameraSession`:
+order give the same bytes. The rules, besides those of `TrackingSession`:
 
 - An image that is not younger than the one before is skipped, or starts the track anew with
   `reset_on_time_jump`.
-- With `use_keypoints` an image waits for keypoints of exactly its stamp, for keypoints of a later
-  stamp, or for an image that is `input_timeout` younger; with `use_keypoints_3d` for keypoints_3d,
-  with `use_depth` for a depth image, and with `use_predictions` for a pose_prediction, in the same
-  way. Of several of one stamp the
-  last counts; keypoints without names, and mixtures without components, say that nobody was seen.
-- With `gravity_frame` or `fixed_frame` an image waits for the transforms of its stamp, or for an
-  image or a transform that is `input_timeout` younger, and never so long that it would be
-  dropped. Where they do not come, what was known of gravity before holds, and the camera is taken
-  to go on as before.
+- An image waits for the inputs that are used (`image_inputs`); keypoints without names, and
+  mixtures without components, say that nobody was seen.
 - When the person is no longer in view one mixture without components of either kind goes out, with
   markers that remove those before, and then nothing until a new track starts.
-- A camera_info with another calibration, and ~/reset, start the track anew.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
@@ -33,24 +25,27 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
-from hmt_ros.sessions.camera_frames import CameraFrames
-from hmt_ros.sessions.camera_session import (
-    CAMERA_INFO,
-    COMPRESSED_MASK,
-    IMAGE,
-    MASK,
-    CameraSession,
-    StampedInputs,
-    WaitingImage,
-)
-from hmt_ros.sessions.depth_inputs import DEPTH, DepthInputs, depth_elsewhere
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, WaitingImage
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_state import FilterState
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
+from hmt_ros.sessions.image_inputs import (
+    COMPRESSED_MASK,
+    DEPTH,
+    DETECTIONS,
+    INPUTS,
+    KEYPOINTS,
+    KEYPOINTS_3D,
+    KEYPOINTS_INPUT,
+    MASK,
+    PREDICTION,
+    PREDICTION_INPUT,
+    ImageInput,
+)
+from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input
 from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
-from hmt_ros.sessions.session import NeededInput, everything
+from hmt_ros.sessions.session import everything
 from hmt_ros.sessions.track_messages import (
     TOPICS_OF_NODE,
     Presentation,
@@ -60,15 +55,12 @@ from hmt_ros.sessions.track_messages import (
     track_messages,
 )
 from hmt_ros.sessions.track_reports import TrackCondition, report_change
-from hmt_ros.sessions.track_start import TrackStart, prepare_start
-from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
-from hmt_ros.sessions.warm_up import warm_up_tracking
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking import PosePrediction, Status, Tracker
 from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.cdr import serialise
-from msg_tools.messages.headers import time_ns
 from msg_tools.messages.keep_out import KeepOutState
 from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_of
 
@@ -85,8 +77,6 @@ __all__ = [
     'FilterState',
 ]
 
-PREDICTION = 'pose_prediction'
-
 # Change of a length above which a body is described anew, m.
 RESHAPED = 0.005
 _STATES = {
@@ -97,18 +87,14 @@ _STATES = {
 }
 
 
-class FilterSession(CameraSession[FilterParameters, FilterState]):
-    """Tracks one person before one camera; see `Session` for arguments and attributes.
+class FilterSession(TrackingSession[FilterParameters, FilterState]):
+    """Tracks one person before one camera; see `TrackingSession` for arguments and attributes.
 
     Attributes:
-        start: what the present track started from.
-        frames: that transforms lead to from the camera.
         robot: what a robot acts on; may be read by any thread.
-        answered: number of images of which a robot was told.
     """
 
     TOPICS = TOPICS_OF_NODE
-    DONE = 'tracked'
     ESTIMATE = 'the track'
     CHECKED = ('subject_file', 'background_file', 'body_model', 'lifter')
 
@@ -119,62 +105,23 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         wanted: Callable[[str], bool] = everything,
     ) -> None:
         super().__init__(parameters, publish, wanted)
-        self.start = prepare_start(parameters)
-        p = parameters
-        self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
         self._tracker: Tracker | None = None
         self._tracks, self._turn = 0, 0.0
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
-        self._keypoints = KeypointInputs(self._log)
-        self._depths = DepthInputs(self._log)
-        self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
-        self.robot = RobotOutputs()
-        self.answered = 0
+        self._keypoints = KeypointReader(parameters.source, self._log)
         # Of an image that was left out since the last estimate.
         self._late_prediction: PosePrediction | None = None
+        self.robot = RobotOutputs()
         self.state = self._present_state()
 
-    def prepare(self) -> None:
-        """See `Session`."""
-        warm_up_tracking()
-
-    def restart(self, start: TrackStart | None = None) -> None:
-        """Drops the track; the next image starts a new one.
-
-        Args:
-            start: what it starts from; None: what the parameters name.
-
-        Raises:
-            ValueError: the parameters name a file that can not be used; the track goes on.
-        """
-        self.start = prepare_start(self.parameters) if start is None else start
-        super().restart()
-
-    def needed_inputs(self) -> list[NeededInput]:
-        """What has to come at present; may be called by any thread."""
-        needed = super().needed_inputs()
-        needed += [NeededInput((source,), with_each=True) for source, _, _ in self._stamped()]
-        if self.frames.wanted and not self.frames.heard:
-            needed.append(NeededInput(TRANSFORMS))
-        return needed
+    @classmethod
+    def inputs_of(cls, parameters: FilterParameters) -> tuple[ImageInput, ...]:
+        """See `CameraSession`."""
+        own = keypoints_input(parameters.source)
+        return tuple(own if row is KEYPOINTS_INPUT else row for row in INPUTS)
 
     # Inputs.
-
-    def _take(self, source: str, message: Any, stamp: int) -> None:
-        if source == KEYPOINTS:
-            self._keypoints.put(message, stamp, self.parameters, self.start.body)
-        elif source == KEYPOINTS_3D:
-            self._keypoints.put_3d(message, stamp)
-        elif source == DEPTH:
-            if self.parameters.use_depth:
-                self._depths.put(message, stamp)
-        elif source == PREDICTION:
-            self._predictions.put(stamp, self._prediction_in(message))
-        elif source in TRANSFORMS:
-            self._take_transforms(message, static=source == TF_STATIC)
-        else:
-            super()._take(source, message, stamp)
 
     def _forget(self) -> None:
         if self._tracker is not None:
@@ -187,35 +134,32 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         # Where time begins again, so do the numbers of the tracks.
         self._tracker, self._tracks = None, 0
         self.robot.forget()
-        self._keypoints.clear()
-        self._depths.images.clear()
-        self._predictions.clear()
+        self._keypoints.forget()
         self._late_prediction = None
-        self.frames.forget_after(stamp)
 
     def _stamp_of(self, source: str, message: Any) -> int:
-        if source not in TRANSFORMS:
-            return super()._stamp_of(source, message)
-        return max((time_ns(each.header.stamp) for each in message.transforms), default=0)
+        if source == DETECTIONS:
+            told = self._keypoints.stamp_of(message, self._info_stamp)
+            if told is not None:
+                return told
+        return super()._stamp_of(source, message)
 
-    def _take_transforms(self, message: Any, *, static: bool) -> None:
-        if not self.frames.wanted:
-            return
-        for text in self.frames.take(message, static=static):
-            self._log.note(Fault.TRANSFORM, text)
-
-    def _start_anew(self) -> None:
-        try:
-            self.restart()
-        except ValueError as error:
-            self._log.fault(Fault.START, f'{error}; the track starts as the time before')
-            self._start_again()
-
-    def _start_again(self) -> None:
-        self.restart(self.start)
+    def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
+        if row.name == KEYPOINTS:
+            p = self.parameters
+            return self._keypoints.read(
+                message, stamp, p, self.start.body, self._camera, p.keypoint_sigma_px
+            )
+        if row is PREDICTION_INPUT:
+            return self._prediction_in(message)
+        return super()._read_input(row, message, stamp)
 
     def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
-        """The mixture and its body, see `body_of`; `NOBODY`: was seen; None: not to be used."""
+        """The mixture and its body, see `body_of`; `NOBODY`: was seen; None: it says nothing.
+
+        Raises:
+            ValueError: it can not be used; one line.
+        """
         if len(message.components) == 0:
             # A predictor that leaves the image to the track has seen neither somebody nor nobody.
             return None if message.state == TrackState.TRACKING else Status.NOBODY
@@ -223,63 +167,29 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             content = pose_mixture_of(message)
             return PosePrediction(content.mixture, body_of(content, self.start.body))
         except ValueError as error:
-            self._log.fault(Fault.PREDICTION, f'pose_prediction: {error}')
-            return None
-
-    def _waits_for_inputs(self) -> bool:
-        return super()._waits_for_inputs() or bool(self._stamped()) or self.frames.wanted
-
-    def _is_ready(self, waiting: WaitingImage) -> bool:
-        return (
-            super()._is_ready(waiting)
-            and self._missing_here(waiting.stamp_ns) is None
-            and self._has_transforms(self.frames, waiting)
-        )
+            raise ValueError(f'pose_prediction: {error}') from error
 
     def _leave_out(self, stamp: int) -> None:
         # A person moves little until the next image: the prediction is a hypothesis there, too.
-        found = self._predictions.take(stamp)
+        found = self._inputs[PREDICTION].take(stamp)
         if isinstance(found, PosePrediction):
             self._late_prediction = found
 
-    def _prediction_of(self, stamp: int) -> PosePrediction | Status | None:
+    def _prediction_of(self, waiting: WaitingImage) -> PosePrediction | Status | None:
         """What was predicted from an image or, without that, from one left out before it."""
-        found = self._predictions.take(stamp)
+        found: PosePrediction | Status | None = waiting.content(PREDICTION)
         late, self._late_prediction = self._late_prediction, None
         return late if found is None else found
-
-    def _missing_input(self, stamp: int) -> Fault:
-        return self._missing_here(stamp) or super()._missing_input(stamp)
-
-    def _missing_here(self, stamp: int) -> Fault | None:
-        """What an image is waiting for, of the inputs that have its stamp besides masks."""
-        for _, inputs, fault in self._stamped():
-            if not self._has(inputs, stamp, self.parameters.input_timeout):
-                return fault
-        return None
-
-    def _stamped(self) -> list[tuple[str, StampedInputs[Any], Fault]]:
-        """The inputs besides masks that each image waits for, and what it is to have none."""
-        p, known = self.parameters, self._keypoints
-        inputs = (
-            (p.use_keypoints, KEYPOINTS, known.plane, Fault.NO_KEYPOINTS),
-            (p.use_keypoints_3d, KEYPOINTS_3D, known.space, Fault.NO_KEYPOINTS_3D),
-            (p.use_depth, DEPTH, self._depths.images, Fault.NO_DEPTH),
-            (p.use_predictions, PREDICTION, self._predictions, Fault.NO_PREDICTION),
-        )
-        return [(source, those, fault) for used, source, those, fault in inputs if used]
 
     # Outputs.
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
-        stamp = waiting.stamp_ns
         p = self.parameters
-        keypoints = None
-        if p.use_keypoints:
-            keypoints = self._keypoints.take(stamp, p, self.start.body)
-        prediction = self._prediction_of(stamp) if p.use_predictions else None
-        if p.use_depth:
-            waiting = self._depths.added_to(waiting, self._dropped)
+        keypoints = self._keypoints.at_joints(
+            waiting.content(KEYPOINTS), waiting.content(KEYPOINTS_3D), self.start.body,
+            p.keypoint_scheme, waiting.stamp_ns,
+        )  # fmt: skip
+        prediction = self._prediction_of(waiting) if p.use_predictions else None
         self._follow(waiting, camera, keypoints, prediction)
 
     def _new_tracker(self, camera: Camera) -> Tracker:
@@ -323,7 +233,12 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             )
             report_change(self._log, before, self._tracker, self.start.initial, stamp)
             if waiting.depth is not None and not self._tracker.validity.believes('depth'):
-                self._log.note(Fault.DEPTH_ELSEWHERE, depth_elsewhere(stamp))
+                self._log.note(
+                    Fault.DEPTH_ELSEWHERE,
+                    f'depth of {stamp} ns does not show the person where the image does: depth '
+                    'images are not used until they do; wanted depth of the same time, registered '
+                    'to the colour camera',
+                )
             if posterior is not None and likelihood is not None:
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
@@ -337,11 +252,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             # The next image would fail as this one did, after as long a time.
             self._log.skip(Fault.START, f'no track starts at the image of {stamp} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None, box=None))
-
-    def _look_at_frames(self, waiting: WaitingImage) -> None:
-        """Looks up what transforms tell of gravity and of the camera at an image."""
-        for kind, text in self.frames.look(waiting.frame_id, waiting.stamp_ns):
-            self._log.note(kind, text)
 
     def _publish_track(
         self,
@@ -437,11 +347,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self.answered += 1
 
     def stale(self, silence: float) -> list[Output]:
-        """What a robot is told where no image is answered; may be called by any thread.
-
-        Args:
-            silence: time since the newest image was answered, s.
-        """
+        """See `TrackingSession`."""
         found: list[Output] = []
 
         def publish(topic: str, stamp: int, message: Any) -> None:

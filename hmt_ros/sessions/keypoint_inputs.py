@@ -1,29 +1,45 @@
-"""Keypoints that wait for their image: in the plane, and of the same landmarks in space.
+"""Keypoints of the person who is tracked, from messages of any detector, and what they wait with.
 
-Of several keypoints of one stamp the last count; keypoints without names say that nobody was seen.
-Positions in space join the keypoints of their stamp by name.
+The parameter `source` says what the messages are: hmt_msgs/Keypoints2D of one person, or those of
+other detectors, of one person or of several:
+
+- Skeleton2D is in units of the image: it needs a camera_info before. Its topic belongs to one
+  person already. Float32MultiArray without a stamp has that of the newest camera_info.
+- Of several people one is chosen: by `person_id`, or the largest at first, and then the one who is
+  nearest to the last place.
+
+Keypoints without names say that nobody was seen. Positions in space join the keypoints of their
+stamp by name.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from hmt_ros.body import Body
+from hmt_ros.body import Body, Camera
 from hmt_ros.experts.lifter import Lifter, load_lifter
-from hmt_ros.image.keypoint_schemes import AUTO, JOINTS
+from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, schemes
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions.camera_session import StampedInputs
-from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.chosen_person import ChosenPerson
+from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, CameraNodeParameters
 from hmt_ros.sessions.handled import Fault, HandlingLog
+from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS_INPUT, SOURCES, ImageInput
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
-from msg_tools.messages.detections import NO_KEYPOINTS
-from msg_tools.messages.keypoints import Positions, keypoints_of, positions_of
+from msg_tools.messages.detections import (
+    NO_KEYPOINTS,
+    people_of_floats,
+    people_of_yolo,
+    person_of_skeleton,
+    stamp_of_floats,
+)
+from msg_tools.messages.keypoints import Positions, keypoints_of
 
-KEYPOINTS, KEYPOINTS_3D = 'keypoints', 'keypoints_3d'
-
+# Time without the person after which the largest one is chosen anew, s.
+LONGEST_ABSENCE = 1.0
 # Sets of unknown names that are warned of, each once; a detector has one.
 _MOST_WARNINGS = 20
 
@@ -40,51 +56,104 @@ def known_lifter(model: str) -> Lifter | None:
         raise ValueError(f'lifter {model}: {error_line(error)}') from error
 
 
-class KeypointInputs:
-    """The keypoints that have come.
+def keypoints_input(source: str) -> ImageInput:
+    """The input of keypoints with messages of a `source`."""
+    if source == OWN_KEYPOINTS:
+        return KEYPOINTS_INPUT
+    return replace(KEYPOINTS_INPUT, types={DETECTIONS: SOURCES[source]}, after=None)
+
+
+class KeypointReader:
+    """Reads the keypoints of the person who is tracked.
 
     Args:
-        log: takes faults.
-
-    Attributes:
-        plane: keypoints by stamp.
-        space: positions of the same landmarks by stamp.
+        source: as the parameter.
+        log: takes remarks.
     """
 
-    def __init__(self, log: HandlingLog) -> None:
-        self._log = log
-        self.plane: StampedInputs[Keypoints] = StampedInputs()
-        self.space: StampedInputs[Positions] = StampedInputs()
+    def __init__(self, source: str, log: HandlingLog) -> None:
+        self._source, self._log = source, log
+        self._chosen = ChosenPerson()
         self._unknown: set[frozenset[str]] = set()
 
-    def clear(self) -> None:
-        """Drops all that have come."""
-        self.plane.clear()
-        self.space.clear()
+    def stamp_of(self, message: Any, info_stamp: int) -> int | None:
+        """Stamp of a message that may have none, as `floats`; None: it has one in its header.
 
-    def put(self, message: Any, stamp_ns: int, parameters: FilterParameters, body: Body) -> None:
-        """Takes an hmt_msgs/Keypoints2D; one that can not be used counts as none."""
-        p = parameters
-        self.plane.put(stamp_ns, self.read(message, body, p.keypoint_scheme, p.keypoint_sigma_px))
+        Args:
+            message: of the source.
+            info_stamp: of the newest camera_info, ns.
+        """
+        if self._source != 'floats':
+            return None
+        told = stamp_of_floats(message)
+        return info_stamp if told is None else told
 
-    def put_3d(self, message: Any, stamp_ns: int) -> None:
-        """Takes an hmt_msgs/Keypoints3D; one that can not be used counts as none."""
-        content = None
-        if len(message.names):
-            try:
-                content = positions_of(message)
-            except MessageError as error:
-                self._log.fault(Fault.KEYPOINTS_3D, str(error))
-        self.space.put(stamp_ns, content)
+    def read(
+        self, message: Any, stamp: int, parameters: CameraNodeParameters, body: Body,
+        camera: Camera | None, sigma_px: float = 0.0,
+    ) -> Keypoints:  # fmt: skip
+        """The keypoints in a message.
 
-    def take(self, stamp_ns: int, parameters: FilterParameters, body: Body) -> Keypoints | None:
+        Args:
+            message: of the source.
+            stamp: of the message, ns.
+            parameters: how.
+            body: whose joints they may name.
+            camera: that took the image; None: it is not known yet.
+            sigma_px: standard deviation of keypoints without one, px; 0: as is learned.
+
+        Raises:
+            ValueError: it can not be used; one line.
+        """
+        found = self._found(message, stamp, parameters, camera, sigma_px)
+        if found is None or not found.names:
+            return NO_KEYPOINTS
+        _, unknown = found.named_for(body, parameters.keypoint_scheme)
+        if unknown:
+            self._report(unknown, parameters.keypoint_scheme)
+        return found
+
+    def _found(
+        self, message: Any, stamp: int, p: CameraNodeParameters, camera: Camera | None,
+        sigma_px: float,
+    ) -> Keypoints | None:  # fmt: skip
+        if self._source == OWN_KEYPOINTS:
+            return keypoints_of(message, sigma_px) if len(message.names) else None
+        try:
+            if self._source == 'skeleton2d':
+                if camera is None:
+                    raise MessageError(
+                        'it comes before a calibrated camera_info, which tells the size of the '
+                        'image'
+                    )
+                person = person_of_skeleton(message, camera.width, camera.height).keypoints
+                return person[np.flatnonzero(person.seen)]
+            if stamp == 0:
+                raise MessageError('it comes before a camera_info, which tells its stamp')
+            read = people_of_yolo if self._source == 'yolo' else people_of_floats
+            people = read(message, schemes()[p.scheme])
+        except MessageError as error:
+            raise MessageError(f'detection of {stamp} ns: {error}') from error
+        if p.person_id:
+            own = (x.keypoints for x in people if x.name == p.person_id and x.keypoints.seen.any())
+            chosen = next(own, None)
+        else:
+            chosen = self._chosen.choose(people, stamp, LONGEST_ABSENCE)
+        return None if chosen is None else chosen[np.flatnonzero(chosen.seen)]
+
+    def at_joints(
+        self, found: Keypoints | None, positions: Positions | None, body: Body, scheme: str,
+        stamp_ns: int,
+    ) -> Keypoints | None:  # fmt: skip
         """The keypoints that were seen in an image, maybe none, as joints of the body.
 
-        Returns:
-            They have positions if some have come; None: no keypoints have come.
+        Args:
+            found: as read; None: none have come.
+            positions: of the same landmarks in space; None: none have come.
+            body: whose joints they become.
+            scheme: what their names mean.
+            stamp_ns: of the image.
         """
-        found = self.plane.take(stamp_ns)
-        positions = self.space.take(stamp_ns) if parameters.use_keypoints_3d else None
         if found is None or not found.names:
             return found
         if positions is not None:
@@ -95,24 +164,12 @@ class KeypointInputs:
                     f'keypoints_3d of {stamp_ns} ns has none of the names of its keypoints, such '
                     f'as {found.names[0]!r}, but {positions.names[0]!r}',
                 )
-        known, _ = found.named_for(body, parameters.keypoint_scheme)
+        known, _ = found.named_for(body, scheme)
         return known[np.flatnonzero(known.seen)] if known.names else None
 
-    def read(
-        self, message: Any, body: Body, scheme: str, sigma_px: float = 0.0
-    ) -> Keypoints | None:
-        """The keypoints in an hmt_msgs/Keypoints2D; None: it can not be used, which is reported."""
-        if len(message.names) == 0:
-            return NO_KEYPOINTS
-        try:
-            content = keypoints_of(message, sigma_px)
-        except MessageError as error:
-            self._log.fault(Fault.KEYPOINTS, str(error))
-            return None
-        _, unknown = content.named_for(body, scheme)
-        if unknown:
-            self._report(unknown, scheme)
-        return content
+    def forget(self) -> None:
+        """Whom the messages were about is chosen anew."""
+        self._chosen.forget()
 
     def _report(self, unknown: list[str], scheme: str) -> None:
         names = frozenset(unknown)

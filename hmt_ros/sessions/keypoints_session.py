@@ -19,9 +19,9 @@ import numpy as np
 
 from hmt_ros.detectors.mediapipe_pose import DetectorError, MediaPipePose
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions.camera_session import IMAGE, MASK
+from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D
+from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D, MASK
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
 from msg_tools.messages import keypoints

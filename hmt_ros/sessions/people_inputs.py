@@ -46,7 +46,7 @@ class Found:
         return self.detected.box is not None or len(self.keypoints.names) >= FEWEST_KEYPOINTS
 
 
-class PeopleInputs:
+class PeopleReader:
     """Reads the detections.
 
     Args:
@@ -59,13 +59,16 @@ class PeopleInputs:
         self._log = log
         self._unknown: set[frozenset[str]] = set()
 
-    def people(self, message: Any, stamp: int, sigma_px: float) -> list[DetectedPerson] | None:
-        """The people in a message; None where it can not be used.
+    def people(self, message: Any, stamp: int, sigma_px: float) -> list[DetectedPerson]:
+        """The people in a message.
 
         Args:
             message: of the type of `source`.
             stamp: of its image, ns.
             sigma_px: standard deviation of keypoints without covariances, px; 0: as is learned.
+
+        Raises:
+            MessageError: it can not be used.
         """
         try:
             if self._source == 'people':
@@ -77,8 +80,7 @@ class PeopleInputs:
             else:
                 people = people_of_floats(message, self._scheme)
         except MessageError as error:
-            self._log.fault(Fault.DETECTIONS, f'detections of {stamp} ns: {error}')
-            return None
+            raise MessageError(f'detections of {stamp} ns: {error}') from error
         names: set[str] = set()
         for i, person in enumerate(people):
             if person.name and person.name in names:

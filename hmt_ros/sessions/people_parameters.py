@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
-from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.sessions.declared_parameters import AT_ONCE, NEXT_CONFIGURE, parameter_field
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.parameter_file import parameter_file_text
-from msg_tools.messages.detections import BOXES, FLOATS, PEOPLE_2D, YOLO
 
-# Types of the messages by value of the parameter `source`.
-SOURCES = {'people': PEOPLE_2D, 'yolo': YOLO, 'boxes': BOXES, 'floats': FLOATS}
 # Inputs of one person, of whom a topic can not say who it is.
-_OF_ONE = {'subject_file': '', 'use_predictions': False, 'use_keypoints_3d': False}
+_OF_ONE = {
+    'subject_file': '', 'use_predictions': False, 'use_keypoints_3d': False, 'person_id': '',
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,6 @@ class PeopleParameters(FilterParameters):
         source: Type of the messages on the topic detections, 'people' (hmt_msgs/People2D), 'yolo'
             (yolo_msgs/DetectionArray), 'boxes' (vision_msgs/Detection2DArray) or 'floats'
             (std_msgs/Float32MultiArray).
-        scheme: Scheme whose order the keypoints of 'yolo' and 'floats' follow: 'coco17', 'halpe26',
-            'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
         max_people: Maximum number of people who are followed at the same time; of those who come at
             the same time the largest in the image are taken.
         use_keypoints: If true, keypoints of the detections are a measurement and start tracks; if
@@ -41,17 +38,14 @@ class PeopleParameters(FilterParameters):
     """
 
     source: str = parameter_field('people', NEXT_CONFIGURE)
-    scheme: str = parameter_field('coco17', NEXT_CONFIGURE)
     max_people: int = parameter_field(4, AT_ONCE, (1, 20))
     use_keypoints: bool = parameter_field(True, AT_ONCE)
     frame_prefix: str = parameter_field('', AT_ONCE)
 
+    SOURCES: ClassVar[tuple[str, ...]] = ('people', 'yolo', 'boxes', 'floats')
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.source not in SOURCES:
-            raise ValueError(f'source must be one of {tuple(SOURCES)}, saw {self.source!r}')
-        if self.scheme not in schemes():
-            raise ValueError(f'scheme must be one of {tuple(schemes())}, saw {self.scheme!r}')
         for name, unused in _OF_ONE.items():
             if getattr(self, name) != unused:
                 raise ValueError(

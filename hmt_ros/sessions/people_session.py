@@ -1,9 +1,8 @@
 """Several people before one camera: detections in, one filter for each person.
 
-The rules, besides those of `CameraSession`:
+The rules, besides those of `TrackingSession`:
 
-- An image waits for the detections of exactly its stamp, for detections of a later stamp, or for an
-  image that is `input_timeout` younger.
+- An image waits for its detections (`image_inputs`).
 - Somebody to whom the detector gives an identity keeps it. Others are told apart by where they were
   last and how they moved (`hmt_ros.tracking.association`).
 - A detection of nobody who is followed starts a filter, the largest first, up to `max_people`. Whom
@@ -28,24 +27,23 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.scene_watch import SceneWatch
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
-from hmt_ros.sessions.camera_frames import CameraFrames
-from hmt_ros.sessions.camera_session import (
-    IMAGE,
-    CameraSession,
-    StampedInputs,
-    WaitingImage,
-)
-from hmt_ros.sessions.depth_inputs import DEPTH, DepthInputs
+from hmt_ros.sessions.camera_session import IMAGE, WaitingImage
 from hmt_ros.sessions.handled import Fault, Handled, Output
-from hmt_ros.sessions.people_inputs import Found, PeopleInputs
+from hmt_ros.sessions.image_inputs import (
+    DEPTH_INPUT,
+    DETECTIONS,
+    DETECTIONS_INPUT,
+    MASK_INPUT,
+    SOURCES,
+    ImageInput,
+)
+from hmt_ros.sessions.people_inputs import Found, PeopleReader
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_state import PeopleState
 from hmt_ros.sessions.person_session import BODIES, PersonSession, person_of
-from hmt_ros.sessions.session import NeededInput, PublishedTopic, everything
+from hmt_ros.sessions.session import PublishedTopic, everything
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
-from hmt_ros.sessions.track_start import TrackStart, prepare_start
-from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
-from hmt_ros.sessions.warm_up import warm_up_tracking
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking.areas import grown, hull, unknown_area
 from hmt_ros.tracking.association import GATE, ImageTrack, Sighting, assigned
 from hmt_ros.tracking.camera_motion import CameraPose
@@ -57,9 +55,9 @@ from msg_tools.messages.detections import (
     people_message,
     stamp_of_floats,
 )
-from msg_tools.messages.headers import SECOND_NS, time_ns
+from msg_tools.messages.headers import SECOND_NS
 
-DETECTIONS, PEOPLE = 'detections', 'people'
+PEOPLE = 'people'
 __all__ = ['DETECTIONS', 'IMAGE', 'PEOPLE', 'PeopleSession', 'PeopleState']
 
 
@@ -93,20 +91,14 @@ class _Person:
     session: PersonSession
 
 
-class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
-    """Tracks several people; see `Session` for arguments and attributes.
-
-    Attributes:
-        frames: that transforms lead to from the camera.
-        answered: number of images of which a robot was told.
-    """
+class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
+    """Tracks several people; see `TrackingSession` for arguments and attributes."""
 
     # Each person has those of `track_messages` besides, with the prefix of `person_session`.
     TOPICS: ClassVar[Mapping[str, PublishedTopic]] = {
         PEOPLE: PublishedTopic(PEOPLE_2D),
         '/tf': TOPICS_OF_NODE['/tf'],
     }
-    DONE = 'tracked'
     ESTIMATE = 'every track'
     CHECKED = ('background_file', 'body_model', 'lifter')
 
@@ -117,32 +109,16 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         wanted: Callable[[str], bool] = everything,
     ) -> None:
         super().__init__(parameters, publish, wanted)
-        p = parameters
-        self._source = p.source
-        self._inputs = PeopleInputs(p, self._log)
-        self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
-        self._start = prepare_start(p)
-        self._detections: StampedInputs[list[DetectedPerson]] = StampedInputs()
-        self._depths = DepthInputs(self._log)
-        self._info_stamp = self.answered = 0
+        self._source = parameters.source
+        self._reader = PeopleReader(parameters, self._log)
         self._forget()
         self.state = self._present_state()
 
-    def prepare(self) -> None:
-        """See `Session`."""
-        warm_up_tracking()
-
-    def restart(self, start: TrackStart | None = None) -> None:
-        """Drops all tracks; people start anew.
-
-        Args:
-            start: what they start from; None: what the parameters name.
-
-        Raises:
-            ValueError: the parameters name a file that can not be used; the tracks go on.
-        """
-        self._start = prepare_start(self.parameters) if start is None else start
-        super().restart()
+    @classmethod
+    def inputs_of(cls, parameters: PeopleParameters) -> tuple[ImageInput, ...]:
+        """See `CameraSession`."""
+        detections = {DETECTIONS: SOURCES[parameters.source]}
+        return replace(DETECTIONS_INPUT, types=detections), DEPTH_INPUT, MASK_INPUT
 
     def finish(self) -> Handled:
         """Tracks the images that wait for inputs, which do not come any more."""
@@ -158,107 +134,28 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         self._next, self._detected, self._begun = 1, 0, False
 
     def stale(self, silence: float) -> list[Output]:
-        """As `FilterSession.stale`, of everybody who is followed."""
+        """See `TrackingSession`; of everybody who is followed."""
         return [output for person in self._people for output in person.session.stale(silence)]
-
-    def _start_anew(self) -> None:
-        try:
-            self.restart()
-        except ValueError as error:
-            self._log.fault(Fault.START, f'{error}; all tracks start as the time before')
-            self._start_again()
-
-    def _start_again(self) -> None:
-        super().restart()
-
-    def needed_inputs(self) -> list[NeededInput]:
-        """What has to come at present; may be called by any thread."""
-        needed = [*super().needed_inputs(), NeededInput((DETECTIONS,), with_each=True)]
-        if self.parameters.use_depth:
-            needed.append(NeededInput((DEPTH,), with_each=True))
-        if self.frames.wanted and not self.frames.heard:
-            needed.append(NeededInput(TRANSFORMS))
-        return needed
 
     # Inputs.
 
     def _stamp_of(self, source: str, message: Any) -> int:
-        if source in TRANSFORMS:
-            return max((time_ns(each.header.stamp) for each in message.transforms), default=0)
         if source == DETECTIONS and self._source == 'floats':
             told = stamp_of_floats(message)
             return self._info_stamp if told is None else told
         return super()._stamp_of(source, message)
 
-    def _take(self, source: str, message: Any, stamp: int) -> None:
-        if source == DETECTIONS:
-            people = self._inputs.people(message, stamp, self.parameters.keypoint_sigma_px)
-            self._detections.put(stamp, people)
-        elif source == DEPTH:
-            if self.parameters.use_depth:
-                self._depths.put(message, stamp)
-        elif source in TRANSFORMS:
-            if self.frames.wanted:
-                for text in self.frames.take(message, static=source == TF_STATIC):
-                    self._log.note(Fault.TRANSFORM, text)
-        else:
-            super()._take(source, message, stamp)
-
-    def _take_camera_info(self, message: Any) -> None:
-        self._info_stamp = time_ns(message.header.stamp)
-        super()._take_camera_info(message)
-
-    def _forget_inputs(self, stamp: int) -> None:
-        super()._forget_inputs(stamp)
-        self._detections.clear()
-        self._depths.images.clear()
-        self.frames.forget_after(stamp)
-
-    def _waits_for_inputs(self) -> bool:
-        return True
-
-    def _is_ready(self, waiting: WaitingImage) -> bool:
-        timeout = self.parameters.input_timeout
-        return (
-            super()._is_ready(waiting)
-            and self._has(self._detections, waiting.stamp_ns, timeout)
-            and self._has_depth(waiting.stamp_ns)
-            and self._has_transforms(self.frames, waiting)
-        )
-
-    def _missing_input(self, stamp: int) -> Fault:
-        p = self.parameters
-        if not self._has(self._detections, stamp, p.input_timeout):
-            return Fault.NO_DETECTIONS
-        if not self._has_depth(stamp):
-            return Fault.NO_DEPTH
-        return super()._missing_input(stamp)
-
-    def _has_depth(self, stamp: int) -> bool:
-        p = self.parameters
-        return not p.use_depth or self._has(self._depths.images, stamp, p.input_timeout)
+    def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
+        if row.name == DETECTIONS:
+            return self._reader.people(message, stamp, self.parameters.keypoint_sigma_px)
+        return super()._read_input(row, message, stamp)
 
     # Estimates.
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
         stamp = waiting.stamp_ns
-        for each in self._detections.before(stamp):
-            if each in self._dropped:
-                continue
-            self._log.note(
-                Fault.LONE_DETECTIONS,
-                f'detections of {each} ns belong to no image, or come too late: wanted the stamp '
-                'of an image',
-            )
-        detected = self._detections.take(stamp)
-        if detected is None:
-            self._log.note(
-                Fault.NO_DETECTIONS, f'no detections have come for the image of {stamp} ns'
-            )
-        if self.parameters.use_depth:
-            waiting = self._depths.added_to(waiting, self._dropped)
-        for kind, text in self.frames.look(waiting.frame_id, stamp):
-            self._log.note(kind, text)
+        detected: list[DetectedPerson] | None = waiting.content(DETECTIONS)
+        self._look_at_frames(waiting)
         if self._scene is None:
             self._scene = Silhouettes(self._background_for(camera))
         if (pose := self.frames.pose) is not None:
@@ -266,8 +163,8 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
             self._scene.see_from(CameraPose.of(pose.translation, pose.rotation), camera)
         p, found = self.parameters, []
         if detected is not None:
-            found = self._inputs.found(
-                detected, self._start.body, p.keypoint_scheme, use_keypoints=p.use_keypoints
+            found = self._reader.found(
+                detected, self.start.body, p.keypoint_scheme, use_keypoints=p.use_keypoints
             )
         own, left = self._matched(found, stamp)
         self._begin(left, own, camera, self._scene.background, stamp)
@@ -292,10 +189,10 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
 
     def _background_for(self, camera: Camera) -> BackgroundModel:
         try:
-            return self._start.background_model(camera)
+            return self.start.background_model(camera)
         except ValueError as error:
             self._log.note(Fault.BACKGROUND, f'{error}: silhouettes are not used')
-            self._start = replace(self._start, background=None)
+            self.start = replace(self.start, background=None)
             return BackgroundModel(self.parameters.background)
 
     def _matched(
@@ -346,7 +243,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
                 return
             name = self._new_name(one.detected.name)
             session = PersonSession(
-                name, p, self._publish_output, self._wanted, self._start,
+                name, p, self._publish_output, self._wanted, self.start,
                 background, self.frames, self._log,
             )  # fmt: skip
             if not one.keypoints.names:

@@ -160,7 +160,7 @@ class PersonSession(FilterSession):
         return self.start.tracker(camera, self._known_ground(), self._background)
 
     def _look_at_frames(self, waiting: WaitingImage) -> None:
-        """The caller has looked."""
+        """See `TrackingSession`: the caller has looked."""
 
     def _publish(self, topic: str, stamp: int, message: Any) -> None:
         super()._publish(topic_of(self._person, topic), stamp, message)

@@ -189,7 +189,7 @@ class Session(ABC, Generic[Parameters, State]):
         stamp = self._stamp_of(source, message)
         if kind_of(source) == self.COUNTED:
             self._log.counts['received'] += 1
-            self._frame_id = _frame_id(message)
+            self._frame_id = frame_id_of(message)
         self._take(source, message, stamp)
         if not more:
             self._use_what_has_come()
@@ -303,7 +303,7 @@ class Session(ABC, Generic[Parameters, State]):
         self._publish_output(Output(topic, stamp, serialise(message)))
 
 
-def _frame_id(message: Any) -> str:
+def frame_id_of(message: Any) -> str:
     """The frame that a message names; '' where it names none."""
     header = getattr(message, 'header', None)
     return '' if header is None else str(header.frame_id)

@@ -156,7 +156,7 @@ def run(*words, stop_at=''):
 
 def test_the_process_starts_and_ends_well():
     code, said = run(
-        'smoother_node', 'keypoints_adapter_node', '--ros-args', '-r', '__ns:=/humans/bodies/p7',
+        'smoother_node', 'keypoints_node', '--ros-args', '-r', '__ns:=/humans/bodies/p7',
         stop_at='mixtures from',
     )  # fmt: skip
     assert code == 0, said
@@ -167,7 +167,10 @@ def test_the_process_starts_and_ends_well():
     ('words', 'text'),
     [
         (['--help'], 'usage: ros2 run hmt_ros person_node [NODE ...]'),
-        (['smother_node'], 'wanted some of filter_node, smoother_node, bme_node, keypoints_node, '),
+        (
+            ['smother_node'],
+            'wanted some of filter_node, smoother_node, bme_node, keypoints_node, saw',
+        ),
         (['--ros-args', '-r', '__node:=mine'], '__node:=mine would give all nodes one name'),
     ],
 )

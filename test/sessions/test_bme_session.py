@@ -9,9 +9,9 @@ from hmt_ros.body import Camera, load_body
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, SILHOUETTE, TOPICS, TRACK, BmeSession
-from hmt_ros.sessions.camera_session import MASK
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.image_inputs import MASK
 from msg_tools import RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.cdr import deserialise

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
+from hmt_ros.sessions.filter_session import FilterSession
+from hmt_ros.sessions.image_inputs import COMPRESSED_MASK, KEYPOINTS, MASK, PREDICTION
 from hmt_ros.sessions.track_messages import TOPICS, TOPICS_OF_NODE
 from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.tracking import Status
@@ -505,7 +506,7 @@ def test_keypoints_are_forgotten(session, small_camera):
     one = session(use_keypoints=True)
     for index in range(1000):
         one.take(KEYPOINTS, small_camera.keypoints(index))
-    assert len(one._keypoints.plane._content) <= 256
+    assert len(one._inputs[KEYPOINTS]._content) <= 256
 
 
 # Masks.
@@ -626,7 +627,7 @@ def test_masks_without_images_are_forgotten(session, small_camera):
     one = session(use_mask=True)
     for index in range(200):
         one.take(MASK, small_camera.mask(index))
-    assert len(one._masks._content) == 64
+    assert len(one._inputs[MASK]._content) == 64
 
 
 # The background.

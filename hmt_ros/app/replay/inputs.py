@@ -1,28 +1,33 @@
-"""The input of the filter in a bag: images, calibration, masks, depth, keypoints, transforms."""
+"""The input of the filter in a bag: images, calibration, what comes with them, transforms."""
 
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 
-from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
-from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
-from hmt_ros.sessions.people_parameters import SOURCES
-from hmt_ros.sessions.people_session import DETECTIONS
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.image_inputs import (
+    COMPRESSED_TYPE,
+    DETECTIONS,
+    DETECTIONS_INPUT,
+    IMAGE_TYPE,
+    INPUTS,
+    SOURCES,
+)
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools import BagError, BagMessage, BagReader, Topic
 from msg_tools.bags.contents import absolute_name
-from msg_tools.messages import keypoints
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
-RAW, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 
 # Names of topics that are preferred to all others.
 _USUAL = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
+# What a bag may have of the table of inputs: predictions are made anew.
+RECORDED = (*(row for row in INPUTS if row.after is not None), DETECTIONS_INPUT)
 # Frames with z up that stand still [REP 105]; messages that are searched for a way to one.
 UPRIGHT_FRAMES = ('odom', 'map', 'world')
 _SEARCHED = 2000
@@ -37,12 +42,8 @@ class RecordedInput:
     Attributes:
         image: topic of the images.
         camera_info: topic of their calibration.
-        mask: topic of masks of the person; None if the bag has none.
-        depth: topic of depth images; None if the bag has none.
-        keypoints: topic of 2D keypoints; None if the bag has none.
-        keypoints_3d: topic of their positions in space; None if the bag has none.
+        given: topics of what comes with the images, by the source that it is for.
         ground_truth: topic of the ground truth; None if the bag has none.
-        detections: topic of several people, for the people node; None if the bag has none.
         transforms: topics of transforms by source, those that the bag has of `TRANSFORMS`; None if
             transforms are not used.
         upright_frame: one of `UPRIGHT_FRAMES` that transforms lead to from the camera; empty: they
@@ -51,19 +52,20 @@ class RecordedInput:
 
     image: Topic
     camera_info: Topic
-    mask: Topic | None
-    depth: Topic | None
-    keypoints: Topic | None
-    keypoints_3d: Topic | None
-    ground_truth: Topic | None
+    given: Mapping[str, Topic] = field(default_factory=dict)
+    ground_truth: Topic | None = None
     transforms: Mapping[str, Topic] | None = None
-    detections: Topic | None = None
     upright_frame: str = ''
 
     @property
     def transport(self) -> str:
         """Value of the parameter `image_transport`."""
-        return 'compressed' if self.image.msgtype == COMPRESSED else 'raw'
+        return 'compressed' if self.image.msgtype == COMPRESSED_TYPE else 'raw'
+
+    def of(self, name: str) -> Topic | None:
+        """Topic of an input of `RECORDED`, by its name; None if the bag has none."""
+        row = next(row for row in RECORDED if row.name == name)
+        return next((self.given[source] for source in row.types if source in self.given), None)
 
     def messages(self, bag: BagReader) -> Generator[tuple[str, BagMessage], None, None]:
         """(source, message) by log time; the source is one of the filter or `GROUND_TRUTH`.
@@ -72,20 +74,10 @@ class RecordedInput:
             BagError: the bag is damaged here; the messages before the damage were yielded.
         """
         sources = {self.image.name: IMAGE, self.camera_info.name: CAMERA_INFO}
-        if self.mask is not None:
-            raw = self.mask.msgtype == RAW
-            sources[self.mask.name] = MASK if raw else COMPRESSED_MASK
-        if self.depth is not None:
-            sources[self.depth.name] = DEPTH
-        if self.keypoints is not None:
-            sources[self.keypoints.name] = KEYPOINTS
-        if self.keypoints_3d is not None:
-            sources[self.keypoints_3d.name] = KEYPOINTS_3D
         if self.ground_truth is not None:
             sources[self.ground_truth.name] = GROUND_TRUTH
-        if self.detections is not None:
-            sources[self.detections.name] = DETECTIONS
-        sources |= {topic.name: source for source, topic in (self.transforms or {}).items()}
+        for topics in (self.given, self.transforms or {}):
+            sources |= {topic.name: source for source, topic in topics.items()}
         for stored in bag.messages(sources):
             yield sources[stored.topic], stored
 
@@ -95,51 +87,50 @@ def recorded_input(
     image_topic: str | None = None,
     camera_info_topic: str | None = None,
     *,
-    mask_topic: str | None = None,
-    depth_topic: str | None = None,
-    keypoints_topic: str | None = None,
+    topics: Mapping[str, str | None] | None = None,
     namespace: str = '',
 ) -> RecordedInput:
     """Finds the topics.
 
     Images come from `image/compressed`, else from `image`, else from the only topic of images.
     Calibration comes from `camera_info` beside the images, else from the only topic of its type.
-    Masks come from `mask`, else from `mask/compressed`, depths from `depth`, transforms from `/tf`
-    and `/tf_static`.
+    What comes with the images has the names of the table of inputs, transforms come from `/tf` and
+    `/tf_static`.
 
     Args:
         bag: an open bag.
-        image_topic, camera_info_topic, mask_topic, depth_topic, keypoints_topic: names that
-            replace the automatic choice.
+        image_topic, camera_info_topic: names that replace the automatic choice.
+        topics: the same, by the name of the input.
         namespace: topics in it are preferred to those in the root, '/humans/bodies/p1' for example.
 
     Raises:
         BagError: there are no images, no camera_info, or several topics to choose from.
     """
     named = partial(_in_namespace, bag, namespace)
-    kinds = (keypoints.KEYPOINTS_2D,)
-    mask = named(MASK, (RAW,)) or named(COMPRESSED_MASK, (COMPRESSED,))
-    if mask_topic is not None:
-        mask = bag.find_topic((RAW, COMPRESSED), mask_topic)
-    joints = named(KEYPOINTS, kinds)
-    if keypoints_topic is not None:
-        joints = bag.find_topic(kinds, keypoints_topic)
-    depth = named(DEPTH, (RAW,))
-    if depth_topic is not None:
-        depth = bag.find_topic((RAW,), depth_topic)
-    besides = [topic.name.lstrip('/') for topic in (mask, depth) if topic is not None]
-    image = _image_topic(bag, image_topic, namespace, (*MASKS, DEPTH, *besides))
-    found = {source: _named(bag, source, (TRANSFORMS_TYPE,)) for source in TRANSFORMS}
+    given: dict[str, Topic] = {}
+    for row in RECORDED:
+        types = {
+            s: (tuple(SOURCES.values()) if s == DETECTIONS else (t,)) for s, t in row.types.items()
+        }
+        chosen = (topics or {}).get(row.name)
+        if chosen is not None:
+            found = bag.find_topic([x for kinds in types.values() for x in kinds], chosen)
+            given[next(s for s, kinds in types.items() if found.msgtype in kinds)] = found
+            continue
+        for source, kinds in types.items():
+            if (topic := named(source, kinds)) is not None:
+                given[source] = topic
+                break
+    besides = [topic.name.lstrip('/') for topic in given.values()]
+    of_pixels = [source for row in RECORDED if row.pixels is not None for source in row.types]
+    image = _image_topic(bag, image_topic, namespace, (*of_pixels, *besides))
+    transforms = {source: _named(bag, source, (TRANSFORMS_TYPE,)) for source in TRANSFORMS}
     return RecordedInput(
         image,
         _camera_info_topic(bag, image, camera_info_topic),
-        mask,
-        depth,
-        joints,
-        named(KEYPOINTS_3D, (keypoints.KEYPOINTS_3D,)),
+        given,
         named(GROUND_TRUTH, (POSE_MIXTURE,)),
-        {source: topic for source, topic in found.items() if topic is not None},
-        _named(bag, DETECTIONS, tuple(SOURCES.values())),
+        {source: topic for source, topic in transforms.items() if topic is not None},
     )
 
 
@@ -180,7 +171,7 @@ def _upright_above(frame: str, parents: Mapping[str, str]) -> str:
 def _image_topic(
     bag: BagReader, name: str | None, namespace: str, besides: tuple[str, ...]
 ) -> Topic:
-    kinds = (COMPRESSED, RAW)
+    kinds = (COMPRESSED_TYPE, IMAGE_TYPE)
     if name is not None:
         return bag.find_topic(kinds, name)
     for usual in _USUAL:
@@ -196,7 +187,7 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
         return bag.find_topic(kinds, name)
     # /camera/image_raw/compressed has its calibration in /camera/camera_info.
     namespace = image.name.strip('/')
-    if image.msgtype == COMPRESSED:
+    if image.msgtype == COMPRESSED_TYPE:
         namespace = namespace.removesuffix('/compressed')
     namespace = namespace.rpartition('/')[0]
     beside = _named(bag, f'{namespace}/camera_info'.lstrip('/'), kinds)

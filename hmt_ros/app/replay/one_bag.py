@@ -12,25 +12,24 @@ import numpy as np
 
 from hmt_ros.app.progress import Progress, show_progress
 from hmt_ros.app.replay.background import ReadAhead, WriteBehind
-from hmt_ros.app.replay.inputs import COMPRESSED, GROUND_TRUTH, RecordedInput
+from hmt_ros.app.replay.inputs import GROUND_TRUTH, RECORDED, RecordedInput
 from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_parameters
 from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PeopleTrack, PlayedTrack
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
-from hmt_ros.sessions.bme_parameters import FROM_SILHOUETTES
-from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, MASK
+from hmt_ros.sessions.bme_session import BmeSession
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import LONGEST_TIMEOUT
-from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
+from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE
 from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.people_session import DETECTIONS
+from hmt_ros.sessions.people_session import PeopleSession
 from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
-from msg_tools.messages import keypoints
-from msg_tools.messages.depth_images import depth_message
-from msg_tools.messages.headers import SECOND_NS, header_message, time_ns
+from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import ImageError, decode_image, image_message
 from msg_tools.messages.states import transforms_message
 
@@ -134,22 +133,20 @@ def _subject_hint(bag: Path) -> str:
 
 def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
     """The topics that some node uses."""
-    mask, bme = parameters.filter.use_mask, parameters.bme
-    if not mask and (bme is None or not bme.use_mask):
-        recorded = replace(recorded, mask=None)
-    if not parameters.filter.use_depth:
-        recorded = replace(recorded, depth=None)
-    if isinstance(parameters.filter, PeopleParameters):
-        return replace(recorded, keypoints=None, keypoints_3d=None, ground_truth=None)
-    recorded = replace(recorded, detections=None)
-    predicted = bme is not None and bme.predict_from != FROM_SILHOUETTES
-    if not parameters.filter.use_keypoints and not predicted:
-        recorded = replace(recorded, keypoints=None)
-    if not parameters.filter.use_keypoints_3d:
-        recorded = replace(recorded, keypoints_3d=None)
-    if not parameters.filter.uses_transforms:
-        recorded = replace(recorded, transforms=None)
-    return recorded
+    tracking, bme = parameters.filter, parameters.bme
+    if isinstance(tracking, PeopleParameters):
+        rows = PeopleSession.inputs_of(tracking)
+    else:
+        rows = FilterSession.inputs_of(tracking)
+    used = [row for row in rows if row.is_used(tracking)]
+    if bme is not None:
+        used += [row for row in BmeSession.inputs_of(bme) if row.is_used(bme)]
+    sources = {source for row in used for source in row.types}
+    given = {source: topic for source, topic in recorded.given.items() if source in sources}
+    recorded = replace(recorded, given=given)
+    if isinstance(tracking, PeopleParameters):
+        return replace(recorded, ground_truth=None)
+    return recorded if tracking.uses_transforms else replace(recorded, transforms=None)
 
 
 def _play(
@@ -159,7 +156,8 @@ def _play(
     """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
     result = Replayed()
     # Small inputs are copied, so that a replay of the new bag has the same as this one.
-    copied = {GROUND_TRUTH, DETECTIONS, KEYPOINTS, KEYPOINTS_3D, *TRANSFORMS}
+    small = {source for row in RECORDED if row.pixels is None for source in row.types}
+    copied = {GROUND_TRUTH, *small, *TRANSFORMS}
     if options.with_images:
         copied |= {IMAGE, CAMERA_INFO}
 
@@ -193,14 +191,9 @@ def _play(
                 result.last_stamp = time_ns(stored.message.header.stamp)
                 bar.update()
         # The last images need not wait any longer.
-        if recorded.keypoints is not None:
-            check(track.take(KEYPOINTS, _nobody(keypoints.KEYPOINTS_2D, result.last_stamp)))
-        if recorded.keypoints_3d is not None:
-            check(track.take(KEYPOINTS_3D, _nobody(keypoints.KEYPOINTS_3D, result.last_stamp)))
-        if recorded.mask is not None:
-            check(track.take(MASK, _mask_after(result.last_stamp)))
-        if recorded.depth is not None:
-            check(track.take(DEPTH, _depth_after(result.last_stamp)))
+        for row in RECORDED:
+            if row.after is not None and recorded.of(row.name) is not None:
+                check(track.take(row.name, row.after(result.last_stamp)))
         if recorded.transforms is not None:
             check(track.take(TF, _transform_after(result.last_stamp)))
         check(track.finish())
@@ -216,7 +209,7 @@ def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str
     """
     source, stored = next(messages)
     given = stored.message
-    if decode and source == IMAGE and stored.msgtype == COMPRESSED:
+    if decode and source == IMAGE and stored.msgtype == COMPRESSED_TYPE:
         try:
             picture = decode_image(given)
         except ImageError:
@@ -247,22 +240,6 @@ def _readable(
             tell(str(error))
             continue
         yield found
-
-
-def _nobody(msgtype: str, stamp_ns: int) -> Any:
-    """hmt_msgs/Keypoints2D or 3D of an image without joints."""
-    messages = RosbagsMessages()
-    return messages.create(msgtype, header=header_message(messages, stamp_ns, ''))
-
-
-def _mask_after(stamp_ns: int) -> Any:
-    """sensor_msgs/Image with a mask of an image after the last: no mask of an earlier one comes."""
-    return image_message(RosbagsMessages(), np.zeros((1, 1), np.uint8), stamp_ns + 1, '')
-
-
-def _depth_after(stamp_ns: int) -> Any:
-    """sensor_msgs/Image with a depth image after the last: no depth of an earlier one comes."""
-    return depth_message(RosbagsMessages(), np.ones((1, 1), np.float32), stamp_ns + 1, '')
 
 
 def _transform_after(stamp_ns: int) -> Any:

@@ -7,12 +7,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hmt_ros.app.replay.inputs import RecordedInput, recorded_input, upright_frame
+from hmt_ros.app.replay.inputs import RECORDED, RecordedInput, recorded_input, upright_frame
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.image_inputs import (
+    DEPTH,
+    DETECTIONS,
+    KEYPOINTS,
+    KEYPOINTS_3D,
+    MASK,
+    SOURCES,
+)
 from hmt_ros.sessions.parameter_file import read_parameter_file
-from hmt_ros.sessions.people_parameters import SOURCES, PeopleParameters
+from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.tracking.evaluation_plan import ACCURATE
 from msg_tools import BagReader
@@ -70,9 +78,11 @@ class ReplayOptions:
             bag,
             self.image_topic,
             self.camera_info_topic,
-            mask_topic=self.mask_topic,
-            depth_topic=self.depth_topic,
-            keypoints_topic=self.keypoints_topic,
+            topics={
+                MASK: self.mask_topic,
+                DEPTH: self.depth_topic,
+                KEYPOINTS: self.keypoints_topic,
+            },
             namespace=self.namespace,
         )
         return replace(found, upright_frame=upright_frame(bag, found))
@@ -161,15 +171,23 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
     for name, value in given.items():
         if value is not None:
             values[name] = str(value) if isinstance(value, Path) else value
-    values.setdefault('use_keypoints', recorded.keypoints is not None)
-    has_depth = recorded.keypoints_3d is not None and values['use_keypoints'] is True
+    has_keypoints = recorded.of(KEYPOINTS) is not None
+    if values.get('source', OWN_KEYPOINTS) != OWN_KEYPOINTS:
+        has_keypoints = recorded.of(DETECTIONS) is not None
+    values.setdefault('use_keypoints', has_keypoints)
+    has_depth = recorded.of(KEYPOINTS_3D) is not None and values['use_keypoints'] is True
     values.setdefault('use_keypoints_3d', has_depth)
-    values.setdefault('use_mask', recorded.mask is not None)
-    values.setdefault('use_depth', recorded.depth is not None)
+    _use_what_is_there(values, recorded, MASK, DEPTH)
     _use_upright_frame(values, recorded)
     values['image_transport'] = recorded.transport
     values.setdefault('evaluation_budget', ACCURATE)
     return with_values(FilterParameters(), values)
+
+
+def _use_what_is_there(values: dict[str, Any], recorded: RecordedInput, *names: str) -> None:
+    """Inputs of the bag are used where the user says nothing of them."""
+    for row in (row for row in RECORDED if row.name in names):
+        values.setdefault(row.parameter, recorded.of(row.name) is not None)
 
 
 def _use_upright_frame(values: dict[str, Any], recorded: RecordedInput) -> None:
@@ -193,8 +211,9 @@ def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> Peopl
     for option, value in unfit.items():
         if value:
             raise ValueError(f'{option} does not go with --people')
-    if recorded.detections is None:
-        kinds = ', '.join(kind.replace('/msg/', '/') for kind in SOURCES.values())
+    detections = recorded.of(DETECTIONS)
+    if detections is None:
+        kinds = ', '.join(SOURCES[x].replace('/msg/', '/') for x in PeopleParameters.SOURCES)
         raise ValueError(f'--people needs the topic detections, of {kinds}: the bag has none')
     values = _given_values(options, PEOPLE_NODE)
     given = {
@@ -203,10 +222,9 @@ def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> Peopl
         'background_file': None if options.background is None else str(options.background),
     }
     values |= {name: value for name, value in given.items() if value is not None}
-    sources = {kind: source for source, kind in SOURCES.items()}
-    values['source'] = sources[recorded.detections.msgtype]
-    values.setdefault('use_mask', recorded.mask is not None)
-    values.setdefault('use_depth', recorded.depth is not None)
+    sources = {SOURCES[source]: source for source in PeopleParameters.SOURCES}
+    values['source'] = sources[detections.msgtype]
+    _use_what_is_there(values, recorded, MASK, DEPTH)
     _use_upright_frame(values, recorded)
     values['image_transport'] = recorded.transport
     values.setdefault('evaluation_budget', ACCURATE)
@@ -229,6 +247,7 @@ def _bme_parameters(
     values = {
         'background_file': tracking.background_file,
         'use_mask': tracking.use_mask,
+        'source': tracking.source,
         'input_timeout': tracking.input_timeout,
         **_given_values(options, BME),
         'image_transport': recorded.transport,

@@ -13,26 +13,21 @@ from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from typing import Any, Protocol
 
+from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE
 from hmt_ros.app.replay.live_node import LiveNode
 from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER, NodeParameters
 from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
-from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS, FROM_SILHOUETTES
+from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
-from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
-from hmt_ros.sessions.filter_session import (
-    DEPTH,
-    KEYPOINTS,
-    KEYPOINTS_3D,
-    PREDICTION,
-    FilterSession,
-)
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.filter_session import PREDICTION, FilterSession
 from hmt_ros.sessions.handled import Handled, Output
+from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession, published_topic
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
-from msg_tools.messages import keypoints
 from msg_tools.messages.cdr import deserialise
 
 # Topics of the filter that the smoother takes, as sources of the same names.
@@ -173,22 +168,21 @@ class LiveTrack(PlayedTrack):
     def __enter__(self) -> LiveTrack:
         with ExitStack() as opened:
             player = Player(opened)
-            kind, topic = 'Image', 'image'
-            if self._parameters.filter.image_transport == 'compressed':
-                kind, topic = 'CompressedImage', 'image/compressed'
-            inputs = {
-                CAMERA_INFO: ('camera_info', 'sensor_msgs/msg/CameraInfo'),
-                KEYPOINTS: (KEYPOINTS, keypoints.KEYPOINTS_2D),
-                KEYPOINTS_3D: (KEYPOINTS_3D, keypoints.KEYPOINTS_3D),
-                MASK: ('mask', 'sensor_msgs/msg/Image'),
-                DEPTH: (DEPTH, 'sensor_msgs/msg/Image'),
-                COMPRESSED_MASK: ('mask/compressed', 'sensor_msgs/msg/CompressedImage'),
-                IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
+            compressed = self._parameters.filter.image_transport == 'compressed'
+            topic = 'image/compressed' if compressed else 'image'
+            image = topic, COMPRESSED_TYPE if compressed else IMAGE_TYPE
+            given = {
+                source: (source, msgtype)
+                for row in FilterSession.inputs_of(self._parameters.filter)
+                for source, msgtype in row.types.items()
+                if source != PREDICTION
             }
+            inputs = {CAMERA_INFO: ('camera_info', CAMERA_INFO_TYPE), **given, IMAGE: image}
             if self._parameters.filter.uses_transforms:
                 inputs |= {each: (f'/{each}', TRANSFORMS_TYPE) for each in TRANSFORMS}
             live = partial(LiveNode, player, opened, write=self._write)
-            sensors = (f'/{topic}', '/camera_info', *(f'/{each}' for each in MASKS))
+            # Of the namespace that both share: whatever comes must not be lost.
+            sensors = (f'/{topic}', '/camera_info', *(f'/{source}' for source in given))
             if self._parameters.bme is not None:
                 self._bme = live(
                     BME, self._parameters.bme, inputs={}, topics=bme_session.TOPICS, sensors=sensors
@@ -198,7 +192,7 @@ class LiveTrack(PlayedTrack):
                 self._parameters.filter,
                 inputs=inputs,
                 topics=track_messages.TOPICS,
-                sensors=(*sensors, f'/{KEYPOINTS}', f'/{KEYPOINTS_3D}', f'/{DEPTH}'),
+                sensors=sensors,
             )
             if self._parameters.smoother is not None:
                 self._smoother = live(
@@ -263,9 +257,9 @@ def _seen_by_bme(parameters: NodeParameters) -> tuple[str, ...]:
     """Sources in the bag that the BME takes."""
     if parameters.bme is None:
         return ()
-    cue = parameters.bme.predict_from
-    images = () if cue == FROM_KEYPOINTS else (IMAGE, *MASKS)
-    return (CAMERA_INFO, *images, *(() if cue == FROM_SILHOUETTES else (KEYPOINTS,)))
+    images = () if parameters.bme.predict_from == FROM_KEYPOINTS else (IMAGE,)
+    given = (source for row in BmeSession.inputs_of(parameters.bme) for source in row.types)
+    return (CAMERA_INFO, *images, *given)
 
 
 def _heard_by_bme(parameters: NodeParameters) -> tuple[str, ...]:

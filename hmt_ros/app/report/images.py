@@ -9,9 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE, COMPRESSED, OVERLAY, RAW, recorded_input
+from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE, OVERLAY, recorded_input
 from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Image
+from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns
@@ -78,7 +79,7 @@ def image_source(
             found = [
                 topic.name
                 for topic in bag.topics.values()
-                if topic.msgtype in (RAW, COMPRESSED) and topic.message_count
+                if topic.msgtype in (IMAGE_TYPE, COMPRESSED_TYPE) and topic.message_count
             ]
             drawn = [name for name in found if name.endswith(OVERLAY)]
             recorded = [name for name in found if name not in drawn]

@@ -1,0 +1,294 @@
+"""What comes with the images of a camera, declared once, and what waits for its image.
+
+`INPUTS` is the table: topics and types, how a message is read, how long an image waits for it, what
+its absence means. Sessions, nodes, replay and recording read it; a new input is a row here, the
+parameter that switches it on, and the place where its content is used.
+
+An input belongs to the image of exactly its stamp; of several of one stamp the last counts. Where
+its parameter says so an image waits for it: for the input of its stamp, for one of a later stamp,
+or for an image that is `input_timeout` younger. One that can not be used counts as none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from hmt_ros.image.terms.depth import FURTHEST, NEAREST, usable_depths
+from hmt_ros.inference.arrays import Image
+from hmt_ros.sessions.handled import Fault, HandlingLog
+from msg_tools import RosbagsMessages
+from msg_tools.files.error_line import error_line
+from msg_tools.messages import keypoints
+from msg_tools.messages.depth_images import decode_depth, depth_message
+from msg_tools.messages.detections import BOXES, FLOATS, PEOPLE_2D, SKELETON_2D, YOLO
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.images import MAX_PIXELS, decode_mask, image_message
+from msg_tools.messages.keypoints import positions_of
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE
+
+IMAGE_TYPE, COMPRESSED_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
+MASK, COMPRESSED_MASK, DEPTH = 'mask', 'mask/compressed', 'depth'
+KEYPOINTS, KEYPOINTS_3D, DETECTIONS = 'keypoints', 'keypoints_3d', 'detections'
+PREDICTION = 'pose_prediction'
+# Types of detections by value of the parameter `source`.
+SOURCES = {
+    'people': PEOPLE_2D, 'yolo': YOLO, 'boxes': BOXES, 'floats': FLOATS, 'skeleton2d': SKELETON_2D,
+}  # fmt: skip
+
+T = TypeVar('T')
+
+# Inputs that are remembered, those as large as images, and bytes of one.
+REMEMBERED, FEWER = 256, 64
+LARGEST, LARGEST_MASK, LARGEST_DEPTH = 2**24, MAX_PIXELS + 2**16, 4 * MAX_PIXELS + 2**16
+
+
+@dataclass(frozen=True)
+class ImageInput:
+    """An input: a row of the table.
+
+    Attributes:
+        name: of the input.
+        types: type of its messages, by source; a source is the name of its topic, too.
+        parameter: that is true where images wait for it; '': they always do.
+        faulty, none: kinds of faults of a message that can not be used, and of an image without.
+        read: content of a message of a stamp, None where it says that there is nothing; raises
+            ValueError, in one line, where it can not be used.
+        lone: kind of fault of one that belongs to no image; None: it is not told of.
+        told: whether an image without one is told of.
+        pixels: whether it has a value for each pixel of its image; '' or what else to do.
+        remembered: how many are, of stamps whose image has not come.
+        largest: size of the largest message that is taken, bytes.
+        reliable: whether none may be lost on its way.
+        together: whether those of images that were left out stay, to be used with the next.
+        after: message of a stamp that ends the wait for those before; None: a bag has none.
+    """
+
+    name: str
+    types: Mapping[str, str]
+    parameter: str
+    faulty: Fault
+    none: Fault
+    read: Callable[[Any, int], Any] | None = None
+    lone: Fault | None = None
+    told: bool = False
+    pixels: str | None = None
+    remembered: int = REMEMBERED
+    largest: int = LARGEST
+    reliable: bool = False
+    together: bool = False
+    after: Callable[[int], Any] | None = None
+
+    def is_used(self, parameters: Any) -> bool:
+        """Whether images wait for it, by the parameters of a node."""
+        return not self.parameter or bool(getattr(parameters, self.parameter, False))
+
+
+def _read_mask(message: Any, stamp: int) -> Any:
+    mask = decode_mask(message)
+    if mask.all():
+        raise ValueError(f'mask of {stamp} ns is zero nowhere, wanted zero where the person is not')
+    return mask
+
+
+def _read_depth(message: Any, stamp: int) -> Any:
+    depth = usable_depths(decode_depth(message))
+    if not depth.any():
+        raise ValueError(
+            f'depth of {stamp} ns lies nowhere between {NEAREST:g} and {FURTHEST:g} m: wanted '
+            '16UC1 in mm or 32FC1 in m'
+        )
+    return depth
+
+
+def _read_positions(message: Any, _stamp: int) -> Any:
+    return positions_of(message) if len(message.names) else None
+
+
+def _without_names(msgtype: str, stamp_ns: int) -> Any:
+    """hmt_msgs/Keypoints2D or 3D of an image without joints."""
+    messages = RosbagsMessages()
+    return messages.create(msgtype, header=header_message(messages, stamp_ns, ''))
+
+
+def _empty_mask(stamp_ns: int) -> Any:
+    return image_message(RosbagsMessages(), np.zeros((1, 1), np.uint8), stamp_ns + 1, '')
+
+
+def _some_depth(stamp_ns: int) -> Any:
+    return depth_message(RosbagsMessages(), np.ones((1, 1), np.float32), stamp_ns + 1, '')
+
+
+MASK_INPUT = ImageInput(
+    MASK, {MASK: IMAGE_TYPE, COMPRESSED_MASK: COMPRESSED_TYPE}, 'use_mask',
+    Fault.MASK, Fault.NO_MASK, _read_mask, lone=Fault.LONE_MASK, told=True, pixels='',
+    remembered=FEWER, largest=LARGEST_MASK, after=_empty_mask,
+)  # fmt: skip
+DEPTH_INPUT = ImageInput(
+    DEPTH, {DEPTH: IMAGE_TYPE}, 'use_depth',
+    Fault.DEPTH, Fault.NO_DEPTH, _read_depth, lone=Fault.LONE_DEPTH, told=True,
+    pixels=': use depth that is registered to the colour camera',
+    remembered=FEWER, largest=LARGEST_DEPTH, after=_some_depth,
+)  # fmt: skip
+KEYPOINTS_INPUT = ImageInput(
+    KEYPOINTS, {KEYPOINTS: keypoints.KEYPOINTS_2D}, 'use_keypoints',
+    Fault.KEYPOINTS, Fault.NO_KEYPOINTS, after=partial(_without_names, keypoints.KEYPOINTS_2D),
+)  # fmt: skip
+KEYPOINTS_3D_INPUT = ImageInput(
+    KEYPOINTS_3D, {KEYPOINTS_3D: keypoints.KEYPOINTS_3D}, 'use_keypoints_3d',
+    Fault.KEYPOINTS_3D, Fault.NO_KEYPOINTS_3D, _read_positions,
+    after=partial(_without_names, keypoints.KEYPOINTS_3D),
+)  # fmt: skip
+PREDICTION_INPUT = ImageInput(
+    PREDICTION, {PREDICTION: POSE_MIXTURE}, 'use_predictions',
+    Fault.PREDICTION, Fault.NO_PREDICTION, reliable=True,
+)  # fmt: skip
+# Its type depends on the parameter `source`.
+DETECTIONS_INPUT = ImageInput(
+    DETECTIONS, {DETECTIONS: ''}, '', Fault.DETECTIONS, Fault.NO_DETECTIONS,
+    lone=Fault.LONE_DETECTIONS, told=True,
+)  # fmt: skip
+
+# In the order in which images wait for them.
+INPUTS = (MASK_INPUT, KEYPOINTS_INPUT, KEYPOINTS_3D_INPUT, DEPTH_INPUT, PREDICTION_INPUT)
+
+
+class StampedInputs(Generic[T]):
+    """Inputs that belong to the image of exactly their stamp; of several the last counts.
+
+    None stands for an input that says nothing, as of a detector that saw nobody.
+
+    Args:
+        most: number of inputs that are remembered.
+    """
+
+    def __init__(self, most: int = REMEMBERED) -> None:
+        self._most = most
+        self._content: dict[int, T | None] = {}
+        self._newest = -1
+
+    def __contains__(self, stamp_ns: int) -> bool:
+        return stamp_ns in self._content
+
+    def put(self, stamp_ns: int, content: T | None) -> None:
+        """Keeps an input for its image."""
+        self._newest = max(self._newest, stamp_ns)
+        self._content[stamp_ns] = content
+        while len(self._content) > self._most:
+            del self._content[min(self._content)]
+
+    def is_settled(self, stamp_ns: int) -> bool:
+        """Whether the input for an image has come, or a later one."""
+        return stamp_ns in self._content or self._newest > stamp_ns
+
+    def before(self, stamp_ns: int) -> list[int]:
+        """Stamps of the inputs that are older than an image."""
+        return [stamp for stamp in self._content if stamp < stamp_ns]
+
+    def take(self, stamp_ns: int) -> T | None:
+        """The input for an image, None where there is none; drops it and all that are older."""
+        return self.take_all(stamp_ns).get(stamp_ns)
+
+    def take_all(self, stamp_ns: int) -> dict[int, T | None]:
+        """The inputs by stamp, in order, for an image and all that are older; drops them."""
+        taken = sorted(stamp for stamp in self._content if stamp <= stamp_ns)
+        return {stamp: self._content.pop(stamp) for stamp in taken}
+
+    def clear(self) -> None:
+        """Drops all inputs."""
+        self._content.clear()
+        self._newest = -1
+
+
+class Taken(NamedTuple):
+    """What has come for an image.
+
+    Attributes:
+        content: of its stamp; None: nothing, or what says nothing.
+        answered: whether anything has come.
+    """
+
+    content: Any
+    answered: bool
+
+
+class ImageInputs:
+    """What has come for the images of a session.
+
+    Args:
+        rows: of the table that the session has.
+        log: takes faults.
+    """
+
+    def __init__(self, rows: Iterable[ImageInput], log: HandlingLog) -> None:
+        self._log = log
+        self._rows = {source: row for row in rows for source in row.types}
+        self._waiting: dict[str, StampedInputs[Any]] = {
+            row.name: StampedInputs(row.remembered) for row in self._rows.values()
+        }
+
+    def __getitem__(self, name: str) -> StampedInputs[Any]:
+        """Those of an input that wait."""
+        return self._waiting[name]
+
+    def row(self, source: str) -> ImageInput | None:
+        """The input that a source is of; None: it is of none."""
+        return self._rows.get(source)
+
+    def put(self, source: str, message: Any, stamp_ns: int, read: Callable[..., Any]) -> None:
+        """Reads a message and keeps its content for its image.
+
+        Args:
+            source: of the message.
+            message: of the type of the source.
+            stamp_ns: of the message.
+            read: as `ImageInput.read`.
+        """
+        row, content = self._rows[source], None
+        try:
+            content = read(message, stamp_ns)
+        except ValueError as error:
+            self._log.fault(row.faulty, error_line(error))
+        self._waiting[row.name].put(stamp_ns, content)
+
+    def take(self, row: ImageInput, stamp_ns: int, image: Image, dropped: Container[int]) -> Taken:
+        """What has come for an image; tells of what is missing, and of what belongs to none.
+
+        Args:
+            row: the input.
+            stamp_ns: of the image.
+            image: (H, W, 3).
+            dropped: stamps of images that were dropped, whose inputs are not missed.
+        """
+        waiting = self._waiting[row.name]
+        if row.lone is not None:
+            for each in (x for x in waiting.before(stamp_ns) if x not in dropped):
+                verb, what = ('belong', 'come') if row.name.endswith('s') else ('belongs', 'comes')
+                self._log.note(
+                    row.lone,
+                    f'{row.name} of {each} ns {verb} to no image, or {what} too late: wanted the '
+                    'stamp of an image',
+                )
+        answered = stamp_ns in waiting
+        content = waiting.take(stamp_ns)
+        if row.told and not answered:
+            verb = 'have' if row.name.endswith('s') else 'has'
+            self._log.note(row.none, f'no {row.name} {verb} come for the image of {stamp_ns} ns')
+        if content is None or row.pixels is None or content.shape == image.shape[:2]:
+            return Taken(content, answered)
+        (height, width), (rows, columns) = content.shape, image.shape[:2]
+        self._log.fault(
+            row.faulty,
+            f'{row.name} of {stamp_ns} ns has {width}x{height} pixels, wanted the {columns}x{rows} '
+            f'of its image{row.pixels}',
+        )
+        return Taken(None, answered)
+
+    def clear(self) -> None:
+        """Drops all that has come."""
+        for waiting in self._waiting.values():
+            waiting.clear()
