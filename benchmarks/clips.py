@@ -11,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from hmt_ros.sessions.depth_inputs import DEPTH
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +18,7 @@ from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera, load_body
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions.image_inputs import DEPTH
 from msg_tools import BagReader
 from msg_tools.files.array_file import read_archive
 from msg_tools.messages.camera_info import camera_from_info

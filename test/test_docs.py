@@ -147,7 +147,9 @@ def test_commands_are_understood(page):
             parse(words[3:])
         elif words[:3] == ['ros2', 'run', 'hmt_ros']:
             given = {b.partition(':=')[0] for a, b in pairwise(words) if a == '-p'}
-            assert given <= {p.name for p in declared_parameters(NODES[words[3]][0])}
+            together = [node for node in words if node in NODES] or [*NODES]
+            known = (declared_parameters(NODES[node][0]) for node in together)
+            assert given <= {p.name for every in known for p in every}
 
 
 def parse(words: list[str]) -> None:

@@ -203,7 +203,6 @@ def test_nodes_that_find_keypoints(actions):
         f'{NAMESPACE}/{topic}' for topic in keypoints_session.TOPICS
     }
     assert f'{NAMESPACE}/keypoints_3d' in allowed['filter_node']['subscribe']
-    assert f'{NAMESPACE}/detections' in allowed['filter_node']['subscribe']
 
 
 def test_several_people(actions):

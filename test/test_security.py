@@ -122,7 +122,9 @@ def test_limits_of_bags_are_those_of_the_page() -> None:
 @pytest.mark.ros
 def test_limits_of_messages_are_those_of_the_page() -> None:
     from hmt_ros.nodes import subscribed_topic
+    from hmt_ros.sessions import image_inputs
 
     page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
     stated = {int(text.replace(' ', '')) for text in re.findall(r'\*\*([\d ]+)\*\*', page)}
-    assert {subscribed_topic.LARGEST_MESSAGE, subscribed_topic.LARGEST_IMAGE} <= stated
+    assert {image_inputs.LARGEST, image_inputs.LARGEST_MASK, image_inputs.LARGEST_DEPTH} <= stated
+    assert subscribed_topic.LARGEST_IMAGE in stated

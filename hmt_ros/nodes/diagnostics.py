@@ -16,6 +16,7 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import qos_policy_name_from_kind
 
+from hmt_ros.nodes.estimating_thread import Duration
 from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.sessions.session import SessionState
 
@@ -41,21 +42,25 @@ class Rates:
         self.name, self._done = name, done
         self._received = self._used = 0.0
         self._latencies: list[float] = []
+        self._stages, self._waiting = (math.nan, math.nan), 0
         self._counts: Counter[str] = Counter()
         self._began = time.monotonic()
 
     def next_period(
-        self, counts: Counter[str], latencies: list[float], durations: list[float]
+        self, counts: Counter[str], latencies: list[float], durations: list[Duration], waiting: int
     ) -> None:
         """Ends a period.
 
         Args:
             counts: 'received', 'dropped', 'faults', 'lost' and those used, since the start.
             latencies: of the period, s.
-            durations: of the computations in the period, s.
+            durations: of the computations in the period.
+            waiting: messages that wait to be handled.
         """
+        self._waiting, self._stages = waiting, (math.nan, math.nan)
         if durations:
-            mean = 1e3 * sum(durations) / len(durations)
+            mean, publishing = (1e3 * sum(x) / len(durations) for x in zip(*durations, strict=True))
+            self._stages = mean - publishing, publishing
             self.computing = f'computing takes {mean:.0f} ms for one of the {self.name}'
         now = time.monotonic()
         # A node that was configured anew counts anew.
@@ -75,6 +80,9 @@ class Rates:
             (f'{self.name} {self._done} a second', f'{self._used:.1f}'),
             ('latency, mean, ms', f'{1e3 * sum(known) / len(known):.1f}'),
             ('latency, largest, ms', f'{1e3 * max(known):.1f}'),
+            ('estimating, mean, ms', f'{self._stages[0]:.1f}'),
+            ('publishing, mean, ms', f'{self._stages[1]:.1f}'),
+            ('messages waiting', str(self._waiting)),
         ]
 
     def line(self) -> str:

@@ -44,6 +44,18 @@ class Waiting(NamedTuple):
     stamp_ns: int = 0
 
 
+class Duration(NamedTuple):
+    """What an estimate took.
+
+    Attributes:
+        whole: from the bytes of its message to the last one that it led to, s.
+        publishing: of this what making these into bytes took, and publishing them, s.
+    """
+
+    whole: float
+    publishing: float
+
+
 class Arrived(NamedTuple):
     """What has come since the last time.
 
@@ -164,6 +176,7 @@ class EstimatingThread:
         tell_change: called when status or kinds of faults of the session have changed.
         inner_faults: counts errors that the session should not have raised.
         log_error: takes the traceback of such an error.
+        read: the message of a type in bytes.
 
     Attributes:
         queue: what waits.
@@ -178,8 +191,9 @@ class EstimatingThread:
         tell_change: Callable[[], None],
         inner_faults: InnerFaults,
         log_error: Callable[[str], None],
+        read: Callable[[bytes, str], Any] = deserialise,
     ) -> None:
-        self._session = session
+        self._session, self._read = session, read
         session.interrupted = self._is_interrupted
         self._inputs: dict[str, SubscribedTopic] = {}
         self._stamped: set[str] = set()
@@ -191,7 +205,7 @@ class EstimatingThread:
         self._tell, self._tell_change = tell, tell_change
         self._inner_faults, self._log_error = inner_faults, log_error
         self._latencies: deque[float] = deque(maxlen=1000)
-        self._durations: deque[float] = deque(maxlen=1000)
+        self._durations: deque[Duration] = deque(maxlen=1000)
         self._arrivals: dict[int, float] = {}
         self._thread = threading.Thread(target=self._work, name='estimate', daemon=True)
         self._thread.start()
@@ -223,8 +237,8 @@ class EstimatingThread:
         """Times from the arrival of messages to their estimates, s, since the last call."""
         return [self._latencies.popleft() for _ in range(len(self._latencies))]
 
-    def take_durations(self) -> list[float]:
-        """Times that estimates took by themselves, s, since the last call."""
+    def take_durations(self) -> list[Duration]:
+        """Times that estimates took by themselves since the last call."""
         return [self._durations.popleft() for _ in range(len(self._durations))]
 
     def stop(self, timeout: float | None = None) -> bool:
@@ -277,7 +291,7 @@ class EstimatingThread:
         if waiting.source == _RESTART:
             waiting.content()
             return
-        done = session.state.counts[session.DONE]
+        done, publishing = session.state.counts[session.DONE], session.publishing
         if kind_of(waiting.source) == session.COUNTED:
             self._arrivals[waiting.stamp_ns] = waiting.arrival
             if len(self._arrivals) > _REMEMBERED:
@@ -287,7 +301,7 @@ class EstimatingThread:
                 raise ValueError(
                     f'it has {waiting.content.size} bytes, the limit is {waiting.content.limit}'
                 )
-            message = deserialise(waiting.content, self._inputs[waiting.source].msgtype)
+            message = self._read(waiting.content, self._inputs[waiting.source].msgtype)
         except Exception as error:  # noqa: BLE001
             # Bytes from outside meet generated code here, which does not say what it may raise.
             handled = session.refuse(waiting.source, error_line(error), more=more)
@@ -299,5 +313,6 @@ class EstimatingThread:
             arrival = self._arrivals.get(newest, waiting.arrival)
             now = time.monotonic()
             self._latencies.append(now - arrival)
-            self._durations.append((now - began) / more_done)
+            published = (session.publishing - publishing) / more_done
+            self._durations.append(Duration((now - began) / more_done, published))
         self._tell(handled)

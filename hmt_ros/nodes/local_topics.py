@@ -7,10 +7,17 @@ processes is subscribed to once, by the first node that listens, which hands it 
 from __future__ import annotations
 
 import threading
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+
+from hmt_ros.inference.arrays import Image
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.images import decode_image
+
+# Messages that are shared, the newest, and their least size, bytes: small ones are read again.
+SHARED, LARGE = 4, 10_000
 
 
 @dataclass(eq=False)
@@ -33,10 +40,13 @@ class Listener:
 class LocalTopics:
     """Hands messages from node to node.
 
-    `deliver` and `listeners` may be called by any thread, the others by that of the executor.
+    All but `offer`, `listen` and `leave` may be called by any thread, these by the executor's.
     """
 
     def __init__(self) -> None:
+        # What several nodes read and decode: the newest, with what they were made of.
+        self._read: deque[tuple[bytes, Any]] = deque(maxlen=SHARED)
+        self._decoded: deque[tuple[Any, Image]] = deque(maxlen=SHARED)
         self._offered: set[str] = set()
         # The tuples are replaced as a whole: other threads may be going through the old ones.
         self._listeners: defaultdict[str, tuple[Listener, ...]] = defaultdict(tuple)
@@ -67,6 +77,25 @@ class LocalTopics:
         if subscription is not None and left:
             left[0].subscription = left[0].connect()
         return subscription
+
+    def read(self, data: bytes, msgtype: str) -> Any:
+        """The message in bytes; the same object for all who got the same large bytes."""
+        for known, message in tuple(self._read):
+            if known is data:
+                return message
+        message = deserialise(data, msgtype)
+        if len(data) >= LARGE:
+            self._read.append((data, message))
+        return message
+
+    def decode(self, message: Any) -> Image:
+        """The picture of an image, as `decode_image`; decoded once for all who share a message."""
+        for known, image in tuple(self._decoded):
+            if known is message:
+                return image
+        image = decode_image(message)
+        self._decoded.append((message, image))
+        return image
 
     def deliver(self, topic: str, data: bytes) -> None:
         """Hands a message to all who listen."""

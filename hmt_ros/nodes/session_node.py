@@ -188,6 +188,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         for msgtype, needed_by in self._messages_of_others(settings).items():
             read_installed_messages(msgtype, needed_by)
         session: AnySession = self.SESSION(settings, *functions)
+        session.decode_image = self._local.decode
         return session
 
     def _new_publisher(self, topic: str, msgtype: str, qos: QoSProfile) -> Any:
@@ -238,6 +239,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             tell_change=self._diagnose,
             inner_faults=self._inner_faults,
             log_error=self.get_logger().error,
+            read=self._local.read,
         )
         self._heard = {one.topic for one in inputs} & self._outputs.keys()
         session.topic_names = {one.source: self.resolve_topic_name(one.topic) for one in inputs}
@@ -419,7 +421,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         counts['lost'] = self._events.lost
         latencies = [] if self._thread is None else self._thread.take_latencies()
         durations = [] if self._thread is None else self._thread.take_durations()
-        self._rates.next_period(counts, latencies, durations)
+        waiting = 0 if self._thread is None else len(self._thread.queue)
+        self._rates.next_period(counts, latencies, durations, waiting)
         if self._session is not None and self._listeners:
             self._silent.look(self._session.needed_inputs())
         self._diagnose()

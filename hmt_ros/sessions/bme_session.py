@@ -83,7 +83,7 @@ from hmt_ros.sessions.session import (
 from hmt_ros.sessions.warm_up import film
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.headers import SECOND_NS, time_ns
-from msg_tools.messages.images import decode_image, image_message
+from msg_tools.messages.images import image_message
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
@@ -467,7 +467,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 f'the background is being learned, from {self._background.frames} of '
                 f'{p.background_images} images so far: set background_file, or wait'
             )
-        image = decode_image(message)
+        image = self.decode_image(message)
         check_size(image, camera)
         mask = self._silhouette(image)
         if _height(mask) < p.least_height:

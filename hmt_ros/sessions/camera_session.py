@@ -42,7 +42,7 @@ from hmt_ros.sessions.session import NeededInput, Order, Session, State, everyth
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, UncalibratedError, camera_from_info
 from msg_tools.messages.headers import SECOND_NS, time_ns
-from msg_tools.messages.images import ImageError, decode_image, decode_picture
+from msg_tools.messages.images import ImageError, decode_picture
 
 CAMERA_INFO, IMAGE = 'camera_info', 'image'
 CAMERA_MOVED = 'the camera has moved since the background was taken'
@@ -239,7 +239,7 @@ class CameraSession(Session[CameraParameters, State]):
             self._forget_inputs(stamp)
             self._start_anew()
         try:
-            image = decode_image(message)
+            image = self.decode_image(message)
         except ImageError as error:
             self._log.skip(Fault.IMAGE, str(error))
             return

@@ -26,7 +26,7 @@ from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
 from msg_tools.messages import keypoints
 from msg_tools.messages.detections import NO_KEYPOINTS
-from msg_tools.messages.images import ImageError, decode_image, image_message
+from msg_tools.messages.images import ImageError, image_message
 from msg_tools.messages.keypoints import keypoints_message, positions_message
 
 TOPICS = {
@@ -96,7 +96,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
         if order is Order.JUMP:
             self.restart()
         try:
-            image = decode_image(message)
+            image = self.decode_image(message)
             found = self._detector.detect(image, stamp)
         except ImageError as error:
             self._log.skip(Fault.IMAGE, str(error))

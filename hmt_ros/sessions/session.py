@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -13,11 +14,13 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.declared_parameters import NodeParameters
 from hmt_ros.sessions.handled import Fault, Handled, HandlingLog, Output
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
+from msg_tools.messages.images import decode_image
 
 # Key of the diagnostics, before the name of a topic, for the number of its subscribers.
 SUBSCRIBERS = 'subscribers of '
@@ -138,6 +141,8 @@ class Session(ABC, Generic[Parameters, State]):
         interrupted: whether messages have come during an estimate; a node sets it.
         state: replaced with every message.
         topic_names: full names of the topics by source, for faults; empty without topics.
+        decode_image: the picture of a message; a node shares it with others of its process.
+        publishing: time that messages took to be made into bytes and published, s; for diagnostics.
     """
 
     TOPICS: ClassVar[Mapping[str, PublishedTopic]]
@@ -164,6 +169,8 @@ class Session(ABC, Generic[Parameters, State]):
         self._weights = np.empty(0)
         self._frame_id = ''
         self.topic_names: Mapping[str, str] = {}
+        self.decode_image: Callable[[Any], Image] = decode_image
+        self.publishing = 0.0
 
     def prepare(self) -> None:
         """Compiles, or loads, what the messages will need; nothing is estimated or published.
@@ -299,8 +306,10 @@ class Session(ABC, Generic[Parameters, State]):
         return Order.JUMP
 
     def _publish(self, topic: str, stamp: int, message: Any) -> None:
+        began = time.perf_counter()
         self._log.published(topic, stamp)
         self._publish_output(Output(topic, stamp, serialise(message)))
+        self.publishing += time.perf_counter() - began
 
 
 def frame_id_of(message: Any) -> str:

@@ -2,7 +2,11 @@
 
 from dataclasses import dataclass, field
 
-from hmt_ros.nodes.local_topics import Listener, LocalTopics
+import pytest
+
+from hmt_ros.nodes.local_topics import LARGE, SHARED, Listener, LocalTopics
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.images import ImageError
 
 
 @dataclass
@@ -59,3 +63,27 @@ def test_who_leaves_hands_the_subscription_on():
     assert local.listeners('/image') == 0
     # Whoever comes then subscribes anew.
     assert Node(local).listen('/image').made == 1
+
+
+def test_what_several_read_is_read_and_decoded_once(small_camera):
+    local, other = LocalTopics(), LocalTopics()
+    data = serialise(small_camera.image(0))
+    kind = 'sensor_msgs/msg/Image'
+    assert len(data) < LARGE
+    assert local.read(data, kind) is not local.read(data, kind)
+    large = serialise(small_camera.image(1, (640, 480)))
+    message = local.read(large, kind)
+    assert local.read(large, kind) is message
+    assert local.read(bytes(bytearray(large)), kind) is not message
+    assert other.read(large, kind) is not message
+    image = local.decode(message)
+    assert local.decode(message) is image
+    assert image.shape == (480, 640, 3)
+    # What comes later takes the place of what was shared.
+    for _ in range(SHARED):
+        local.read(bytes(bytearray(large)), kind)
+    assert local.read(large, kind) is not message
+    broken = small_camera.image(0)
+    broken.encoding = 'infrared'
+    with pytest.raises(ImageError, match='infrared'):
+        local.decode(broken)

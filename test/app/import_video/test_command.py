@@ -71,7 +71,7 @@ def test_video_with_keypoints(video, tmp_path, number_in):
     with BagReader(tmp_path / 'bag') as bag:
         recorded = recorded_input(bag)
         assert recorded.image.name == '/image/compressed'
-        assert recorded.keypoints is not None
+        assert recorded.of('keypoints') is not None
 
 
 def test_jpeg_files_are_copied_and_masks_are_found_by_name(folder, tmp_path):

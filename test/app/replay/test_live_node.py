@@ -88,7 +88,7 @@ def test_same_mixtures_of_every_image(tmp_path, capsys):
     mixtures = ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture', 'trajectory_mixture')
     for topic in mixtures:
         # Windows are smoothed ten times a second.
-        assert len(messages(offline, topic)) == (1 if topic == 'trajectory_mixture' else 3)
+        assert len(messages(offline, topic)) == (2 if topic == 'trajectory_mixture' else 3)
         assert messages(offline, topic) == messages(live, topic)
     # What a robot acts on, too.
     assert len(messages(offline, 'keep_out')) == 3
