@@ -7,8 +7,7 @@ still open, and reports on `~/handled` with the source 'finish'.
 from __future__ import annotations
 
 import sys
-import threading
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from hmt_msgs.msg import TrajectoryMixture
@@ -23,9 +22,6 @@ from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
-
-# How long the executor waits for a window that is being smoothed before it serves the others.
-_TURN = 0.01  # s
 
 
 class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
@@ -45,53 +41,23 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
     def _finish(self, session: SmootherSession) -> None:
         self._tell(session.finish())
 
-    async def _on_smooth_window(
+    def _on_smooth_window(
         self, request: SmoothWindow.Request, response: SmoothWindow.Response
     ) -> SmoothWindow.Response:
         session = self._session
         if session is None:
             response.success, response.message = False, 'the node is not configured'
             return response
-        # It may take seconds, in which mixtures arrive.
-        found = _Elsewhere(
-            lambda: serialise(
-                session.smooth_span(time_ns(request.from_time), time_ns(request.to_time))
-            )
-        )
+        # Mixtures that come meanwhile wait in the middleware.
+        span = time_ns(request.from_time), time_ns(request.to_time)
         try:
-            data = await found
+            data = serialise(session.smooth_span(*span))
         except ValueError as error:
             response.success, response.message = False, error_line(error)
             return response
         response.success = True
         response.trajectories = deserialize_message(data, TrajectoryMixture)
         return response
-
-
-class _Elsewhere:
-    """The value of a function that runs in a thread of its own; to be awaited in a callback."""
-
-    def __init__(self, function: Callable[[], bytes]) -> None:
-        self._value = b''
-        self._error: Exception | None = None
-        self._done = threading.Event()
-
-        def work() -> None:
-            try:
-                self._value = function()
-            except Exception as error:  # noqa: BLE001
-                # Raised where it is awaited.
-                self._error = error
-            self._done.set()
-
-        threading.Thread(target=work, name='smooth_window', daemon=True).start()
-
-    def __await__(self) -> Generator[None, None, bytes]:
-        while not self._done.wait(_TURN):
-            yield
-        if self._error is not None:
-            raise self._error
-        return self._value
 
 
 def main(args: list[str] | None = None) -> int:

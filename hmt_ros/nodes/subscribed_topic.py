@@ -72,7 +72,8 @@ TRANSFORM_TOPICS = (
     SubscribedTopic(TF_STATIC, '/tf_static', TRANSFORMS_TYPE, _TF_STATIC_QOS, waiting=TF_QUEUE),
     SubscribedTopic(TF, '/tf', TRANSFORMS_TYPE, _TF_QOS, waiting=TF_QUEUE),
 )
-_MIXTURES = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+# As many as come in the seconds that `~/smooth_window` may take.
+_MIXTURES = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
 CAMERA_INFO_TOPIC = SubscribedTopic(CAMERA_INFO, 'camera_info', 'sensor_msgs/msg/CameraInfo')
 
 

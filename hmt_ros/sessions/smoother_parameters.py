@@ -93,8 +93,8 @@ class SmootherParameters(NodeParameters):
             as large.
         publish_tf: If true, the links of the heaviest smoothed pose are published on /tf.
         frame_prefix: Prefix of the names of these links, beside those of the filter.
-        queue_size: Maximum number of mixtures that wait; when the node is late the oldest are
-            dropped.
+        queue_size: Maximum number of mixtures that wait, while ~/smooth_window is answered for
+            example; the oldest are dropped.
         through_modes: whether the best path through every single mode is a candidate, besides the
             best between first and last modes.
         dynamics: settings of the motion model.
@@ -113,7 +113,7 @@ class SmootherParameters(NodeParameters):
     publish_covariances: bool = parameter_field(False, AT_ONCE)
     publish_tf: bool = parameter_field(False, AT_ONCE)
     frame_prefix: str = parameter_field('smoothed/', AT_ONCE)
-    queue_size: int = parameter_field(10, AT_ONCE, (1, 1000))
+    queue_size: int = parameter_field(100, AT_ONCE, (1, 1000))
     through_modes: bool = False
     dynamics: SmootherDynamics = field(default_factory=SmootherDynamics)
 
