@@ -39,8 +39,9 @@ from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader, BagWriter
+from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import stamp_in
-from msg_tools.messages.pose_mixtures import POSE_MIXTURE
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE, TrackState
 
 RATE = 30.0  # images a second
 SECONDS, QUICK_SECONDS = 16.0, 3.0
@@ -82,17 +83,19 @@ class Case:
 
 
 CASES = {
-    'newest': Case('newest complete image'),
+    'newest': Case('processes apart: newest complete image'),
     'queue': Case('queue_size 5', filter={'queue_size': 5}, bme={'queue_size': 5}),
     'predictions': Case('predictions from every image', bme={'tracked_interval': 0.0}),
     'compressed': Case('JPEG', transport='compressed'),
     'gravity': Case('gravity given', filter={'gravity': (0.0, 1.0, 0.0)}),
     'keypoints': Case('images and keypoints', keypoints=True),
-    'together': Case('one process', together=True),
-    'together, filter': Case('one process, filter and experts', together=True, smoothed=False),
-    'together, keypoints': Case('one process, keypoints', keypoints=True, together=True),
+    'together': Case('one process: newest complete image', together=True),
+    'together, filter': Case(
+        'one process: filter and experts alone', together=True, smoothed=False
+    ),
+    'together, keypoints': Case('one process: images and keypoints', keypoints=True, together=True),
     'together, keypoints, filter': Case(
-        'one process, keypoints, filter alone', keypoints=True, together=True, smoothed=False
+        'one process: the same, filter alone', keypoints=True, together=True, smoothed=False
     ),
     'usual DDS': Case('without fastdds.xml', room=False),
 }
@@ -187,6 +190,7 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
         camera.spin(player, lambda: len(arrived[POSTERIOR]) > 2, START_SECONDS)
         shift, start_ns = camera.begin(player)
         before = [_cpu_seconds(node) for node in processes]
+        at_first = sum(_memory(node) for node in processes)
         received = _received(player)
         camera.spin(player, camera.ended, len(truth.joints) / RATE + PATIENCE)
         spent = [_cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)]
@@ -211,12 +215,16 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
     # The newest image is the one that was due last.
     ages = [1e-9 * min(when - stamp - offset, last - stamp) for stamp, _, when in shown[SMOOTHED]]
     count = len(latencies)
+    states = [deserialise(data, POSE_MIXTURE).state for _, data, _ in shown[POSTERIOR]]
     if not count or (case.smoothed and not ages):
         raise LiveNodeError(f'{count} images of the clip were answered, {len(ages)} smoothed')
     return {
         'images': len(truth.joints),
         'lost': max(len(truth.joints) - received, 0),
         'answered': count,
+        # Somebody is in view all the time.
+        'nobody': states.count(TrackState.NOBODY),
+        'track_lost': states.count(TrackState.LOST),
         'camera_late_ms': 1e-6 * camera.latest_ns,
         'latency_ms': {
             what: float(np.percentile(latencies, p)) for what, p in (('median', 50), ('95 %', 95))
@@ -225,7 +233,11 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
             what: float(np.percentile(ages, p)) if ages else math.nan
             for what, p in (('median', 50), ('95 %', 95))
         },
+        'first_and_last_quarter_ms': [
+            float(np.median(part)) for part in (latencies[: count // 4], latencies[-count // 4 :])
+        ],
         'memory_mb': memory,
+        'grown_mb': memory - at_first,
         'cpu_s': dict(zip((node.name for node in processes), spent, strict=True)),
         'cpu_ms_per_pose': 1e3 * sum(spent) / count,
         'wanted': f'95 % of the smoothed poses at most {OLDEST:g} s old',
@@ -392,7 +404,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """A table for people."""
     rows = [
         [
-            '', 'images', 'lost', 'answered', 'latency, median', '95 %', 'CPU per pose',
+            '', 'images', 'lost', 'answered', 'NOBODY', 'latency, median', '95 %', 'CPU per pose', 'memory',
             'smoothed: age, median', '95 %', 'heaviest', 'best of K', 'smoothed, heaviest',
         ]
     ]  # fmt: skip
@@ -402,23 +414,24 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
             continue
         what = OFFLINE.get(stage) or CASES[stage].what
         if isinstance(found, str):
-            rows.append([what, found, *[''] * 10])
+            rows.append([what, found, *[''] * 12])
             continue
         errors = [
             f'{found[POSTERIOR]["heaviest_mm"]:.0f} mm', f'{found[POSTERIOR]["best_mm"]:.0f} mm',
             f'{found[SMOOTHED]["heaviest_mm"]:.0f} mm' if SMOOTHED in found else '',
         ]  # fmt: skip
         if stage in OFFLINE:
-            rows.append([what, str(found['images']), '0', '100 %', *[''] * 5, *errors])
+            rows.append([what, str(found['images']), '0', '100 %', *[''] * 7, *errors])
             continue
         latency, age = found['latency_ms'], found['age_s']
         rows.append(
             [
                 what, str(found['images']), str(found['lost']),
-                f'{100 * found["answered"] / found["images"]:.0f} %',
+                f'{100 * found["answered"] / found["images"]:.0f} %', str(found['nobody']),
                 f'{latency["median"]:.0f} ms', f'{latency["95 %"]:.0f} ms',
-                f'{found["cpu_ms_per_pose"]:.0f} ms',
-                f'{age["median"]:.2f} s', f'{age["95 %"]:.2f} s', *errors,
+                f'{found["cpu_ms_per_pose"]:.0f} ms', f'{found["memory_mb"]:.0f} MB',
+                *('' if math.isnan(age[x]) else f'{age[x]:.2f} s' for x in ('median', '95 %')),
+                *errors,
             ]
         )  # fmt: skip
     return table(rows, markdown=markdown)

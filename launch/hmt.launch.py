@@ -40,6 +40,8 @@ TURN = {'qx': 0.5, 'qy': -0.5, 'qz': 0.5, 'qw': 0.5}
 TRUTH = {'true': True, 'false': False}
 # Interval between two predictions of bme_node while filter_node tracks the person, s.
 TRACKED_INTERVAL = 0.2
+# Time after which a process that has ended is started again, s.
+RESPAWN_DELAY = 1.0
 # Environment variables that name a file with settings of Fast DDS.
 PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 
@@ -98,6 +100,7 @@ ARGUMENTS = (
     ('bag', '', 'bag to play once the nodes run; empty: none'),
     ('use_sim_time', '', "'true' or 'false'; empty: true while a bag is played"),
     ('autostart', 'true', "'false': the nodes wait for their lifecycle services"),
+    ('respawn', 'false', "'true': a process of the nodes that ends is started again"),
     (
         'camera_frame',
         '',
@@ -216,6 +219,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         name: [str(share / 'config' / f'{name}.yaml'), _file(name, values[name])] for name in names
     }
     levels = {name: f'{_logger(namespace, name)}:={given["log_level"]}' for name in names}
+    respawn = _truth(given, 'respawn')
     if _truth(given, 'one_process') and PEOPLE not in names:
         actions: list[Any] = [
             Node(
@@ -227,6 +231,8 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
                 remappings=remappings,
                 ros_arguments=[x for name in names for x in ('--log-level', levels[name])],
                 output='both',
+                respawn=respawn,
+                respawn_delay=RESPAWN_DELAY,
                 additional_env=env,
             )
         ]
@@ -241,6 +247,8 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
                 remappings=[] if name == 'smoother_node' else remappings,
                 ros_arguments=['--log-level', levels[name]],
                 output='both',
+                respawn=respawn,
+                respawn_delay=RESPAWN_DELAY,
                 additional_env=env,
             )
             for name in names

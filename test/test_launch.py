@@ -180,6 +180,9 @@ def test_one_process_for_all(actions, description):
         for name in one['arguments']
         for word in ('--log-level', f'humans.bodies.p1.{name}:=info')
     ]
+    assert one['respawn'] is False
+    again = actions(one_process='true', respawn='true')['person_node']
+    assert (again['respawn'], again['respawn_delay']) == (True, 1.0)
     # Several people have a node, and so a process, of their own.
     assert list(actions(one_process='true', nodes='people_node')) == ['people_node']
 

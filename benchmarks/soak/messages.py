@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from hypothesis import HealthCheck, Phase, given, seed, settings
-from hypothesis.strategies import booleans
 
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.mutations import damaged, messages_of
@@ -27,6 +27,8 @@ from msg_tools.messages.cdr import deserialise, serialise
 _MADE_UP = 0.05
 # So many damaged messages, then a valid one, which has to be used.
 _BETWEEN = 200
+# Messages that are made up, and then given, at a time.
+_AT_ONCE = 100
 # A session is replaced after so many: damage may have put it where little more can happen.
 _LIFE = 500
 
@@ -44,12 +46,19 @@ def _through(scene: Scene, amount: Amount) -> Outcome:
     outcome = Outcome(scene.node, 'random and damaged messages, in process')
     fed = _Fed(scene, outcome)
     fed.check()
-    forget_peak()
-    before = resident_memory()
     _damage(fed, amount.part(1.0 - _MADE_UP))
     _make_up(fed, amount.part(_MADE_UP))
-    outcome.growth_mb = (peak_memory() - before) / 1e6
     return outcome
+
+
+@contextmanager
+def _watched_memory(outcome: Outcome) -> Iterator[None]:
+    """Notes by how much the memory of this process grows at most meanwhile."""
+    forget_peak()
+    before = resident_memory()
+    yield
+    grown = (peak_memory() - before) / 1e6
+    outcome.growth_mb = max(grown, outcome.growth_mb or 0.0)
 
 
 class _Fed:
@@ -158,16 +167,17 @@ def ask(session: Any, message: Any) -> None:
 
 def _damage(fed: _Fed, amount: Amount) -> None:
     rng = np.random.default_rng(0)
-    for number in amount.counted():
-        if number % _BETWEEN == 0:
-            fed.check()
-        sources = [*fed.valid, '']
-        chosen = sources[int(rng.integers(0, len(sources)))]
-        if chosen:
-            fed.take(chosen, damaged(serialise(fed.valid[chosen]), rng))
-        else:
-            fed.ask(damaged(serialise(fed.valid[fed.asked]), rng))
-    fed.check()
+    with _watched_memory(fed.outcome):
+        for number in amount.counted():
+            if number % _BETWEEN == 0:
+                fed.check()
+            sources = [*fed.valid, '']
+            chosen = sources[int(rng.integers(0, len(sources)))]
+            if chosen:
+                fed.take(chosen, damaged(serialise(fed.valid[chosen]), rng))
+            else:
+                fed.ask(damaged(serialise(fed.valid[fed.asked]), rng))
+        fed.check()
 
 
 def _make_up(fed: _Fed, amount: Amount) -> None:
@@ -176,24 +186,37 @@ def _make_up(fed: _Fed, amount: Amount) -> None:
     for source, valid in sources.items():
         msgtype = valid.__msgtype__
         part = amount.part(1.0 / len(sources))
+        # What makes messages up keeps more of them than it tells: they are given afterwards.
+        for number, data in _made_up(msgtype, words, part.times):
+            with _watched_memory(fed.outcome):
+                for each in data:
+                    message = deserialise(each, msgtype) if number % 2 else None
+                    if message is not None:
+                        each = serialise(stamped(message, fed.scene.stamp(fed.outcome.times)))
+                    if fed.valid[source].__msgtype__ == msgtype:
+                        fed.take(source, each)
+        fed.check()
 
-        @seed(0)
+
+def _made_up(msgtype: str, words: tuple[str, ...], count: int) -> Iterator[tuple[int, list[bytes]]]:
+    """Bytes of messages that are made up by their type, some at a time, with a number."""
+    for number, first in enumerate(range(0, count, _AT_ONCE)):
+        made: list[bytes] = []
+
+        @seed(number)
         @settings(
-            max_examples=part.times,
+            max_examples=min(_AT_ONCE, count - first),
             database=None,
             deadline=None,
             phases=[Phase.generate],
             suppress_health_check=list(HealthCheck),
         )
-        @given(messages_of(msgtype, words), booleans())
-        def give(message: Any, in_time: bool) -> None:
-            if in_time:
-                message = stamped(message, fed.scene.stamp(fed.outcome.times))
-            if fed.valid[source].__msgtype__ == msgtype:  # noqa: B023
-                fed.take(source, serialise(message))  # noqa: B023
+        @given(messages_of(msgtype, words))
+        def make(message: Any) -> None:
+            made.append(serialise(message))  # noqa: B023
 
-        give()
-        fed.check()
+        make()
+        yield number, made
 
 
 def _words() -> tuple[str, ...]:
