@@ -404,8 +404,9 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """A table for people."""
     rows = [
         [
-            '', 'images', 'lost', 'answered', 'NOBODY', 'latency, median', '95 %', 'CPU per pose', 'memory',
-            'smoothed: age, median', '95 %', 'heaviest', 'best of K', 'smoothed, heaviest',
+            '', 'images', 'lost', 'answered', 'NOBODY', 'latency, median', '95 %', 'CPU per pose',
+            'memory', 'smoothed: age, median', '95 %', 'heaviest', 'best of K',
+            'smoothed, heaviest',
         ]
     ]  # fmt: skip
     for stage in STAGES:

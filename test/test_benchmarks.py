@@ -382,7 +382,8 @@ def test_live_tells_of_a_camera_that_does_not_wait():
     }
     found = {
         'images': 480, 'lost': 2, 'answered': 120, 'latency_ms': {'median': 151.2, '95 %': 190.0},
-        'age_s': {'median': 0.75, '95 %': 0.9}, 'cpu_ms_per_pose': 210.0, **errors,
+        'age_s': {'median': 0.75, '95 %': 0.9}, 'cpu_ms_per_pose': 210.0, 'nobody': 0,
+        'memory_mb': 417.2, **errors,
     }  # fmt: skip
     text = live.as_text(
         {'offline': {'images': 480, **errors}, 'newest': found, 'queue': 'skipped: no ROS'}
@@ -390,7 +391,8 @@ def test_live_tells_of_a_camera_that_does_not_wait():
     offline, newest, queue = (' '.join(line.split()) for line in text.splitlines()[-3:])
     assert offline == 'offline, every image 480 0 100 % 80 mm 61 mm 80 mm'
     assert newest == (
-        'newest complete image 480 2 25 % 151 ms 190 ms 210 ms 0.75 s 0.90 s 80 mm 61 mm 80 mm'
+        'processes apart: newest complete image 480 2 25 % 0 151 ms 190 ms 210 ms 417 MB '
+        '0.75 s 0.90 s 80 mm 61 mm 80 mm'
     )
     assert queue == 'queue_size 5 skipped: no ROS'
 

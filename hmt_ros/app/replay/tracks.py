@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE
-from hmt_ros.app.replay.live_node import LiveNode
+from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
 from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER, NodeParameters
 from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
@@ -30,6 +30,7 @@ from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools.messages.cdr import deserialise
 
+PERSON = 'person_node'
 # Topics of the filter that the smoother takes, as sources of the same names.
 HANDED_ON = (MIXTURE,)
 
@@ -154,13 +155,14 @@ class LiveTrack(PlayedTrack):
     Args:
         parameters: parameters of the nodes.
         write: takes topic, stamp and bytes of each published message, in the order of the nodes.
+        together: whether the nodes run in one process.
 
     Raises:
         LiveNodeError: there is no ROS, or a node does not start, answer or end.
     """
 
-    def __init__(self, parameters: NodeParameters, write: Write) -> None:
-        self._parameters, self._write = parameters, write
+    def __init__(self, parameters: NodeParameters, write: Write, *, together: bool = False) -> None:
+        self._parameters, self._write, self._together = parameters, write, together
         self._seen, self._heard = _seen_by_bme(parameters), _heard_by_bme(parameters)
         self._bme: LiveNode | None = None
         self._smoother: LiveNode | None = None
@@ -180,7 +182,12 @@ class LiveTrack(PlayedTrack):
             inputs = {CAMERA_INFO: ('camera_info', CAMERA_INFO_TYPE), **given, IMAGE: image}
             if self._parameters.filter.uses_transforms:
                 inputs |= {each: (f'/{each}', TRANSFORMS_TYPE) for each in TRANSFORMS}
-            live = partial(LiveNode, player, opened, write=self._write)
+            process = None
+            if self._together:
+                every = zip((FILTER, SMOOTHER, BME), self._parameters, strict=True)
+                names = [name for name, own in every if own is not None]
+                process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', names)
+            live = partial(LiveNode, player, opened, within=process, write=self._write)
             # Of the namespace that both share: whatever comes must not be lost.
             sensors = (f'/{topic}', '/camera_info', *(f'/{source}' for source in given))
             if self._parameters.bme is not None:
@@ -198,11 +205,14 @@ class LiveTrack(PlayedTrack):
                 self._smoother = live(
                     SMOOTHER, self._parameters.smoother, inputs={}, topics=smoothed_messages.TOPICS
                 )
+            if process is not None:
+                process.start()
             self._filter.wait_until_active()
             if self._bme is not None:
                 self._bme.wait_until_active()
                 self._bme.wait_for_subscribers((PREDICTION,), 2)
-                self._filter.wait_until_heard(self._seen, 2)
+                # Nodes of one process listen once.
+                self._filter.wait_until_heard(self._seen, 1 if self._together else 2)
                 self._filter.wait_for_subscribers(self._heard, 2)
             if self._smoother is not None:
                 self._smoother.wait_until_active()

@@ -3,13 +3,14 @@
 import os
 import socket
 import sys
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.app.replay import live_node
+from hmt_ros.app.replay import live_node, one_bag
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.options import NodeParameters
 from hmt_ros.app.replay.player import (
@@ -94,6 +95,18 @@ def test_same_mixtures_of_every_image(tmp_path, capsys):
     assert len(messages(offline, 'keep_out')) == 3
     assert len(messages(offline, 'pose_forecast')) > 3
     # And everything else.
+    assert content(offline) == content(live)
+
+
+def test_same_in_one_process(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(one_bag, 'LiveTrack', partial(LiveTrack, together=True))
+    bag = write(tmp_path / 'bag', recorded(3))
+    options = ['--set', 'forecast_rate=50.0', '--bme', '']
+    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
+    assert one == other
+    assert one[0] == 0
+    assert len(messages(live, 'pose_prediction')) == 3
+    assert len(messages(live, 'smoothed_pose_mixture')) == 3
     assert content(offline) == content(live)
 
 
