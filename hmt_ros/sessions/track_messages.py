@@ -165,17 +165,20 @@ def track_messages(
     skeleton = track.body.skeleton
     frames = forward(skeleton, track.posterior.means)
     joints = frames.joints().transpose(2, 0, 1)
-    posterior, likelihood = _mixtures(track, joints)
     ground = _ground_state(track)
+    # Both are made before anything is published: either may be one that a message must not have.
+    made = {
+        'pose_mixture': lambda: _posterior(track, joints),
+        'likelihood_mixture': lambda: _likelihood(track),
+    }
+    mixtures = {topic: make() for topic, make in made.items() if wanted(topic)}
     if track.starts:
         publish('body', message_of_body(messages, track.body, stamp, frame))
     if presentation.describe:
         prefix = presentation.frame_prefix
         publish('human_description', description_message(messages, track.body, frame, prefix))
-    if wanted('pose_mixture'):
-        publish('pose_mixture', pose_mixture_message(messages, posterior))
-    if wanted('likelihood_mixture'):
-        publish('likelihood_mixture', pose_mixture_message(messages, likelihood))
+    for topic, mixture in mixtures.items():
+        publish(topic, pose_mixture_message(messages, mixture))
     if wanted('person_pose'):
         pose, its_frame = person_pose(track.body, track.posterior), frame
         if track.fixed is not None:
@@ -184,7 +187,7 @@ def track_messages(
     if wanted('ground'):
         publish('ground', ground_message(messages, ground))
     if wanted('human_joint_states'):
-        names = posterior.dof_names
+        names = track.body.dof_names
         publish(
             'human_joint_states', joint_state_message(messages, names, track.point, stamp, frame)
         )
@@ -297,46 +300,49 @@ def robot_messages(
             publish('pose_forecast', stamp, made)
 
 
-def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixture]:
-    """Posterior and likelihood, with joints (K, J, 3) of the posterior in the camera frame."""
-    posterior, likelihood, velocities = track.posterior, track.likelihood, track.velocities
-    frame, positions, shape = track.frame_id, joints, track.shape_covariance
+def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
+    """The posterior, with joints (K, J, 3) in the camera frame."""
+    posterior, velocities = track.posterior, track.velocities
+    frame, positions = track.frame_id, joints
     if (fixed := track.fixed) is not None:
         posterior, velocities = fixed.placed(track.body, posterior, velocities)
+        frame, positions = fixed.optical, fixed.motion.points(joints)
+    return PoseMixture.of_body(
+        track.body,
+        posterior,
+        MixtureKind.POSTERIOR,
+        track.stamp_ns,
+        frame,
+        joint_positions=positions,
+        log_likelihoods=track.log_likelihoods,
+        state=track.state,
+        track_id=track.track_id,
+        existence_probability=track.existence_probability,
+        cue_probabilities=_in_range(track.cue_probabilities),
+        identities=track.identities,
+        velocities=velocities,
+    )
+
+
+def _likelihood(track: TrackedImage) -> PoseMixture:
+    likelihood, frame, shape = track.likelihood, track.frame_id, track.shape_covariance
+    if (fixed := track.fixed) is not None:
         likelihood, _ = fixed.placed(track.body, likelihood)
         at_best = GaussianMixture(np.ones(1), track.posterior.means[:1], shape[None])
-        shape = fixed.placed(track.body, at_best)[0].covariances[0]
-        frame, positions = fixed.optical, fixed.motion.points(joints)
-    return (
-        PoseMixture.of_body(
-            track.body,
-            posterior,
-            MixtureKind.POSTERIOR,
-            track.stamp_ns,
-            frame,
-            joint_positions=positions,
-            log_likelihoods=track.log_likelihoods,
-            state=track.state,
-            track_id=track.track_id,
-            existence_probability=track.existence_probability,
-            cue_probabilities=_in_range(track.cue_probabilities),
-            identities=track.identities,
-            velocities=velocities,
-        ),
-        PoseMixture.of_body(
-            track.body,
-            likelihood,
-            MixtureKind.LIKELIHOOD,
-            track.stamp_ns,
-            frame,
-            state=track.state,
-            track_id=track.track_id,
-            existence_probability=track.existence_probability,
-            log_likelihoods=track.likelihood_values,
-            error_share=track.likelihood_errors.independent,
-            error_time=track.likelihood_errors.time,
-            shape_covariance=shape,
-        ),
+        shape, frame = fixed.placed(track.body, at_best)[0].covariances[0], fixed.optical
+    return PoseMixture.of_body(
+        track.body,
+        likelihood,
+        MixtureKind.LIKELIHOOD,
+        track.stamp_ns,
+        frame,
+        state=track.state,
+        track_id=track.track_id,
+        existence_probability=track.existence_probability,
+        log_likelihoods=track.likelihood_values,
+        error_share=track.likelihood_errors.independent,
+        error_time=track.likelihood_errors.time,
+        shape_covariance=shape,
     )
 
 
