@@ -35,8 +35,10 @@ _LIFE = 500
 
 def messages(amount: Amount) -> Iterator[Outcome]:
     """Messages through every subscriber and service of every node."""
-    count = len(scenes())
-    for scene in scenes().values():
+    # A session does not know which process it is in.
+    alone = [scene for scene in scenes().values() if not scene.together]
+    count = len(alone)
+    for scene in alone:
         with warnings_as_errors():
             outcome = _through(scene, amount.part(1.0 / count))
         yield outcome

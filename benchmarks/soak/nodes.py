@@ -45,7 +45,7 @@ def nodes(amount: Amount) -> Iterator[Outcome]:
         with ExitStack() as running:
             watched: Watched | None = None
             for done, case, share in CASES:
-                outcome = Outcome(scene.node, done)
+                outcome = Outcome(scene.title, done)
                 part = Amount(max(1, round(amount.times * share)), seconds)
                 try:
                     if watched is None:

@@ -30,6 +30,7 @@ from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.messages.states import transforms_message
 
+PERSON = 'person_node'
 CLIP = ROOT / 'bags' / 'reach'
 _SMALL = TrackerSettings(max_hypotheses=2, candidates=4)
 
@@ -49,6 +50,7 @@ class Scene:
         others: a valid message of each other source.
         start_ns: stamp of the first.
         variants: other parameters, with which more of what comes is looked at.
+        together: nodes that run with it in one process; empty: it has one of its own.
     """
 
     node: str
@@ -61,6 +63,12 @@ class Scene:
     others: Mapping[str, Any]
     start_ns: int
     variants: tuple[Mapping[str, Any], ...]
+    together: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """What runs: the node, or the process of several."""
+        return PERSON if self.together else self.node
 
     def message(self, index: int) -> Any:
         """A message of the counted source; stamps grow with the index."""
@@ -92,8 +100,9 @@ def stamped(message: Any, stamp_ns: int) -> Any:
 
 @cache
 def scenes() -> dict[str, Scene]:
-    """One of each node."""
-    return {scene.node: scene for scene in (_filter(), _smoother(), _bme())}
+    """One of each node, and the filter in a process with others."""
+    person = replace(_filter(), together=('filter_node', 'smoother_node'))
+    return {scene.title: scene for scene in (_filter(), _smoother(), _bme(), person)}
 
 
 @cache

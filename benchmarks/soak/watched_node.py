@@ -7,11 +7,12 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import Any
 
-from benchmarks.soak.scenes import Scene
-from hmt_ros.app.replay.live_node import LiveNode
+from benchmarks.soak.scenes import PERSON, Scene
+from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
 from hmt_ros.app.replay.player import LiveNodeError, Player
 from hmt_ros.sessions.handled import Handled
 
+OURS = '/hmt_ros/'
 # How long one message may take, s.
 PATIENCE = 60.0
 # How long a valid message is waited for that may have been sent too early, s.
@@ -43,6 +44,10 @@ class Watched:
         scene = self.scene
         with ExitStack() as opened:
             self.player = Player(opened)
+            process = None
+            if scene.together:
+                module = f'hmt_ros.nodes.{PERSON}'
+                process = NodeProcess(self.player, opened, PERSON, module, scene.together)
             self.node = LiveNode(
                 self.player,
                 opened,
@@ -51,8 +56,11 @@ class Watched:
                 inputs=scene.inputs,
                 topics=scene.session.TOPICS,
                 sensors=scene.sensors,
+                within=process,
                 write=_ignored,
             )
+            if process is not None:
+                process.start()
             self.node.wait_until_active()
             self.node.wait_for_subscribers(tuple(scene.session.TOPICS), 1)
             self._opened = opened.pop_all()
@@ -172,13 +180,25 @@ class Watched:
         return diagnostics[self.node.full_name]
 
     def traces(self) -> list[str]:
-        """What it has said that no user should see."""
-        lines = self.node.output().splitlines()
+        """What it has said that no user should see.
+
+        An executor of rclpy shows where a callback failed: that of rclpy itself for /clock does
+        where time is below zero.
+        """
+        lines = [
+            line
+            for line in self.node.output().splitlines()
+            if not line.strip().startswith('raise ')
+        ]
         return [
             f'said {line.strip()[:120]}'
             for line in lines
             if 'Error' in line.partition(':')[0].split('.')[-1] and not line.startswith('[')
-        ] or [f'said {line[:120]}' for line in lines if 'Traceback' in line or 'Warning:' in line]
+        ] or [
+            f'said {line.strip()[:120]}'
+            for line in lines
+            if 'Traceback' in line or 'Warning:' in line or ('File "' in line and OURS in line)
+        ]
 
     def spin(self, seconds: float) -> None:
         """Listens for a while."""
