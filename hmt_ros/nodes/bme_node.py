@@ -44,7 +44,8 @@ class BmeNode(SessionNode[BmeSession, BmeParameters]):
         yield CAMERA_INFO_TOPIC
         if self._settings.tracked_interval > 0:
             yield SubscribedTopic(TRACK, TRACK, 'hmt_msgs/msg/PoseMixture', RELIABLE)
-        yield from input_topics(BmeSession.inputs_of(self._settings))
+        assert self._session is not None
+        yield from input_topics(self._session.rows)
         if self._settings.predict_from != FROM_KEYPOINTS:
             yield image_topic(self._settings.image_transport)
 

@@ -309,7 +309,9 @@ class EstimatingThread:
             handled = session.take(waiting.source, message, more=more)
         if more_done := session.state.counts[session.DONE] - done:
             # An image may have waited for this message, which came later.
-            newest = max((stamp for _, stamp in handled.published), default=0)
+            # Forecasts are of times to come.
+            stamps = (stamp for topic, stamp in handled.published if 'forecast' not in topic)
+            newest = max(stamps, default=0)
             arrival = self._arrivals.get(newest, waiting.arrival)
             now = time.monotonic()
             self._latencies.append(now - arrival)

@@ -9,6 +9,7 @@ from typing import Any
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic, image_topic
+from hmt_ros.sessions.image_inputs import MASK
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.keypoints_session import KeypointsSession
 
@@ -20,6 +21,10 @@ class KeypointsNode(SessionNode[KeypointsSession, KeypointsParameters]):
     SUBJECT = 'detection'
     SESSION = KeypointsSession
     DEFAULTS = KeypointsParameters()
+
+    def _offered_topics(self) -> Iterable[str]:
+        masks = self._settings.publish_mask
+        return (topic for topic in self.SESSION.TOPICS if masks or topic != MASK)
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         return ()

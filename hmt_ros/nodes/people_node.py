@@ -66,6 +66,8 @@ class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
         if topic in self._outputs:
             return
         with self._opening:
+            if topic in self._outputs:
+                return
             publisher = self._new_publisher(topic, *published_with(published_topic(topic)))
             publisher.on_activate(None)
             # Others may be going through the old ones.

@@ -111,7 +111,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._local = LocalTopics() if local is None else local
         self._local_names: dict[str, str] = {}
         self._listeners: list[Listener] = []
-        for topic in self.SESSION.TOPICS:
+        for topic in self._offered_topics():
             if not topic.startswith('/'):
                 self._local.offer(self._local_name(topic))
         # Topics that the node both publishes and subscribes to, and what it published there.
@@ -135,6 +135,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._timer = self.create_timer(1.0, self._diagnose_period, clock=steady)
 
     # What a node decides.
+
+    def _offered_topics(self) -> Iterable[str]:
+        """Topics that nodes of this process get from this node and nobody else."""
+        return self.SESSION.TOPICS
 
     def _in_namespace(self, defaults: Any) -> Any:
         """Default values of the parameters in the namespace of the node."""

@@ -48,7 +48,7 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
         if session is None:
             response.success, response.message = False, 'the node is not configured'
             return response
-        # Mixtures that come meanwhile wait in the middleware.
+        # Mixtures that come meanwhile wait, in the middleware or in the queue.
         span = time_ns(request.from_time), time_ns(request.to_time)
         try:
             data = serialise(session.smooth_span(*span))

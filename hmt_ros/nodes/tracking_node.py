@@ -5,13 +5,13 @@ A watchdog tells robots where no image was answered for `stale_time`, by a clock
 
 from __future__ import annotations
 
+import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 from hmt_msgs.srv import Reset
-from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from hmt_ros.nodes.session_node import SessionNode
@@ -40,15 +40,26 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        # Images that were answered, and when that was last seen.
-        self._count, self._answered = 0, time.monotonic()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._watchdog = self.create_timer(_GLANCE, self._watch, clock=steady)
+        self._inactive = threading.Event()
+        self._watchdog: threading.Thread | None = None
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listens."""
-        self._answered = time.monotonic()
-        return super().on_activate(state)
+        result = super().on_activate(state)
+        self._inactive = threading.Event()
+        # Not a timer: while the executor serves something else, robots are told all the same.
+        self._watchdog = threading.Thread(
+            target=self._watch, args=(self._session, self._inactive), name='watchdog', daemon=True
+        )
+        self._watchdog.start()
+        return result
+
+    def _unsubscribe(self) -> None:
+        super()._unsubscribe()
+        self._inactive.set()
+        if self._watchdog is not None:
+            self._watchdog.join()
+            self._watchdog = None
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield Reset, '~/reset', self._on_reset
@@ -58,8 +69,9 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield CAMERA_INFO_TOPIC
-        yield from input_topics(self.SESSION.inputs_of(self._settings))
-        if self._session is not None and self._session.frames.wanted:
+        assert self._session is not None
+        yield from input_topics(self._session.rows)
+        if self._session.frames.wanted:
             yield from TRANSFORM_TOPICS
         yield image_topic(self._settings.image_transport)
 
@@ -87,15 +99,15 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
         self.get_logger().info(f'~/reset: {response.message}')
         return response
 
-    def _watch(self) -> None:
+    # Called by a thread of its own.
+
+    def _watch(self, session: AnySession, inactive: threading.Event) -> None:
         """Tells robots of images that are not answered."""
-        session, thread = self._session, self._thread
-        if session is None or thread is None:
-            return
-        now = time.monotonic()
-        if session.answered != self._count:
-            self._count, self._answered = session.answered, now
-        silence = now - self._answered
-        if silence >= self._settings.stale_time:
-            for output in session.stale(silence):
-                self._publish(output)
+        count, answered = session.answered, time.monotonic()
+        while not inactive.wait(_GLANCE):
+            now = time.monotonic()
+            if session.answered != count:
+                count, answered = session.answered, now
+            if now - answered >= self._settings.stale_time:
+                for output in session.stale(now - answered, count):
+                    self._publish(output)

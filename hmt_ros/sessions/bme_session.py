@@ -186,6 +186,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._lifter = None
         if parameters.predict_from != FROM_SILHOUETTES:
             self._lifter = known_lifter(parameters.lifter)
+        self._cue = parameters.predict_from
         self._keypoints = KeypointReader(parameters.source, self._log)
         self._by_keypoints: KeypointPredictor | None = None
         self.state = self._present_state()
@@ -197,7 +198,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._inputs[KEYPOINTS].put(0, shown.keypoints(0))
             self._lifted(0, shown.camera)
             self._by_keypoints = None
-        if self.parameters.predict_from == FROM_KEYPOINTS:
+        if self._cue == FROM_KEYPOINTS:
             return
         for mask in shown.masks[:2]:
             previous = self._seen(mask, shown.camera, previous).mixture
@@ -220,9 +221,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     def needed_inputs(self) -> list[NeededInput]:
         """See `Session`."""
         needed = super().needed_inputs()
-        if self.parameters.predict_from != FROM_KEYPOINTS:
+        if self._cue != FROM_KEYPOINTS:
             return needed
-        own = NeededInput(tuple(self._rows[0].types))
+        own = NeededInput(tuple(self.rows[0].types))
         return [own, *(x for x in needed if x.sources == (CAMERA_INFO,))]
 
     def _forget_inputs(self, stamp: int) -> None:
@@ -245,7 +246,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
         row = self._inputs.row(source)
-        if row is not None and self.parameters.predict_from == FROM_KEYPOINTS:
+        if row is not None and self._cue == FROM_KEYPOINTS:
             self._take_keypoints(row, message, stamp)
         elif source != TRACK:
             super()._take(source, message, stamp)
@@ -261,6 +262,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if order is Order.SKIPPED:
             return
         if order is Order.JUMP:
+            self._forget_inputs(stamp)
             self._start_anew()
         camera = self._camera
         if camera is None:
@@ -306,7 +308,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return None if found is None else found[: self.parameters.max_hypotheses].normalised()
 
     def _take_image(self, message: Any, stamp: int) -> None:
-        if self.parameters.predict_from == FROM_KEYPOINTS:
+        if self._cue == FROM_KEYPOINTS:
             return
         in_turn = not self._waiting and self._newest is not None and stamp > self._newest
         if not in_turn or not self._is_left_to_track(stamp) or self._wanted(SILHOUETTE):
@@ -358,7 +360,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     def _mixture_of(self, waiting: WaitingImage, camera: Camera) -> GaussianMixture | None:
         """The prediction from an image; None if nobody is seen."""
         p, given = self.parameters, waiting.mask
-        if p.predict_from == FROM_BOTH:
+        if self._cue == FROM_BOTH:
             lifted = self._lifted(waiting.stamp_ns, camera)
             if lifted is not None:
                 self._without_background = True

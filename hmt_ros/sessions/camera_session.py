@@ -88,7 +88,11 @@ class WaitingImage(NamedTuple):
 
 
 class CameraSession(Session[CameraParameters, State]):
-    """A session that estimates from images; see `Session` for arguments and attributes."""
+    """A session that estimates from images; see `Session` for arguments and attributes.
+
+    Attributes:
+        rows: what may come with the images.
+    """
 
     COUNTED = IMAGE
     UNIT = 'image'
@@ -107,8 +111,8 @@ class CameraSession(Session[CameraParameters, State]):
         self._watch = SceneWatch()
         self._waiting: deque[WaitingImage] = deque()
         self._newest: int | None = None
-        self._rows = self.inputs_of(parameters)
-        self._inputs = ImageInputs(self._rows, self._log)
+        self.rows = self.inputs_of(parameters)
+        self._inputs = ImageInputs(self.rows, self._log)
         self._info_stamp = 0
         # Images that have come since the last estimate; whether some were left when it was
         # interrupted; and stamps of those that were dropped.
@@ -131,7 +135,7 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _awaited(self) -> list[ImageInput]:
         """The inputs that images wait for."""
-        return [row for row in self._rows if row.is_used(self.parameters)]
+        return [row for row in self.rows if row.is_used(self.parameters)]
 
     @abstractmethod
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
@@ -191,9 +195,9 @@ class CameraSession(Session[CameraParameters, State]):
         row = self._inputs.row(source)
         if source == CAMERA_INFO:
             self._take_camera_info(message)
-        elif row is None:
+        elif source == IMAGE:
             self._take_image(message, stamp)
-        elif row in self._awaited():
+        elif row is not None and row in self._awaited():
             self._inputs.put(source, message, stamp, partial(self._read_input, row))
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:

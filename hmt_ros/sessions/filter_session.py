@@ -15,6 +15,7 @@ order give the same bytes. The rules, besides those of `TrackingSession`:
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -113,6 +114,8 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         # Of an image that was left out since the last estimate.
         self._late_prediction: PosePrediction | None = None
         self.robot = RobotOutputs()
+        # What a watchdog says never follows the answer to a newer image.
+        self._telling = threading.Lock()
         self.state = self._present_state()
 
     @classmethod
@@ -208,7 +211,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
     ) -> None:
         """Takes an image with its inputs; see `Tracker.step`."""
         stamp = waiting.stamp_ns
-        before = TrackCondition.of(self._tracker)
+        before, answered = TrackCondition.of(self._tracker), False
         starts = before.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
@@ -243,9 +246,12 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
                 self._publish_nobody(self._tracker, waiting)
-            self._tell_robot(self._tracker, waiting, posterior)
+            answered = True
+            self._tell_robot(waiting, self._tracker, posterior)
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
+            if not answered:
+                self._tell_robot(waiting)
             if not starts:
                 self._log.skip(Fault.ESTIMATE, f'image of {stamp} ns can not be tracked: {text}')
                 return
@@ -322,32 +328,49 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         self._log.counts['tracked'] += 1
 
     def _tell_robot(
-        self, tracker: Tracker, waiting: WaitingImage, posterior: GaussianMixture | None
+        self,
+        waiting: WaitingImage,
+        tracker: Tracker | None = None,
+        posterior: GaussianMixture | None = None,
     ) -> None:
-        """Publishes what a robot acts on; of every image, whatever it shows."""
+        """Publishes what a robot acts on; of every image, whatever it shows.
+
+        Args:
+            waiting: the image.
+            tracker: after the image; None: it could not be tracked.
+            posterior: of the image; None: there is no track.
+        """
         p, seen, frame, fixed = self.parameters, None, waiting.frame_id, None
         placed = True
         if p.publish_in_fixed_frame:
             frame, placed = p.fixed_frame, self.frames.pose is not None
             if self.frames.pose is not None:
                 fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
-        state = _STATES[tracker.status]
-        if state is KeepOutState.TRACKING:
-            if placed and posterior is not None:
+        state = KeepOutState.UNKNOWN if tracker is None else _STATES[tracker.status]
+        if state is KeepOutState.NOBODY and tracker is not None and not tracker.nobody_shown:
+            # An earlier image has said so, and this one says nothing.
+            state = KeepOutState.UNKNOWN
+        if state is KeepOutState.TRACKING and tracker is not None:
+            if placed and posterior is not None and not tracker.foreseen:
                 seen = LastSeen(
                     waiting.stamp_ns, waiting.frame_id, tracker.body, posterior, tracker.forecaster,
                     fixed, p.keep_out_probability,
                 )  # fmt: skip
             else:
                 state = KeepOutState.LOST
-        self.robot.tell(
-            waiting.stamp_ns, frame, state, tracker.track_id, tracker.existence_probability, seen
-        )
-        robot_messages(self._messages, self.robot, p, self._wanted, self._publish)
-        self.answered += 1
+        number = self._tracks if tracker is None else tracker.track_id
+        existence = math.nan if tracker is None else tracker.existence_probability
+        with self._telling:
+            self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen)
+            robot_messages(self._messages, self.robot, p, self._wanted, self._publish)
+            self.answered += 1
 
-    def stale(self, silence: float) -> list[Output]:
+    def stale(self, silence: float, answered: int) -> list[Output]:
         """See `TrackingSession`."""
+        with self._telling:
+            return self._stale(silence) if answered == self.answered else []
+
+    def _stale(self, silence: float) -> list[Output]:
         found: list[Output] = []
 
         def publish(topic: str, stamp: int, message: Any) -> None:

@@ -133,9 +133,12 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         self._watch = SceneWatch()
         self._next, self._detected, self._begun = 1, 0, False
 
-    def stale(self, silence: float) -> list[Output]:
+    def stale(self, silence: float, answered: int) -> list[Output]:
         """See `TrackingSession`; of everybody who is followed."""
-        return [output for person in self._people for output in person.session.stale(silence)]
+        if answered != self.answered:
+            return []
+        people = [person.session for person in self._people]
+        return [output for one in people for output in one.stale(silence, one.answered)]
 
     # Inputs.
 

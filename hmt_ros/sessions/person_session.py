@@ -151,9 +151,9 @@ class PersonSession(FilterSession):
         """The person, as far as it is known."""
         return self.start.body if self._tracker is None else self._tracker.body
 
-    def stale(self, silence: float) -> list[Output]:
-        """See `FilterSession.stale`."""
-        found = super().stale(silence)
+    def stale(self, silence: float, answered: int) -> list[Output]:
+        """See `TrackingSession`."""
+        found = super().stale(silence, answered)
         return [one._replace(topic=topic_of(self._person, one.topic)) for one in found]
 
     def _new_tracker(self, camera: Camera) -> Tracker:

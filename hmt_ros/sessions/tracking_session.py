@@ -67,11 +67,12 @@ class TrackingSession(CameraSession[Parameters, State]):
         super().restart()
 
     @abstractmethod
-    def stale(self, silence: float) -> list[Output]:
+    def stale(self, silence: float, answered: int) -> list[Output]:
         """What a robot is told where no image is answered; may be called by any thread.
 
         Args:
             silence: time since the newest image was answered, s.
+            answered: the number of images that were; nothing is told where there are more by now.
         """
 
     def needed_inputs(self) -> list[NeededInput]:

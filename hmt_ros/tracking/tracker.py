@@ -331,6 +331,16 @@ class Tracker:
         return self._point.pose
 
     @property
+    def foreseen(self) -> bool:
+        """Whether the last image showed nothing of the person: the posterior is a prediction."""
+        return self._foreseen
+
+    @property
+    def nobody_shown(self) -> bool:
+        """Whether the last image itself has said that nobody is there; a covered lens does not."""
+        return self._nobody and self._existence.nobody
+
+    @property
     def forecaster(self) -> Forecaster:
         """Predicts the track from the last image that it followed.
 

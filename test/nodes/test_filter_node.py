@@ -556,3 +556,41 @@ def test_an_empty_view_is_a_warning_and_no_error(running, small_camera, stub_tra
     ]
     assert set(told) == {(1, 'nobody in view')}
     assert running.diagnosis()[2]['track'] == '2'
+
+
+def test_robots_are_told_that_no_image_is_answered(world, small_camera):
+    from builtin_interfaces.msg import Time
+    from hmt_msgs.msg import KeepOut
+    from hmt_msgs.srv import ForecastPose
+
+    one = world(stale_time=0.3)
+    told = []
+    one.listen(KeepOut, 'keep_out', told)
+    one.start()
+    one.spin_until(lambda: told and told[-1].state == KeepOut.STATE_STALE, 'a stale message')
+    assert len(told[-1].radii) == 0
+    one.send('camera_info', small_camera.info())
+    one.send('image', small_camera.image(0))
+    one.spin_until(lambda: any(x.state == KeepOut.STATE_TRACKING for x in told), 'the image')
+    count = len(told)
+    one.spin_until(lambda: len(told) > count + 3, 'more of them')
+    assert {message.state for message in told[count + 1 :]} == {KeepOut.STATE_STALE}
+    # It grows.
+    assert told[-1].unseen > told[-2].unseen >= 0.3
+    assert min(told[-1].radii) > min(told[-2].radii)
+    # Where the person is by now.
+    answer = one.call(ForecastPose, 'forecast_pose', stamp=Time())
+    assert not answer.success
+    assert 'wanted a time from then to 10 s later' in answer.message
+    seconds, nanoseconds = divmod(small_camera.stamp(1), 10**9)
+    later = Time(sec=seconds, nanosec=nanoseconds)
+    answer = one.call(ForecastPose, 'forecast_pose', stamp=later)
+    assert answer.success
+    assert answer.mixture.header.stamp == later
+    assert answer.mixture.kind == answer.mixture.FORECAST
+    assert one.change_state('deactivate')
+    count = len(told)
+    time.sleep(0.2)
+    one.executor.spin_once(timeout_sec=0.1)
+    assert len(told) <= count + 1
+    assert one.change_state('activate')

@@ -1023,18 +1023,52 @@ def test_robots_are_told_of_every_image(session, outputs, small_camera, stub_tra
 
 def test_a_camera_that_stops_makes_the_space_grow(session, outputs, small_camera):
     one = session()
-    (before,) = [keep_out_of(read(x)) for x in one.stale(1.0) if x.topic == 'keep_out']
+    (before,) = [keep_out_of(read(x)) for x in one.stale(1.0, 0) if x.topic == 'keep_out']
     assert (before.state, len(before.radii)) == (KeepOutState.STALE, 0)
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
     (last,) = kept_out(outputs)
-    markers, capsules = sorted(one.stale(0.2), key=lambda x: x.topic == 'keep_out')
+    markers, capsules = sorted(one.stale(0.2, 1), key=lambda x: x.topic == 'keep_out')
     assert markers.topic == 'keep_out_markers'
     after = keep_out_of(read(capsules))
     assert (after.state, after.unseen) == (KeepOutState.STALE, 0.2)
     assert (after.radii - last.radii).tolist() == pytest.approx([1.3] * len(last.radii))
     # It is told by whoever watches, and not as the answer to an image.
     assert len(kept_out(outputs)) == 1
+
+
+def test_a_watchdog_says_nothing_where_a_newer_image_was_answered(session, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    before = one.answered
+    one.take(IMAGE, small_camera.image(0))
+    assert one.stale(5.0, before) == []
+    assert one.stale(5.0, one.answered) != []
+
+
+def test_an_image_that_shows_nothing_frees_nothing(session, outputs, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    (tracker,) = stub_tracker.made
+    # The posterior is a prediction, while the track has not been given up.
+    tracker.foreseen = True
+    one.take(IMAGE, small_camera.image(1))
+    # It can not be tracked at all.
+    stub_tracker.fault = ValueError('a hypothesis is not finite')
+    one.take(IMAGE, small_camera.image(2))
+    stub_tracker.fault, tracker.foreseen = None, False
+    # Nobody, by an earlier image: the lens is covered now.
+    stub_tracker.empty |= {small_camera.stamp(3), small_camera.stamp(4)}
+    one.take(IMAGE, small_camera.image(3))
+    tracker.nobody_shown = False
+    one.take(IMAGE, small_camera.image(4))
+    found = kept_out(outputs)
+    assert [content.state.name for content in found] == [
+        'TRACKING', 'LOST', 'LOST', 'NOBODY', 'UNKNOWN',
+    ]  # fmt: skip
+    assert [content.unseen for content in found[:3]] == pytest.approx([0.0, 0.1, 0.2])
+    assert found[2].radii.min() > found[1].radii.min() > found[0].radii.min()
 
 
 def test_a_reset_does_not_free_the_space(session, outputs, small_camera):

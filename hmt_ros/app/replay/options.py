@@ -172,8 +172,9 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
         if value is not None:
             values[name] = str(value) if isinstance(value, Path) else value
     has_keypoints = recorded.of(KEYPOINTS) is not None
-    if values.get('source', OWN_KEYPOINTS) != OWN_KEYPOINTS:
-        has_keypoints = recorded.of(DETECTIONS) is not None
+    if (source := values.get('source', OWN_KEYPOINTS)) != OWN_KEYPOINTS:
+        detections = recorded.of(DETECTIONS)
+        has_keypoints = detections is not None and detections.msgtype == SOURCES.get(source)
     values.setdefault('use_keypoints', has_keypoints)
     has_depth = recorded.of(KEYPOINTS_3D) is not None and values['use_keypoints'] is True
     values.setdefault('use_keypoints_3d', has_depth)
@@ -212,7 +213,8 @@ def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> Peopl
         if value:
             raise ValueError(f'{option} does not go with --people')
     detections = recorded.of(DETECTIONS)
-    if detections is None:
+    sources = {SOURCES[source]: source for source in PeopleParameters.SOURCES}
+    if detections is None or detections.msgtype not in sources:
         kinds = ', '.join(SOURCES[x].replace('/msg/', '/') for x in PeopleParameters.SOURCES)
         raise ValueError(f'--people needs the topic detections, of {kinds}: the bag has none')
     values = _given_values(options, PEOPLE_NODE)
@@ -222,7 +224,6 @@ def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> Peopl
         'background_file': None if options.background is None else str(options.background),
     }
     values |= {name: value for name, value in given.items() if value is not None}
-    sources = {SOURCES[source]: source for source in PeopleParameters.SOURCES}
     values['source'] = sources[detections.msgtype]
     _use_what_is_there(values, recorded, MASK, DEPTH)
     _use_upright_frame(values, recorded)
@@ -248,6 +249,9 @@ def _bme_parameters(
         'background_file': tracking.background_file,
         'use_mask': tracking.use_mask,
         'source': tracking.source,
+        'scheme': tracking.scheme,
+        'person_id': tracking.person_id,
+        'keypoint_scheme': tracking.keypoint_scheme,
         'input_timeout': tracking.input_timeout,
         **_given_values(options, BME),
         'image_transport': recorded.transport,

@@ -108,7 +108,7 @@ class StandingStill:
         return self
 
     log_likelihoods, identities, velocities = np.zeros(1), np.ones(1, dtype=int), None
-    forecaster = None
+    forecaster, foreseen, nobody_shown = None, False, False
 
     @property
     def point_estimate(self):

@@ -243,7 +243,7 @@ def test_every_type_of_the_project_has_its_definition_in_the_bag(
     tmp_path: Path, messages: RosbagsMessages
 ) -> None:
     types = sorted(name for name in typestore().fielddefs if name.startswith('hmt_msgs/'))
-    assert len(types) == 10
+    assert len(types) == 11
     with BagWriter(tmp_path / 'bag') as bag:
         for msgtype in types:
             bag.write(f'/{msgtype}', 1, messages.create(msgtype))

@@ -248,7 +248,7 @@ def test_type_hashes_are_those_of_ros() -> None:
 
     folder = Path(get_package_share_directory('hmt_msgs')) / 'msg'
     paths = sorted(folder.glob('*.json'))
-    assert len(paths) == 10
+    assert len(paths) == 11
     for path in paths:
         hashes = json.loads(path.read_text())['type_hashes']
         wanted = {entry['type_name']: entry['hash_string'] for entry in hashes}
