@@ -54,8 +54,16 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
         self._watchdog.start()
         return result
 
+    def stop(self, timeout: float | None = None) -> bool:
+        """See `SessionNode`; nobody is watched any more."""
+        self._end_watch()
+        return super().stop(timeout)
+
     def _unsubscribe(self) -> None:
         super()._unsubscribe()
+        self._end_watch()
+
+    def _end_watch(self) -> None:
         self._inactive.set()
         if self._watchdog is not None:
             self._watchdog.join()
