@@ -2,7 +2,7 @@
 
 A clip of a dancer with known truth is rendered, and replayed offline, where every image is used.
 Keypoints are the true joints with the noise of a detector, behind each image.
-Then a camera, in a process of its own, shows it to the real nodes at 30 images a second. Latency is
+Then a camera, in a process of its own, shows it to the real nodes at its rate. Latency is
 the time from when an image is due at the camera to the arrival of its pose_mixture in another
 process; age is how much older a smoothed pose is, when it arrives, than the newest image.
 """
@@ -43,7 +43,9 @@ from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import stamp_in
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, TrackState
 
-RATE = 30.0  # images a second
+RATE, SLOWER = 30.0, 15.0  # images a second
+# The slower camera, and its clip.
+LARGE = ('--size', '1280x720', '--fps', f'{SLOWER:g}')
 SECONDS, QUICK_SECONDS = 16.0, 3.0
 MOTION = 'dance'
 POSTERIOR, SMOOTHED = 'pose_mixture', 'smoothed_pose_mixture'
@@ -69,6 +71,7 @@ class Case:
         keypoints: whether there are any; then there is no BME.
         together: whether the nodes run in one process.
         smoothed: whether there is a smoother.
+        large: whether it is a slower camera of more pixels, see `LARGE`.
         filter, bme: parameters that are not the usual ones.
     """
 
@@ -78,6 +81,7 @@ class Case:
     keypoints: bool = False
     together: bool = False
     smoothed: bool = True
+    large: bool = False
     filter: Mapping[str, Any] = field(default_factory=dict)
     bme: Mapping[str, Any] = field(default_factory=dict)
 
@@ -97,6 +101,7 @@ CASES = {
     'together, keypoints, filter': Case(
         'one process: the same, filter alone', keypoints=True, together=True, smoothed=False
     ),
+    'large': Case('processes apart: 1280x720, 15 images a second', large=True),
     'usual DDS': Case('without fastdds.xml', room=False),
 }
 OFFLINE = {'offline': 'offline, every image', 'upright': 'offline, gravity given'}
@@ -117,13 +122,17 @@ def measure(seconds: float = SECONDS, only: tuple[str, ...] = STAGES) -> dict[st
     with tempfile.TemporaryDirectory(prefix='benchmark_live.') as name:
         folder = Path(name)
         clip = folder / 'clip'
-        _run(make_bag.main, [MOTION, '-o', str(clip), '--duration', f'{seconds:g}', '--quiet'])
+        usual = [MOTION, '--duration', f'{seconds:g}', '--quiet', '-o']
+        _run(make_bag.main, [*usual, str(clip)])
+        if any(stage in only for stage, case in CASES.items() if case.large):
+            _run(make_bag.main, [*usual, str(folder / 'large'), *LARGE])
         stages = {
             'offline': lambda: offline(clip, folder / 'offline', *WITHOUT_GRAVITY),
             'upright': lambda: offline(clip, folder / 'upright'),
         }
         for stage, case in CASES.items():
-            stages[stage] = partial(_tried, clip, folder / stage.replace(' ', '_'), case)
+            shown = folder / 'large' if case.large else clip
+            stages[stage] = partial(_tried, shown, folder / f'{stage} of nodes', case)
         return run_stages('live', stages, only)
 
 
@@ -173,7 +182,7 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
     Raises:
         LiveNodeError: there is no ROS, or a node does not start or track.
     """
-    truth = read_truth(clip / 'truth.npz')
+    truth, rate = read_truth(clip / 'truth.npz'), SLOWER if case.large else RATE
     with ExitStack() as opened:
         player = Player(opened)
         nodes = _nodes(player, opened, clip, case)
@@ -184,7 +193,7 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
         told = [str(_detections(clip, truth))] if case.keypoints else []
         camera = _Camera(
             opened, player.domain, clip, case.transport, len(truth.joints), told,
-            subscribers=1 if case.keypoints or case.together else 2,
+            subscribers=1 if case.keypoints or case.together else 2, rate=rate,
         )  # fmt: skip
         # The kernels are compiled and the track has started before the clip moves.
         camera.spin(player, lambda: len(arrived[POSTERIOR]) > 2, START_SECONDS)
@@ -192,7 +201,7 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
         before = [_cpu_seconds(node) for node in processes]
         at_first = sum(_memory(node) for node in processes)
         received = _received(player)
-        camera.spin(player, camera.ended, len(truth.joints) / RATE + PATIENCE)
+        camera.spin(player, camera.ended, len(truth.joints) / rate + PATIENCE)
         spent = [_cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)]
         memory = sum(_memory(node) for node in processes)
         end = time.monotonic() + PATIENCE
@@ -322,10 +331,11 @@ class _Camera:
         more: Sequence[str] = (),
         *,
         subscribers: int,
+        rate: float,
     ) -> None:
         command = [sys.executable, '-m', 'benchmarks.camera', str(clip), transport]
         self._process = subprocess.Popen(
-            [*command, f'{RATE:g}', str(images), str(subscribers), *more],
+            [*command, f'{rate:g}', str(images), str(subscribers), *more],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, **environment(domain)},

@@ -95,7 +95,7 @@ def run_together(
 def _new_executor() -> Executor:
     """An executor that does not look through all topics of all nodes for each message.
 
-    A camera gets a fifth more answers by it. The first releases of Jazzy do not have it.
+    A camera gets a quarter more answers by it. The first releases of Jazzy do not have it.
     """
     try:
         from rclpy.experimental import EventsExecutor
