@@ -19,7 +19,6 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -223,10 +222,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         for topic, published in self.SESSION.TOPICS.items():
             self._outputs[topic] = self._new_publisher(topic, *published_with(published))
         self._handled = self._new_publisher('~/handled', HANDLED, ANSWERS)
-        # While a service waits for something, the others of its group would wait with it.
-        group = ReentrantCallbackGroup()
         self._offered = [
-            self.create_service(kind, name, callback, callback_group=group)
+            self.create_service(kind, name, callback)
             for kind, name, callback in self._offered_services()
         ]
         return super().on_configure(state)

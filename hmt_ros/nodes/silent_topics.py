@@ -1,6 +1,6 @@
 """Why nothing arrives: what a node waits for, who publishes it, and what there is instead.
 
-Everything here runs in the executor's thread, once a period of the diagnostics, and asks the graph
+All but `arrived` runs in the executor's thread, once a period of the diagnostics, and asks the graph
 only about topics on which nothing arrives.
 """
 
