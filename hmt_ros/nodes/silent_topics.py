@@ -1,7 +1,7 @@
 """Why nothing arrives: what a node waits for, who publishes it, and what there is instead.
 
-All but `arrived` runs in the executor's thread, once a period of the diagnostics, and asks the graph
-only about topics on which nothing arrives.
+All but `arrived` runs in the executor's thread, once a period of the diagnostics, and asks the
+graph only about topics on which nothing arrives.
 """
 
 from __future__ import annotations

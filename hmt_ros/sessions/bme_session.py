@@ -70,7 +70,7 @@ from hmt_ros.sessions.camera_session import (
     read_picture,
 )
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS, MASK_INPUT, ImageInput
+from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK_INPUT, ImageInput
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input, known_lifter
 from hmt_ros.sessions.session import (
     NeededInput,
@@ -229,13 +229,6 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     def _forget_inputs(self, stamp: int) -> None:
         super()._forget_inputs(stamp)
         self._keypoints.forget()
-
-    def _stamp_of(self, source: str, message: Any) -> int:
-        if source == DETECTIONS:
-            told = self._keypoints.stamp_of(message, self._info_stamp)
-            if told is not None:
-                return told
-        return super()._stamp_of(source, message)
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name != KEYPOINTS:

@@ -29,6 +29,7 @@ from hmt_ros.sessions.declared_parameters import CameraNodeParameters
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.image_inputs import (
     DEPTH,
+    DETECTIONS,
     MASK,
     MASK_INPUT,
     REMEMBERED,
@@ -41,6 +42,7 @@ from hmt_ros.sessions.named_frames import NamedFrames
 from hmt_ros.sessions.session import NeededInput, Order, Session, State, everything
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, UncalibratedError, camera_from_info
+from msg_tools.messages.detections import stamp_of_floats
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import ImageError, decode_picture
 
@@ -113,7 +115,8 @@ class CameraSession(Session[CameraParameters, State]):
         self._newest: int | None = None
         self.rows = self.inputs_of(parameters)
         self._inputs = ImageInputs(self.rows, self._log)
-        self._info_stamp = 0
+        # Messages of `floats` may have no stamp: then it is that of the newest camera_info.
+        self._floats, self._info_stamp = parameters.source == 'floats', 0
         # Images that have come since the last estimate; whether some were left when it was
         # interrupted; and stamps of those that were dropped.
         self._fresh = 0
@@ -199,6 +202,12 @@ class CameraSession(Session[CameraParameters, State]):
             self._take_image(message, stamp)
         elif row is not None and row in self._awaited():
             self._inputs.put(source, message, stamp, partial(self._read_input, row))
+
+    def _stamp_of(self, source: str, message: Any) -> int:
+        if source != DETECTIONS or not self._floats:
+            return super()._stamp_of(source, message)
+        told = stamp_of_floats(message)
+        return self._info_stamp if told is None else told
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         """The content of a message, as `ImageInput.read`."""

@@ -34,7 +34,6 @@ from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.image_inputs import (
     COMPRESSED_MASK,
     DEPTH,
-    DETECTIONS,
     INPUTS,
     KEYPOINTS,
     KEYPOINTS_3D,
@@ -139,13 +138,6 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         self.robot.forget()
         self._keypoints.forget()
         self._late_prediction = None
-
-    def _stamp_of(self, source: str, message: Any) -> int:
-        if source == DETECTIONS:
-            told = self._keypoints.stamp_of(message, self._info_stamp)
-            if told is not None:
-                return told
-        return super()._stamp_of(source, message)
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name == KEYPOINTS:

@@ -34,7 +34,6 @@ from msg_tools.messages.detections import (
     people_of_floats,
     people_of_yolo,
     person_of_skeleton,
-    stamp_of_floats,
 )
 from msg_tools.messages.keypoints import Positions, keypoints_of
 
@@ -75,18 +74,6 @@ class KeypointReader:
         self._source, self._log = source, log
         self._chosen = ChosenPerson()
         self._unknown: set[frozenset[str]] = set()
-
-    def stamp_of(self, message: Any, info_stamp: int) -> int | None:
-        """Stamp of a message that may have none, as `floats`; None: it has one in its header.
-
-        Args:
-            message: of the source.
-            info_stamp: of the newest camera_info, ns.
-        """
-        if self._source != 'floats':
-            return None
-        told = stamp_of_floats(message)
-        return info_stamp if told is None else told
 
     def read(
         self, message: Any, stamp: int, parameters: CameraNodeParameters, body: Body,

@@ -53,7 +53,6 @@ from msg_tools.messages.detections import (
     PEOPLE_2D,
     DetectedPerson,
     people_message,
-    stamp_of_floats,
 )
 from msg_tools.messages.headers import SECOND_NS
 
@@ -109,7 +108,6 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         wanted: Callable[[str], bool] = everything,
     ) -> None:
         super().__init__(parameters, publish, wanted)
-        self._source = parameters.source
         self._reader = PeopleReader(parameters, self._log)
         self._forget()
         self.state = self._present_state()
@@ -141,12 +139,6 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         return [output for one in people for output in one.stale(silence, one.answered)]
 
     # Inputs.
-
-    def _stamp_of(self, source: str, message: Any) -> int:
-        if source == DETECTIONS and self._source == 'floats':
-            told = stamp_of_floats(message)
-            return self._info_stamp if told is None else told
-        return super()._stamp_of(source, message)
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name == DETECTIONS:

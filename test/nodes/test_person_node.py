@@ -137,6 +137,8 @@ def test_a_node_that_is_deactivated_leaves_the_images_to_the_others(together, sm
     info.publish(serialise(small_camera.info()))
     image.publish(serialise(small_camera.image(0)))
     spin_until(executor, lambda: nodes[left]._session.state.counts['received'] == 1, 'the image')
+    assert nodes[left]._connected
+    assert not owner._connected
 
 
 def run(*words, stop_at=''):
