@@ -1,4 +1,4 @@
-"""What is measured: `python -m benchmarks NAME`; docs/generate.py writes it into the pages."""
+"""What is measured: `python -m benchmarks NAME`; docs/generate.py writes it to results/."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Writes the generated parts of the pages.
+"""Writes the tables of parameters, and the results of benchmarks.
 
     python docs/generate.py NAME [NAME ...]
 
-The name of a node, such as filter_node, writes the table of its parameters. The name of a benchmark
-runs it and writes its results (minutes; soak ten, experts fifteen, tracking thirty or more). Such a
-part stands between `<!-- begin NAME -->` and `<!-- end -->`.
+The name of a node, such as filter_node, writes the table of its parameters, which stands in
+nodes.md between `<!-- begin NAME -->` and `<!-- end -->`. The name of a benchmark runs it and
+writes benchmarks/results/NAME.md (minutes; soak ten, experts fifteen, tracking thirty or more).
 """
 
 from __future__ import annotations
@@ -16,54 +16,33 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
 
-# Page of each part.
-PAGES = {
-    'filter_node': 'nodes.md',
-    'smoother_node': 'nodes.md',
-    'bme_node': 'nodes.md',
-    'keypoints_node': 'nodes.md',
-    'hri_node': 'nodes.md',
-    'people_adapter_node': 'nodes.md',
-    'people_node': 'nodes.md',
-    'bags': 'bags.md',
-    'nodes': 'nodes.md',
-    'live': 'nodes.md',
-    'soak': 'robustness.md',
-    'flips': 'flips.md',
-    'forecast': 'robots.md',
-    'keep_out': 'robots.md',
-    'kernels': 'likelihood.md',
-    'contour_noise': 'likelihood.md',
-    'depth': 'likelihood.md',
-    'distance': 'ground.md',
-    'error_model': 'tracking.md',
-    'gate': 'tracking.md',
-    'joint_errors': 'body.md',
-    'lifting': 'lifting.md',
-    'keypoint_noise': 'keypoints.md',
-    'motion_prior': 'motion_prior.md',
-    'people': 'people.md',
-    'hypotheses': 'sampling.md',
-    'kjs': 'sampling.md',
-    'real_video': 'real_video.md',
-    'smoothing': 'smoothing.md',
-    'experts': 'experts.md',
-    'absence': 'tracking.md',
-    'tracking': 'tracking.md',
-    'vertical': 'ground.md',
-    'votes': 'tracking.md',
-}
+NODES = (
+    'filter_node',
+    'smoother_node',
+    'bme_node',
+    'keypoints_node',
+    'hri_node',
+    'people_adapter_node',
+    'people_node',
+)
+RESULTS = DOCS.parent / 'benchmarks' / 'results'
 
 
 def main(argv: list[str]) -> int:
-    """Writes the parts that are named."""
-    if not argv or any(name not in PAGES for name in argv):
-        sys.stderr.write(f'generate.py: wanted some of {", ".join(PAGES)}\n')
+    """Writes what is named."""
+    from benchmarks import BENCHMARKS
+
+    if not argv or any(name not in (*NODES, *BENCHMARKS) for name in argv):
+        sys.stderr.write(f'generate.py: wanted some of {", ".join((*NODES, *BENCHMARKS))}\n')
         return 1
     for name in argv:
-        path, content = DOCS / PAGES[name], part(name)
-        # Read when it is written: a page may have been edited while a benchmark ran.
-        path.write_text(with_part(path.read_text('utf-8'), name, content), 'utf-8')
+        if name in NODES:
+            page = DOCS / 'nodes.md'
+            page.write_text(
+                with_part(page.read_text('utf-8'), name, parameter_table(name)), 'utf-8'
+            )
+        else:
+            (RESULTS / f'{name}.md').write_text(results(name), 'utf-8')
     return 0
 
 
@@ -81,17 +60,18 @@ def with_part(page: str, name: str, content: str) -> str:
     return f'{head}{begin}{content}\n{end}{tail}'
 
 
-def part(name: str) -> str:
-    """The content of a part."""
-    if name.endswith('_node'):
-        return parameter_table(name)
-    from benchmarks import benchmark
+def results(name: str) -> str:
+    """What a benchmark measures now, as a page."""
+    from benchmarks import BENCHMARKS, benchmark
 
     measuring = benchmark(name)
     from benchmarks.machine import on_machine
 
     result = measuring.measure()
-    return f'{measuring.as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
+    table, machine = measuring.as_text(result, markdown=True), on_machine(result['machine'])
+    what = BENCHMARKS[name]
+    head = f'# {name}: {what}\n\n```\npython -m benchmarks {name}\n```'
+    return f'{head}\n\n{table}\n\n{machine}\n'
 
 
 def parameter_table(node: str) -> str:
