@@ -2,9 +2,9 @@
 
     python docs/generate.py NAME [NAME ...]
 
-The name of a node, such as filter_node, writes the table of its parameters, which stands in
-nodes.md between `<!-- begin NAME -->` and `<!-- end -->`. The name of a benchmark runs it and
-writes benchmarks/results/NAME.md (minutes; soak ten, experts fifteen, tracking thirty or more).
+The name of a node, such as filter_node, writes the table of its parameters in NAME.md, between
+`<!-- begin NAME -->` and `<!-- end -->`. The name of a benchmark runs it and writes
+benchmarks/results/NAME.md (minutes; soak ten, experts fifteen, tracking thirty or more).
 """
 
 from __future__ import annotations
@@ -25,6 +25,15 @@ NODES = (
     'people_adapter_node',
     'people_node',
 )
+# When a new value of a parameter takes effect: mark of the parameter, and what the mark says.
+_EFFECTS = {
+    'at once': ('', ''),
+    'next track': ('†', 'with the next track'),
+    'next window': ('†', 'with the next window'),
+    'next configure': ('‡', 'at the next configuration'),
+    'at launch': ('§', 'only at launch'),
+}
+_MARKS = [*_EFFECTS.values()]
 RESULTS = DOCS.parent / 'benchmarks' / 'results'
 
 
@@ -37,7 +46,7 @@ def main(argv: list[str]) -> int:
         return 1
     for name in argv:
         if name in NODES:
-            page = DOCS / 'nodes.md'
+            page = DOCS / f'{name}.md'
             page.write_text(
                 with_part(page.read_text('utf-8'), name, parameter_table(name)), 'utf-8'
             )
@@ -75,7 +84,11 @@ def results(name: str) -> str:
 
 
 def parameter_table(node: str) -> str:
-    """All parameters of a node, as it declares them."""
+    """The parameters of a node, as it declares them.
+
+    Parameters that filter_node has with the same default, description and effect are named below
+    the table; of people_node, which has nearly all, their number is told.
+    """
     from hmt_ros.sessions.bme_parameters import BmeParameters
     from hmt_ros.sessions.declared_parameters import declared_parameters
     from hmt_ros.sessions.filter_parameters import FilterParameters
@@ -94,18 +107,33 @@ def parameter_table(node: str) -> str:
         'people_adapter_node': PeopleAdapterParameters(),
         'people_node': PeopleParameters(),
     }
-    lines = ['| parameter | default | range | takes effect | what |', '|---|---|---|---|---|']
-    for parameter in declared_parameters(settings[node]):
+    declared = declared_parameters(settings[node])
+    known = [] if node == 'filter_node' else declared_parameters(settings['filter_node'])
+    shared = [f'`{parameter.name}`' for parameter in declared if parameter in known]
+    declared = [parameter for parameter in declared if parameter not in known]
+    rest = ''
+    if shared:
+        named = f'{", ".join(shared[:-1])} and {shared[-1]}'
+        which = f'The other {len(shared)}' if node == 'people_node' else named
+        rest = f' {which} are as for [filter_node](filter_node.md#parameters).'
+    lines, same = ['| parameter | default, range | meaning |', '|---|---|---|'], ''
+    for parameter in declared:
         value = parameter.default
         text = str(value).lower() if isinstance(value, bool) else str(value)
         default = f'`{text}`' if value != () and text else 'empty'
-        bounds = ''
         if parameter.limits is not None:
             low, high = (_number(limit) for limit in parameter.limits)
-            bounds = f'{low} to {high}' if high else f'at least {low}'
-        cells = (f'`{parameter.name}`', default, bounds, parameter.effect, parameter.description)
-        lines.append(f'| {" | ".join(cells)} |')
-    return '\n'.join(lines)
+            default += f', {low} to {high}' if high else f', at least {low}'
+        mark, _ = _EFFECTS[parameter.effect]
+        description = parameter.description.replace('<', '&lt;')
+        head, _, tail = description.partition(': ')
+        if tail and tail == same:
+            description = f'{head}: as above.'
+        same = tail
+        lines.append(f'| `{parameter.name}`{mark} | {default} | {description} |')
+    used = dict.fromkeys(_EFFECTS[parameter.effect] for parameter in declared)
+    marks = ', '.join(f'{mark} {text}' for mark, text in sorted(used, key=_MARKS.index) if mark)
+    return '\n'.join([*lines, '', f'New values take effect at once; {marks}.{rest}'])
 
 
 def _number(limit: float) -> str:

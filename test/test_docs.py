@@ -202,15 +202,39 @@ def test_model_file_of_the_body_page(tmp_path):
     assert load_body(path).dimension == 32
 
 
+def page_of(node: str) -> str:
+    """The page of a node."""
+    return (ROOT / 'docs' / f'{node}.md').read_text('utf-8')
+
+
 def test_generated_parts_are_up_to_date():
     generate = runpy.run_path(str(ROOT / 'docs' / 'generate.py'))
-    page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
     for node in NODES:
+        page = page_of(node)
         fresh = generate['with_part'](page, node, generate['parameter_table'](node))
         assert page == fresh, f'run: python docs/generate.py {node}'
     assert set(generate['NODES']) == {*NODES}
     with pytest.raises(ValueError, match="no part 'weather'"):
         generate['with_part'](page, 'weather', '')
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_page_of_a_node_tells_of_every_parameter(node):
+    """In its table, or by reference to that of filter_node, where default and meaning are equal."""
+    described = {codes(row[0])[0]: row[1:] for row in rows(page_of(node), '## Parameters')}
+    known = [] if node == 'filter_node' else declared_parameters(FilterParameters())
+    declared = {p.name: p for p in declared_parameters(NODES[node][0])}
+    shared = {name for name, p in declared.items() if p in known}
+    assert set(described) == set(declared) - shared
+    for name, (default, _) in described.items():
+        value = declared[name].default
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        assert codes(default) == ([text] if value not in ('', ()) else []), name
+    after = page_of(node).partition('New values take effect at once')[2].partition('<!-- end')[0]
+    if node == 'people_node':
+        assert f'The other {len(shared)} are as for [filter_node]' in after
+    else:
+        assert set(codes(after)) == shared
 
 
 def test_every_benchmark_has_its_results():
@@ -231,9 +255,7 @@ def rows(page: str, heading: str) -> list[list[str]]:
 
 @pytest.mark.parametrize('node', NODES)
 def test_topics_of_a_node(node):
-    page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
-    section = page.partition(f'\n## {node}\n')[2].partition('\n## ')[0]
-    published = {row[0].strip('`'): row[1] for row in rows(section, '### Published topics')}
+    published = {row[0].strip('`'): row[1] for row in rows(page_of(node), '## Published topics')}
     wanted = {topic: kind.msgtype.replace('/msg/', '/') for topic, kind in NODES[node][1].items()}
     assert {topic: published[topic] for topic in wanted} == wanted
     assert set(published) - set(wanted) == {'/diagnostics', '~/handled'}

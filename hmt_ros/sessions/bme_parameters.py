@@ -41,19 +41,19 @@ class BmeParameters(CameraNodeParameters):
             where there is no background_file.
         stature: Height of the person, m; 0 selects that of the model.
         least_height: Minimum height of a silhouette that counts as a person, px.
-        predict_from: What poses are predicted from, 'silhouettes', 'keypoints' of a detector (topic
-            keypoints; no image is needed), or 'both', keypoints where they show a person and
-            silhouettes elsewhere; an image then waits for the keypoints of its stamp.
+        predict_from: Cue of the predictions: 'silhouettes', 'keypoints' of a detector (no image is
+            needed), or 'both'. With 'both' an image waits for its keypoints; silhouettes serve
+            where these show nobody.
         lifter: Experts that predict from keypoints, 'keypoints', which ships, or a file that
             learn-lifter wrote.
-        propagation: How a prediction depends on that of the image before, 'none', 'dynamics' by
-            rule (9) of the paper with the motion prior of the body, or 'experts' by rule (1) with a
-            model that was trained with --dynamics.
+        propagation: How a prediction depends on the one before: 'none', 'dynamics' or 'experts'.
+            Dynamics are rule (9) of the paper with the motion prior; experts are rule (1), trained
+            with --dynamics.
         longest_interval: Maximum interval without a person after which the images before are still
             taken into account, s.
         max_hypotheses: Maximum number of components of a prediction.
-        tracked_interval: Interval between two predictions while the filter tracks the person, by
-            its topic pose_mixture and the stamps of the images, s; 0 predicts from every image.
+        tracked_interval: Interval between two predictions while pose_mixture says that the filter
+            tracks the person, by the stamps of the images, s; 0 predicts from every image.
         background: settings of the background subtraction.
     """
 

@@ -138,8 +138,8 @@ class ImageNodeParameters(NodeParameters):
     Attributes:
         image_transport: Transport of the images, 'raw' (topic image) or 'compressed' (topic
             image/compressed).
-        queue_size: Maximum number of images that wait, together with all other inputs of their
-            stamps, while the node is late; the oldest are dropped, so that 1 leaves the newest.
+        queue_size: Maximum number of complete images that wait while the node is late; the oldest
+            are dropped, so that 1 leaves the newest.
     """
 
     queue_size: int = parameter_field(1, AT_ONCE, (1, 1000))
@@ -164,14 +164,12 @@ class CameraNodeParameters(ImageNodeParameters):
             (yolo_msgs/DetectionArray) or 'floats' (std_msgs/Float32MultiArray).
         scheme: Scheme whose order the keypoints of 'yolo' and 'floats' follow: 'coco17', 'halpe26',
             'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
-        person_id: Identity that the detector gives the person who is tracked; if empty, it is the
-            largest person at first, and then the one nearest to where this person was last.
-        keypoint_scheme: What the names of keypoints mean, 'auto' (recognised by the names),
-            'joints' (the joints of the body themselves), or a scheme of detectors: 'coco17',
-            'halpe26', 'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
-        input_timeout: Maximum time that an image waits for each other input of its stamp that is
-            used, measured by the stamps of later messages, s; an input of a later stamp ends the
-            wait for its kind at once.
+        person_id: Identity that the detector gives the tracked person; if empty, the largest person
+            at first, then the one nearest to where this person was.
+        keypoint_scheme: Scheme of the names of keypoints: 'auto' (recognised by the names),
+            'joints' (those of the body itself), or a value that the parameter scheme takes.
+        input_timeout: Maximum time that an image waits for each input of its stamp, by the stamps
+            of later messages, s. A later input of the kind ends the wait.
     """
 
     use_mask: bool = parameter_field(False, AT_ONCE)

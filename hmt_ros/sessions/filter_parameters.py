@@ -47,9 +47,9 @@ class FilterParameters(CameraNodeParameters):
     """All parameters of the filter node.
 
     Attributes:
-        subject_file: YAML file with the joints of the person in one image, which starts the track;
-            if empty, keypoints (with use_keypoints), a mask (with use_mask), a pose_prediction
-            (with use_predictions), or a mixture or a box (by ~/reset) starts it.
+        subject_file: YAML file with the joints of the person in one image, which starts the track.
+            If empty, keypoints, a mask or a prediction, as far as they are used, or ~/reset starts
+            it.
         background_file: Image of the empty scene as the camera sees it; if empty, the background is
             learned from the images before the track starts.
         body_model: Body model, 'human37', 'human34', 'human32' or a YAML file.
@@ -59,40 +59,37 @@ class FilterParameters(CameraNodeParameters):
         use_keypoints_3d: If true, positions of the same landmarks in space (topic keypoints_3d) are
             weak evidence of depth, and an image waits for those of its stamp.
         keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px; 0
-            selects the one that is learned, which depends on confidence and on the size of the
-            person.
+            selects the learned one, which depends on confidence and size of the person.
         use_depth: If true, depth images that are registered to the images (topic depth) are a
-            measurement, and an image waits for the depth image of its stamp.
-        use_predictions: If true, poses that bme_node predicts from the image start the track where
-            there is no subject_file, and are among the hypotheses; an image then waits for the
-            prediction of its stamp.
+            measurement; an image waits for that of its stamp.
+        use_predictions: If true, poses that bme_node predicts start a track without subject_file
+            and are hypotheses; an image waits for the prediction of its stamp.
         gravity: Direction of gravity in the camera optical frame, three numbers of any length;
             empty: the lines of the scene show it, if they can. A still camera that looks to the
             horizon has [0.0, 1.0, 0.0].
         camera_height: Height of the camera above the floor, m; 0 if unknown.
-        gravity_frame: Name of a frame with z up, such as odom or map; /tf and /tf_static then tell
-            the direction of gravity at every image, before gravity does; empty switches it off.
+        gravity_frame: Name of a frame with z up, such as odom or map; /tf then tells the direction
+            of gravity at every image and overrides gravity. Empty: off.
         floor_in_gravity_frame: If true, the floor is the plane z = 0 of gravity_frame, and /tf and
             /tf_static tell the height of the camera, before camera_height does.
-        fixed_frame: Name of a frame that stands still, such as odom; /tf and /tf_static then tell
-            how the camera moves, and the motion prior, gravity, floor and contacts are those of
-            that frame; empty switches it off.
+        fixed_frame: Name of a frame that stands still, such as odom; /tf then tells how the camera
+            moves. Motion prior, gravity, floor and contacts refer to that frame. Empty: off.
         publish_in_fixed_frame: If true, markers and person_pose are published in fixed_frame, whose
-            z axis must point up, and mixtures in the frame <fixed_frame>_optical, which has the
-            same origin and the axes of a camera; if false, in the frame of the camera.
+            z axis must point up, and mixtures in <fixed_frame>_optical. If false, all are in the
+            frame of the camera.
         overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
             overlay off.
         publish_tf: If true, the links of the point estimate are published on /tf, and
             camera_upright where gravity is known.
         frame_prefix: Prefix of the names of the links on /tf and in human_description, which tells
-            several persons apart; in a namespace the node takes the namespace for default.
+            persons apart; in a namespace its default is the namespace.
         keep_out_probability: Probability with which keep_out holds the person, of each part of the
             body and of the modes.
         stale_time: Time without an answered image after which keep_out says so and grows, s.
         forecast_rate: Number of poses a second on pose_forecast, at times after the images; 0
             switches it off.
-        forecast_horizon: Time after an image up to which it is the first to be predicted from, s;
-            it covers the time until the next image is answered.
+        forecast_horizon: Maximum time ahead of an image that is predicted from it, s; it covers the
+            time until the next image is answered.
         tracker: settings of the tracker.
         background: settings of the background subtraction.
     """

@@ -39,9 +39,9 @@ class HriParameters(NodeParameters):
             that shows a body.
         publish_links: If true, /tf tells the frames of all links of a body; if false, only that of
             the body itself, for use with robot_state_publisher.
-        added_joints: If true, the kinematic model has four joints that the reference of REP 155
-            does not have, with which it passes through all joint positions; if false, the trunk
-            only leans, and the shoulders have a fixed place on it.
+        added_joints: If true, the kinematic model has four joints beyond the reference of REP 155
+            and passes through all joint positions. If false, the trunk only leans, and the
+            shoulders are fixed to it.
         longest_silence: Time without a mixture after which a body is not tracked any more, by the
             stamps of camera_info, s.
         queue_size: Maximum number of mixtures that wait; when the node is late the oldest are

@@ -29,8 +29,8 @@ class PeopleParameters(FilterParameters):
         source: Type of the messages on the topic detections, 'people' (hmt_msgs/People2D), 'yolo'
             (yolo_msgs/DetectionArray), 'boxes' (vision_msgs/Detection2DArray) or 'floats'
             (std_msgs/Float32MultiArray).
-        max_people: Maximum number of people who are followed at the same time; of those who come at
-            the same time the largest in the image are taken.
+        max_people: Maximum number of people who are followed at the same time; of those who come
+            together the largest in the image are taken.
         use_keypoints: If true, keypoints of the detections are a measurement and start tracks; if
             false, only their boxes are used.
         frame_prefix: Prefix of the names of all frames on /tf and in human_description, before

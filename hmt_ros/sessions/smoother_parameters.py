@@ -77,15 +77,15 @@ class SmootherParameters(NodeParameters):
             one; if empty, that name.
         method: Smoothing method: 'paths', the most probable paths in closed form, or 'variational',
             refined as in VMS, which takes seconds for an image.
-        fixed_lag: Time by which a smoothed pose is older than the newest image, at any rate of
-            images, and a fifth of it more at most, s; 0 is filtering.
+        fixed_lag: Time by which a smoothed pose is older than the newest image, s, at any rate of
+            images. It may be a fifth more; 0 is filtering.
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
         max_trajectories: Maximum number of components of a mixture over trajectories.
         max_hypotheses: Maximum number of components of smoothed_pose_mixture.
         merge_distance: Distance, in standard deviations of what an image counts for, below which
             two modes of it are merged.
-        resting_feet: If true, feet that rest do not slide between images; the frame of the mixtures
-            has to stand still, as that of a camera that does, or fixed_frame of the filter.
+        resting_feet: If true, feet that rest do not slide between images. The frame of the mixtures
+            must then stand still (a still camera, or publish_in_fixed_frame of the filter).
         random_seed: Seed of all random numbers; the same mixtures give the same results.
         longest_interval: Interval between two mixtures above which a gap is reported, s; the
             dynamics bridge it.
