@@ -719,17 +719,16 @@ def test_policy_allows_what_the_nodes_do_and_nothing_else(started, name):
 @pytest.mark.ros
 @pytest.mark.parametrize('name', SETTINGS)
 def test_page_names_what_the_nodes_have(started, name):
-    """docs/nodes.md: subscribed, published, services, each with its type."""
+    """The page of the node: subscribed, published, services, each with its type."""
     started.wait_until_active(name)
     found = started.graph(name)
-    page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
-    section = page.partition(f'\n## {name}\n')[2].partition('\n## ')[0]
+    page = (ROOT / 'docs' / f'{name}.md').read_text('utf-8')
     for heading, key, elsewhere in (
-        ('### Subscribed topics', 'subscribe', ()),
-        ('### Published topics', 'publish', ('/rosout', '/parameter_events')),
-        ('### Services', 'reply', ()),
+        ('## Subscribed topics', 'subscribe', ()),
+        ('## Published topics', 'publish', ('/rosout', '/parameter_events')),
+        ('## Services', 'reply', ()),
     ):
-        text = re.split(r'\n#+ ', section.partition(f'\n{heading}\n')[2], maxsplit=1)[0]
+        text = re.split(r'\n#+ ', page.partition(f'\n{heading}\n')[2], maxsplit=1)[0]
         rows = re.findall(r'^\| `([^`]+)` \| ([\w/]+) \|', text, re.MULTILINE)
         listed = {started.resolved(name, topic): kind for topic, kind in rows}
         has = {

@@ -1,0 +1,177 @@
+"""The programs in examples/: what they tell, and that they run."""
+
+from __future__ import annotations
+
+import math
+import os
+import runpy
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from hmt_ros.body import load_body
+from hmt_ros.inference import GaussianMixture
+from msg_tools import BagWriter, RosbagsMessages
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message
+from msg_tools.messages.pose_mixtures import (
+    POSE_MIXTURE,
+    MixtureKind,
+    PoseMixture,
+    TrackState,
+    pose_mixture_message,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / 'examples'
+MESSAGES = RosbagsMessages()
+NAN = math.nan
+
+
+def example(name):
+    return runpy.run_path(str(EXAMPLES / f'{name}.py'))
+
+
+def test_the_readme_names_every_example():
+    text = (EXAMPLES / 'README.md').read_text('utf-8')
+    assert all(f'`{path.name}`' in text for path in EXAMPLES.glob('*.py'))
+
+
+def keep_out(state, away=1.5, unseen=0.0):
+    """Somebody `away` m from the origin, if anybody is known."""
+    some = state not in (KeepOutState.NOBODY, KeepOutState.UNKNOWN)
+    starts, ends = np.array([[-1.0, 0.0, away + 0.25]]), np.array([[1.0, 0.0, away + 0.25]])
+    none = np.empty((0, 3))
+    content = KeepOut(
+        10**9, 'eye', state, starts if some else none, ends if some else none,
+        np.full(int(some), 0.25), unseen=unseen if some else NAN,
+    )  # fmt: skip
+    return keep_out_message(MESSAGES, content)
+
+
+def test_a_robot_slows_down_and_stops_where_nothing_is_known():
+    told = example('keep_distance')
+    scale = told['speed_scale']
+    assert told['distance_to_capsules']([0, 0, 1], [0, 0, 1], [0.2]) == pytest.approx(0.8)
+    assert told['distance_to_capsules']([3, 4, 0], [3, -4, 0], [1]) == pytest.approx(2.0)
+    assert told['distance_to_capsules']([3, -4, 0], [3, 4, 0], [9]) == 0.0
+    for message, wanted in (
+        (keep_out(KeepOutState.NOBODY), 1.0),
+        (keep_out(KeepOutState.UNKNOWN), 0.0),
+        (keep_out(KeepOutState.STALE, 9.0), 0.0),
+        (keep_out(KeepOutState.TRACKING, 0.4), 0.0),
+        (keep_out(KeepOutState.TRACKING, 1.25), 0.5),
+        (keep_out(KeepOutState.TRACKING, 9.0), 1.0),
+        (keep_out(KeepOutState.LOST, 9.0, 0.4), 1.0),
+        (keep_out(KeepOutState.LOST, 9.0, 0.6), 0.0),
+    ):
+        constants = {f'STATE_{each.name}': int(each) for each in KeepOutState}
+        given = SimpleNamespace(
+            **constants,
+            **{x: getattr(message, x) for x in ('state', 'unseen', 'starts', 'ends', 'radii')},
+        )
+        assert scale(given) == pytest.approx(wanted)
+
+
+def mixture(*heights, weights=(0.75, 0.25)):
+    """Modes whose right wrist is so far above the head, m, with a deviation of 0.05 m each."""
+    names = ('head', 'left_wrist', 'right_wrist')
+    places = [SimpleNamespace(y=0.0), SimpleNamespace(y=0.9)]
+    modes = [
+        SimpleNamespace(
+            weight=weight,
+            joint_positions=[*places, SimpleNamespace(y=-height)],
+            joint_covariances_relative=[0.0025] * 27,
+        )
+        for height, weight in zip(heights, weights, strict=True)
+    ]
+    return SimpleNamespace(state=1, STATE_TRACKING=1, joint_names=list(names), components=modes)
+
+
+def test_a_raised_hand_is_as_probable_as_its_modes():
+    told = example('raised_hand')['raised_hand']
+    assert told(mixture(0.5, 0.5)) == pytest.approx(1.0, abs=1e-6)
+    assert told(mixture(0.5, -0.5)) == pytest.approx(0.75, abs=1e-6)
+    assert told(mixture(0.0, -0.5)) == pytest.approx(0.375, abs=1e-6)
+    # One deviation of the difference of two joints.
+    one = 0.05 * math.sqrt(2.0)
+    assert told(mixture(one, one)) == pytest.approx(0.8413, abs=1e-4)
+    nobody = mixture(0.5, 0.5)
+    nobody.state = 3
+    assert math.isnan(told(nobody))
+
+
+def test_the_height_of_a_joint_is_drawn(tmp_path):
+    body = load_body('human37')
+    poses = np.tile(body.prior_mean, (2, 1))
+    poses[:, 2] = 3.0
+    covariance = 1e-4 * np.eye(body.dimension)
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(5):
+            posterior = GaussianMixture([0.6, 0.4], poses, [covariance] * 2)
+            content = PoseMixture.of_body(
+                body, posterior, MixtureKind.POSTERIOR, 10**9 + k * 10**8, 'eye',
+                state=TrackState.TRACKING,
+            )  # fmt: skip
+            bag.write('pose_mixture', content.stamp_ns, pose_mixture_message(MESSAGES, content))
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / 'plot_joint.py', tmp_path / 'bag', '-o', tmp_path / 'a.png'],
+        env={**os.environ, 'PYTHONPATH': str(ROOT)}, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0
+    picture = cv2.imread(str(tmp_path / 'a.png'))
+    assert picture.shape == (480, 900, 3)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ('name', 'topic', 'wanted'),
+    [('keep_distance', 'speed_scale', 0.5), ('raised_hand', 'raised_hand', 0.0)],
+)
+def test_an_example_answers(name, topic, wanted):
+    import rclpy
+    from hmt_msgs.msg import KeepOut as KeepOutOfRos
+    from hmt_msgs.msg import PoseMixture as MixtureOfRos
+    from std_msgs.msg import Float64
+
+    body = load_body('human37')
+    pose = body.prior_mean[None].copy()
+    pose[:, 2] = 3.0
+    posterior = GaussianMixture([1.0], pose, [1e-4 * np.eye(body.dimension)])
+    content = PoseMixture.of_body(
+        body, posterior, MixtureKind.POSTERIOR, 10**9, 'eye', state=TrackState.TRACKING
+    )
+    given = {
+        'keep_distance': ('keep_out', KeepOutOfRos, keep_out(KeepOutState.TRACKING, 1.25)),
+        'raised_hand': ('pose_mixture', MixtureOfRos, pose_mixture_message(MESSAGES, content)),
+    }
+    source, kind, message = given[name]
+    assert POSE_MIXTURE.endswith('PoseMixture')
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node('robot', namespace='/lab', context=context)
+    executor = rclpy.executors.SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    heard: list[float] = []
+    node.create_subscription(Float64, topic, lambda x: heard.append(x.data), 10)
+    publisher = node.create_publisher(kind, source, 10)
+    process = subprocess.Popen(
+        [sys.executable, EXAMPLES / f'{name}.py', '--ros-args', '-r', '__ns:=/lab']
+    )
+    end = time.monotonic() + 60.0
+    data = serialise(message)
+    while time.monotonic() < end and not any(abs(x - wanted) < 1e-3 for x in heard):
+        publisher.publish(data)
+        executor.spin_once(timeout_sec=0.05)
+    process.terminate()
+    process.wait()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+    assert any(abs(x - wanted) < 1e-3 for x in heard), heard[-3:]
