@@ -108,7 +108,7 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         wanted: Callable[[str], bool] = everything,
     ) -> None:
         super().__init__(parameters, publish, wanted)
-        self._reader = PeopleReader(parameters, self._log)
+        self._reader, self._used = PeopleReader(parameters, self._log), parameters
         self._forget()
         self.state = self._present_state()
 
@@ -157,6 +157,10 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
             # From another view the scene is another.
             self._scene.see_from(CameraPose.of(pose.translation, pose.rotation), camera)
         p, found = self.parameters, []
+        if p is not self._used:
+            self._used = p
+            for person in self._people:
+                person.session.use(p)
         if detected is not None:
             found = self._reader.found(
                 detected, self.start.body, p.keypoint_scheme, use_keypoints=p.use_keypoints
