@@ -38,6 +38,8 @@ def main(argv: list[str]) -> int:
     from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
     info, images = read_messages(folder, [COMPRESSED], count)
+    # A clip that is shorter is shown back and forth.
+    indices = [index_back_and_forth(number, len(images)) for number in range(count)]
     stamps, frame = [time_ns(image.header.stamp) for image in images], images[0].header.frame_id
     step, calibration = round(1e9 / rate), serialise(info)
 
@@ -77,18 +79,19 @@ def main(argv: list[str]) -> int:
     first, shown = [content(number) for number in range(min(SWAYING, len(images)))], 0
     start, shift = time.monotonic_ns(), 0
     while not select.select([sys.stdin], [], [], 0)[0]:
-        number = int(index_back_and_forth(shown, len(first)))
+        number = index_back_and_forth(shown, len(first))
         publish(number, first[number], stamps[0] + shift, start + shift)
         shown, shift = shown + 1, shift + step
     sys.stdin.readline()
     start += shift
     print(shift, start, flush=True)
     # A picture is made before it is due, as by a driver.
-    late = [
-        publish(number, content(number), stamp + shift, start + stamp - stamps[0])
-        for number, stamp in enumerate(stamps)
-    ]
-    print(max(late), flush=True)
+    late = 0
+    for number, index in enumerate(indices):
+        after = stamps[index] - stamps[0] if number == index else number * step
+        published = publish(index, content(index), stamps[0] + shift + after, start + after)
+        late = max(late, published)
+    print(late, flush=True)
     sys.stdin.readline()
     return 0
 

@@ -9,7 +9,8 @@ newest image. The clip of the dancer is replayed offline too, where every image 
 
 Somebody who visits an empty scene: `keep_out` may not say NOBODY of an image with half of the
 joints or more in it, and has to say it from a second on after the last of them has left. Of several
-people `people` is what is listened to. --runs repeats each case and shows medians.
+people `people` is what is listened to. --runs repeats each case and shows medians; --minutes shows
+the clip back and forth for so long.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.clips import COMPRESSED, read_messages, table
+from benchmarks.clips import COMPRESSED, index_back_and_forth, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.live_clips import (
     LARGE,
@@ -71,6 +72,7 @@ TOLD, LISTED = 'keep_out', 'people'
 WITHOUT_GRAVITY = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
 START_SECONDS = 120.0  # until the person is tracked: the first images compile the kernels
 PATIENCE = 3.0  # s, after the last image
+GLANCE = 5.0  # s, between two looks at the memory
 OLDEST = 1.0  # s, of a smoothed pose
 # Of a visit: how long a state may be late, s, and the share of the joints that are somebody.
 LATE, SOMEBODY = 1.0, 0.5
@@ -154,14 +156,18 @@ def main(argv: list[str]) -> int:
     parser = benchmark_parser('live', __doc__, quick=f'{QUICK_SECONDS:g} seconds each')
     add_choice(parser, STAGES)
     parser.add_argument('--runs', type=int, default=1, help='runs of each case (1)')
+    parser.add_argument('--minutes', type=float, help='of each case (as long as the clip)')
     options = parser.parse_args(argv)
     seconds = QUICK_SECONDS if options.quick else SECONDS
-    result = measure(seconds, tuple(options.only), options.runs)
+    result = measure(seconds, tuple(options.only), options.runs, options.minutes)
     return show(result, as_text, as_json=options.json)
 
 
 def measure(
-    seconds: float = SECONDS, only: Sequence[str] = STAGES, runs: int = 1
+    seconds: float = SECONDS,
+    only: Sequence[str] = STAGES,
+    runs: int = 1,
+    minutes: float | None = None,
 ) -> dict[str, Any]:
     """What comes of the images of a camera that does not wait."""
     with tempfile.TemporaryDirectory(prefix='benchmark_live.') as name:
@@ -175,7 +181,7 @@ def measure(
             'upright': lambda: offline(dance(), folder / 'upright'),
         }
         for stage, case in CASES.items():
-            stages[stage] = partial(_tried, folder, stage, case, seconds, runs)
+            stages[stage] = partial(_tried, folder, stage, case, seconds, runs, minutes)
         return run_stages('live', stages, only)
 
 
@@ -205,14 +211,16 @@ def _errors(bag: Path, truth: Truth) -> dict[str, Any]:
     }
 
 
-def _tried(folder: Path, stage: str, case: Case, seconds: float, runs: int) -> Any:
+def _tried(
+    folder: Path, stage: str, case: Case, seconds: float, runs: int, minutes: float | None
+) -> Any:
     environ = {PROFILES: str(PROFILE)} if case.room else {}
     clip = make_clip(folder, case.clip, seconds)
     try:
         if case.detector:
             MediaPipePose().close()
         with changed_environment(environ):
-            found = [live(clip, folder / f'{stage} {k}', case) for k in range(runs)]
+            found = [live(clip, folder / f'{stage} {k}', case, minutes) for k in range(runs)]
     except (LiveNodeError, DetectorError) as error:
         return f'skipped: {error}'
     return median_of(found)
@@ -230,13 +238,22 @@ def median_of(found: Sequence[Any]) -> Any:
     return type(first)(np.median(found))
 
 
-def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
-    """The clip through the real nodes, at the rate of the camera.
+def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> dict[str, Any]:
+    """The clip through the real nodes, at the rate of the camera, once or back and forth.
 
     Raises:
         LiveNodeError: there is no ROS, or a node does not start or track.
     """
-    rate, stamps = rate_of(case.clip), _stamps(clip)
+    rate, own = rate_of(case.clip), _stamps(clip)
+    planned = len(own) if minutes is None else round(60 * minutes * rate)
+    indices = [index_back_and_forth(number, len(own)) for number in range(planned)]
+    step = round(1e9 / rate)
+    # As `benchmarks.camera` has them; which image of the clip each is.
+    shows = {
+        own[0] + (own[i] - own[0] if i == k else k * step): own[i] for k, i in enumerate(indices)
+    }
+    stamps = sorted(shows)
+    memories: list[float] = []
     with ExitStack() as opened:
         player = Player(opened)
         nodes = _nodes(player, opened, clip, case)
@@ -260,7 +277,10 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
         before = [_cpu_seconds(node) for node in processes]
         at_first = sum(_memory(node) for node in processes)
         received = _received(player, nodes[0])
-        camera.spin(player, camera.ended, len(stamps) / rate + PATIENCE)
+        camera.spin(
+            player, camera.ended, len(stamps) / rate + PATIENCE,
+            every=lambda: memories.append(sum(_memory(node) for node in processes)),
+        )  # fmt: skip
         spent = [_cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)]
         memory = sum(_memory(node) for node in processes)
         end = time.monotonic() + PATIENCE
@@ -297,6 +317,8 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
         ],
         'memory_mb': memory,
         'grown_mb': memory - at_first,
+        # Of the second half, by when everything has happened once.
+        'grown_later_mb': memories[-1] - memories[len(memories) // 2] if memories else 0.0,
         'cpu_s': dict(zip((node.name for node in processes), spent, strict=True)),
         'cpu_ms_per_pose': 1e3 * sum(spent) / count,
         'wanted': f'95 % of the smoothed poses at most {OLDEST:g} s old',
@@ -317,10 +339,14 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
                 bag.write_serialised(topic, stamp, _shifted(data, stamp))
     states = [deserialise(data, POSE_MIXTURE).state for data in by_stamp[POSTERIOR].values()]
     # Somebody is in view all the time.
+    truth = read_truth(clip / 'truth.npz')
+    truth = replace(
+        truth, joints={stamp: truth.joints[own] for stamp, own in shows.items()}, ground={}
+    )
     return result | {
         'nobody': states.count(TrackState.NOBODY),
         'track_lost': states.count(TrackState.LOST),
-        **_errors(target, read_truth(clip / 'truth.npz')),
+        **_errors(target, truth),
     }
 
 
@@ -477,15 +503,24 @@ class _Camera:
         self.latest_ns = int(self._process.stdout.readline())
         return True
 
-    def spin(self, player: Player, done: Any, seconds: float) -> None:
-        """Listens until something is done.
+    def spin(
+        self,
+        player: Player,
+        done: Callable[[], bool],
+        seconds: float,
+        every: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Listens until something is done; does something else every few seconds.
 
         Raises:
             LiveNodeError: it takes too long, or the camera has ended.
         """
-        end = time.monotonic() + seconds
+        end, then = time.monotonic() + seconds, time.monotonic() + GLANCE
         while not done():
             player.executor.spin_once(timeout_sec=0.1)
+            if time.monotonic() > then:
+                then += GLANCE
+                every()
             if self._process.poll() is not None:
                 raise LiveNodeError(f'the camera ended with code {self._process.returncode}')
             if time.monotonic() > end:
