@@ -161,9 +161,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """
         return {}
 
-    def _finish(self, session: AnySession) -> None:
-        """Publishes what is left when the node does not listen any more."""
-
     # What all nodes do.
 
     def start(self) -> None:
@@ -260,7 +257,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._unsubscribe()
         self.stop()
         if self._session is not None:
-            self._finish(self._session)
+            self._tell(self._session.finish())
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
