@@ -202,6 +202,7 @@ setup(
             'smoother_node = hmt_ros.nodes.smoother_node:main',
             'bme_node = hmt_ros.nodes.bme_node:main',
             'person_node = hmt_ros.nodes.person_node:main',
+            'camera_node = hmt_ros.nodes.camera_node:main',
             'people_node = hmt_ros.nodes.people_node:main',
             'track-video = hmt_ros.app.track_video:main',
             'import-video = hmt_ros.app.import_video.command:main',

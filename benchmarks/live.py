@@ -1,10 +1,16 @@
-"""live: filter, smoother and BME at the images of a camera that does not wait for them.
+"""live: the nodes at the images of a camera that does not wait for them.
 
-A clip of a dancer with known truth is rendered, and replayed offline, where every image is used.
-Keypoints are the true joints with the noise of a detector, behind each image.
-Then a camera, in a process of its own, shows it to the real nodes at its rate. Latency is
-the time from when an image is due at the camera to the arrival of its pose_mixture in another
-process; age is how much older a smoothed pose is, when it arrives, than the newest image.
+A clip with known truth is rendered (`benchmarks.live_clips`). A camera, in a process of its own,
+shows it to the real nodes at its rate, on the same machine; a third process listens. Keypoints are
+the true joints with the noise of a detector, behind each image, or those of MediaPipe, which then
+computes beside the nodes. Latency is the time from when an image is due at the camera to the
+arrival of its pose_mixture; age is how much older a smoothed pose is, when it arrives, than the
+newest image. The clip of the dancer is replayed offline too, where every image is used.
+
+Somebody who visits an empty scene: `keep_out` may not say NOBODY of an image with half of the
+joints or more in it, and has to say it from a second on after the last of them has left. Of several
+people `people` is what is listened to. --runs repeats each case and shows medians; --minutes shows
+the clip back and forth for so long.
 """
 
 from __future__ import annotations
@@ -15,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,39 +30,53 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.clips import COMPRESSED, read_messages, table
+from benchmarks.clips import COMPRESSED, index_back_and_forth, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
+from benchmarks.live_clips import (
+    LARGE,
+    MOTION,
+    PEOPLE,
+    VISIT,
+    make_clip,
+    noisy_keypoints,
+    rate_of,
+    run,
+    shares_in_view,
+)
 from benchmarks.nodes import PROFILE
-from hmt_ros.app import make_bag
 from hmt_ros.app.bag_scores import score_bag
 from hmt_ros.app.replay import command as replay
 from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
 from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER
 from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment, environment
 from hmt_ros.app.truth import read_truth
+from hmt_ros.detectors.mediapipe_pose import DetectorError, MediaPipePose
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS
+from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader, BagWriter
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.headers import stamp_in
+from msg_tools.messages.detections import PEOPLE_2D
+from msg_tools.messages.headers import stamp_in, time_ns
+from msg_tools.messages.keep_out import KEEP_OUT, KeepOutState
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, TrackState
 
-RATE, SLOWER = 30.0, 15.0  # images a second
-# The slower camera, and its clip.
-LARGE = ('--size', '1280x720', '--fps', f'{SLOWER:g}')
 SECONDS, QUICK_SECONDS = 16.0, 3.0
-MOTION = 'dance'
 POSTERIOR, SMOOTHED = 'pose_mixture', 'smoothed_pose_mixture'
+TOLD, LISTED = 'keep_out', 'people'
 # Options of a replay that leaves out the gravity of the bag.
 WITHOUT_GRAVITY = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
 START_SECONDS = 120.0  # until the person is tracked: the first images compile the kernels
 PATIENCE = 3.0  # s, after the last image
+GLANCE = 5.0  # s, between two looks at the memory
 OLDEST = 1.0  # s, of a smoothed pose
-# Standard deviation of keypoints, as a share of the height of the person in the image.
-NOISE = 0.01
-PERSON, TRACKED_INTERVAL = 'person_node', 0.2
+# Of a visit: how long a state may be late, s, and the share of the joints that are somebody.
+LATE, SOMEBODY = 1.0, 0.5
+PERSON, PEOPLE_NODE, DETECTOR = 'person_node', 'people_node', 'keypoints_node'
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
@@ -66,24 +86,32 @@ class Case:
 
     Attributes:
         what: in words.
+        clip: that is shown, see `benchmarks.live_clips`.
         transport: of the images.
         room: whether Fast DDS has room for raw images.
         keypoints: whether there are any; then there is no BME.
+        detector: whether MediaPipe finds them, on the same machine.
         together: whether the nodes run in one process.
         smoothed: whether there is a smoother.
-        large: whether it is a slower camera of more pixels, see `LARGE`.
         filter, bme: parameters that are not the usual ones.
     """
 
     what: str
+    clip: str = 'dance'
     transport: str = 'raw'
     room: bool = True
     keypoints: bool = False
+    detector: bool = False
     together: bool = False
     smoothed: bool = True
-    large: bool = False
     filter: Mapping[str, Any] = field(default_factory=dict)
     bme: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def people(self) -> int:
+        """Number of people, where `people_node` follows them; else 0."""
+        kind, _, number = self.clip.partition(' ')
+        return int(number) if kind == PEOPLE else 0
 
 
 CASES = {
@@ -101,8 +129,23 @@ CASES = {
     'together, keypoints, filter': Case(
         'one process: the same, filter alone', keypoints=True, together=True, smoothed=False
     ),
-    'large': Case('processes apart: 1280x720, 15 images a second', large=True),
+    'together, detector': Case(
+        'one process: images and MediaPipe', keypoints=True, detector=True, together=True
+    ),
+    'large': Case('processes apart: 1280x720, 15 images a second', clip=LARGE),
     'usual DDS': Case('without fastdds.xml', room=False),
+    'visit': Case('one process: images', clip=VISIT, together=True),
+    'visit, keypoints': Case(
+        'one process: images and MediaPipe',
+        clip=VISIT,
+        keypoints=True,
+        detector=True,
+        together=True,
+    ),
+    **{
+        f'people {count}': Case(f'people_node: {count}', clip=f'{PEOPLE} {count}', keypoints=True)
+        for count in (1, 2, 4)
+    },
 }
 OFFLINE = {'offline': 'offline, every image', 'upright': 'offline, gravity given'}
 STAGES = (*OFFLINE, *CASES)
@@ -112,40 +155,41 @@ def main(argv: list[str]) -> int:
     """Runs the benchmark."""
     parser = benchmark_parser('live', __doc__, quick=f'{QUICK_SECONDS:g} seconds each')
     add_choice(parser, STAGES)
+    parser.add_argument('--runs', type=int, default=1, help='runs of each case (1)')
+    parser.add_argument('--minutes', type=float, help='of each case (as long as the clip)')
     options = parser.parse_args(argv)
-    result = measure(QUICK_SECONDS if options.quick else SECONDS, tuple(options.only))
+    seconds = QUICK_SECONDS if options.quick else SECONDS
+    result = measure(seconds, tuple(options.only), options.runs, options.minutes)
     return show(result, as_text, as_json=options.json)
 
 
-def measure(seconds: float = SECONDS, only: tuple[str, ...] = STAGES) -> dict[str, Any]:
+def measure(
+    seconds: float = SECONDS,
+    only: Sequence[str] = STAGES,
+    runs: int = 1,
+    minutes: float | None = None,
+) -> dict[str, Any]:
     """What comes of the images of a camera that does not wait."""
     with tempfile.TemporaryDirectory(prefix='benchmark_live.') as name:
         folder = Path(name)
-        clip = folder / 'clip'
-        usual = [MOTION, '--duration', f'{seconds:g}', '--quiet', '-o']
-        _run(make_bag.main, [*usual, str(clip)])
-        if any(stage in only for stage, case in CASES.items() if case.large):
-            _run(make_bag.main, [*usual, str(folder / 'large'), *LARGE])
+
+        def dance() -> Path:
+            return make_clip(folder, MOTION, seconds)
+
         stages = {
-            'offline': lambda: offline(clip, folder / 'offline', *WITHOUT_GRAVITY),
-            'upright': lambda: offline(clip, folder / 'upright'),
+            'offline': lambda: offline(dance(), folder / 'offline', *WITHOUT_GRAVITY),
+            'upright': lambda: offline(dance(), folder / 'upright'),
         }
         for stage, case in CASES.items():
-            shown = folder / 'large' if case.large else clip
-            stages[stage] = partial(_tried, shown, folder / f'{stage} of nodes', case)
+            stages[stage] = partial(_tried, folder, stage, case, seconds, runs, minutes)
         return run_stages('live', stages, only)
-
-
-def _run(command: Any, arguments: list[str]) -> None:
-    if code := command(arguments):
-        raise ValueError(f'{" ".join(arguments)} ended with {code}')
 
 
 def offline(clip: Path, target: Path, *given: str) -> dict[str, Any]:
     """The clip in lock step: every image, by the parameters of the nodes; its bag tells gravity."""
     options = ['--background', str(clip / 'background.png'), '--quiet', *given]
     start = time.perf_counter()
-    _run(replay.main, [str(clip), '-o', str(target), *options])
+    run(replay.main, [str(clip), '-o', str(target), *options])
     truth = read_truth(clip / 'truth.npz')
     return {
         'images': len(truth.joints),
@@ -167,22 +211,49 @@ def _errors(bag: Path, truth: Truth) -> dict[str, Any]:
     }
 
 
-def _tried(clip: Path, target: Path, case: Case) -> Any:
+def _tried(
+    folder: Path, stage: str, case: Case, seconds: float, runs: int, minutes: float | None
+) -> Any:
     environ = {PROFILES: str(PROFILE)} if case.room else {}
-    with changed_environment(environ):
-        try:
-            return live(clip, target, case)
-        except LiveNodeError as error:
-            return f'skipped: {error}'
+    clip = make_clip(folder, case.clip, seconds)
+    try:
+        if case.detector:
+            MediaPipePose().close()
+        with changed_environment(environ):
+            found = [live(clip, folder / f'{stage} {k}', case, minutes) for k in range(runs)]
+    except (LiveNodeError, DetectorError) as error:
+        return f'skipped: {error}'
+    return median_of(found)
 
 
-def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
-    """The clip through the real nodes, at the rate of the camera.
+def median_of(found: Sequence[Any]) -> Any:
+    """Medians of the numbers of several runs, in the structure of each."""
+    first = found[0]
+    if isinstance(first, dict):
+        return {key: median_of([each[key] for each in found if key in each]) for key in first}
+    if isinstance(first, list):
+        return [median_of(each) for each in zip(*found, strict=True)]
+    if isinstance(first, bool) or not isinstance(first, int | float):
+        return first
+    return type(first)(np.median(found))
+
+
+def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> dict[str, Any]:
+    """The clip through the real nodes, at the rate of the camera, once or back and forth.
 
     Raises:
         LiveNodeError: there is no ROS, or a node does not start or track.
     """
-    truth, rate = read_truth(clip / 'truth.npz'), SLOWER if case.large else RATE
+    rate, own = rate_of(case.clip), _stamps(clip)
+    planned = len(own) if minutes is None else round(60 * minutes * rate)
+    indices = [index_back_and_forth(number, len(own)) for number in range(planned)]
+    step = round(1e9 / rate)
+    # As `benchmarks.camera` has them; which image of the clip each is.
+    shows = {
+        own[0] + (own[i] - own[0] if i == k else k * step): own[i] for k, i in enumerate(indices)
+    }
+    stamps = sorted(shows)
+    memories: list[float] = []
     with ExitStack() as opened:
         player = Player(opened)
         nodes = _nodes(player, opened, clip, case)
@@ -190,53 +261,52 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
             node.wait_until_active()
         processes = list({node.process.pid: node for node in nodes}.values())
         arrived = _listen(player)
-        told = [str(_detections(clip, truth))] if case.keypoints else []
+        more = []
+        if case.people:
+            more = [str(clip), DETECTIONS]
+        elif case.keypoints and not case.detector:
+            more = [str(noisy_keypoints(clip)), KEYPOINTS]
         camera = _Camera(
-            opened, player.domain, clip, case.transport, len(truth.joints), told,
+            opened, player.domain, clip, case.transport, len(stamps), more,
             subscribers=1 if case.keypoints or case.together else 2, rate=rate,
         )  # fmt: skip
         # The kernels are compiled and the track has started before the clip moves.
-        camera.spin(player, lambda: len(arrived[POSTERIOR]) > 2, START_SECONDS)
+        topic = _topic_of(case)
+        camera.spin(player, lambda: len(arrived[topic]) > 2, START_SECONDS)
         shift, start_ns = camera.begin(player)
         before = [_cpu_seconds(node) for node in processes]
         at_first = sum(_memory(node) for node in processes)
-        received = _received(player)
-        camera.spin(player, camera.ended, len(truth.joints) / rate + PATIENCE)
+        received = _received(player, nodes[0])
+        camera.spin(
+            player, camera.ended, len(stamps) / rate + PATIENCE,
+            every=lambda: memories.append(sum(_memory(node) for node in processes)),
+        )  # fmt: skip
         spent = [_cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)]
         memory = sum(_memory(node) for node in processes)
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             player.executor.spin_once(timeout_sec=0.1)
-        received = _received(player) - received
-    first = min(truth.joints) + shift
-    last = max(truth.joints) + shift
+        received = _received(player, nodes[0]) - received
+    first, last = stamps[0] + shift, stamps[-1] + shift
     shown = {
         topic: [(stamp, data, when) for stamp, data, when in messages if first <= stamp <= last]
         for topic, messages in arrived.items()
     }
-    with BagWriter(target) as bag:
-        for topic, messages in shown.items():
-            bag.add_topic(topic, POSE_MIXTURE)
-            for stamp, data, _ in messages:
-                bag.write_serialised(topic, stamp - shift, _shifted(data, stamp - shift))
     offset = start_ns - first
-    latencies = [1e-6 * (when - stamp - offset) for stamp, _, when in shown[POSTERIOR]]
+    latencies = [1e-6 * (when - stamp - offset) for stamp, _, when in shown[topic]]
     # The newest image is the one that was due last.
     ages = [1e-9 * min(when - stamp - offset, last - stamp) for stamp, _, when in shown[SMOOTHED]]
     count = len(latencies)
-    states = [deserialise(data, POSE_MIXTURE).state for _, data, _ in shown[POSTERIOR]]
-    if not count or (case.smoothed and not ages):
+    if not count or (case.smoothed and not case.people and not ages):
         raise LiveNodeError(f'{count} images of the clip were answered, {len(ages)} smoothed')
-    return {
-        'images': len(truth.joints),
-        'lost': max(len(truth.joints) - received, 0),
+    result = {
+        'images': len(stamps),
+        'lost': max(len(stamps) - received, 0),
         'answered': count,
-        # Somebody is in view all the time.
-        'nobody': states.count(TrackState.NOBODY),
-        'track_lost': states.count(TrackState.LOST),
         'camera_late_ms': 1e-6 * camera.latest_ns,
         'latency_ms': {
-            what: float(np.percentile(latencies, p)) for what, p in (('median', 50), ('95 %', 95))
+            what: float(np.percentile(latencies, p))
+            for what, p in (('median', 50), ('95 %', 95), ('99 %', 99))
         },
         'age_s': {
             what: float(np.percentile(ages, p)) if ages else math.nan
@@ -247,29 +317,116 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
         ],
         'memory_mb': memory,
         'grown_mb': memory - at_first,
+        # Of the second half, by when everything has happened once.
+        'grown_later_mb': memories[-1] - memories[len(memories) // 2] if memories else 0.0,
         'cpu_s': dict(zip((node.name for node in processes), spent, strict=True)),
         'cpu_ms_per_pose': 1e3 * sum(spent) / count,
         'wanted': f'95 % of the smoothed poses at most {OLDEST:g} s old',
         'met': bool(ages) and float(np.percentile(ages, 95)) <= OLDEST,
+    }
+    by_stamp = {
+        topic: {stamp - shift: data for stamp, data, _ in messages}
+        for topic, messages in shown.items()
+    }
+    if case.people:
+        return result | _listed(by_stamp[LISTED])
+    if case.clip == VISIT:
+        return result | _told_of_a_visit(by_stamp[TOLD], clip, rate)
+    with BagWriter(target) as bag:
+        for topic in (POSTERIOR, SMOOTHED):
+            bag.add_topic(topic, POSE_MIXTURE)
+            for stamp, data in by_stamp[topic].items():
+                bag.write_serialised(topic, stamp, _shifted(data, stamp))
+    states = [deserialise(data, POSE_MIXTURE).state for data in by_stamp[POSTERIOR].values()]
+    # Somebody is in view all the time.
+    truth = read_truth(clip / 'truth.npz')
+    truth = replace(
+        truth, joints={stamp: truth.joints[own] for stamp, own in shows.items()}, ground={}
+    )
+    return result | {
+        'nobody': states.count(TrackState.NOBODY),
+        'track_lost': states.count(TrackState.LOST),
         **_errors(target, truth),
     }
 
 
+def _topic_of(case: Case) -> str:
+    """What answers an image."""
+    if case.people:
+        return LISTED
+    return TOLD if case.clip == VISIT else POSTERIOR
+
+
+def _stamps(clip: Path) -> list[int]:
+    _, images = read_messages(clip, [COMPRESSED])
+    return [time_ns(image.header.stamp) for image in images]
+
+
+def _listed(messages: Mapping[int, bytes]) -> dict[str, Any]:
+    """Of how many people the answers tell, on average."""
+    counts = [len(deserialise(data, PEOPLE_2D).ids) for data in messages.values()]
+    return {'people': float(np.mean(counts))}
+
+
+def _told_of_a_visit(messages: Mapping[int, bytes], clip: Path, rate: float) -> dict[str, Any]:
+    """Whether the states of the answers are those of the images."""
+    shares = shares_in_view(clip)
+    stamps = sorted(shares)
+    late = round(LATE * rate)
+    states = {
+        stamp: KeepOutState(int(deserialise(data, KEEP_OUT).state))
+        for stamp, data in messages.items()
+    }
+    # What has been so for as long as an answer may be late.
+    lasting = {
+        stamp: [shares[each] for each in stamps[max(k - late, 0) : k + 1]]
+        for k, stamp in enumerate(stamps)
+    }
+    whole = [states[x] for x in states if min(lasting[x]) == 1.0]
+    # Before anybody has come the state is UNKNOWN.
+    came = min(stamp for stamp in stamps if shares[stamp] > 0.0)
+    away = [states[x] for x in states if x > came and max(lasting[x]) == 0.0]
+    return {
+        'nobody': sum(
+            state is KeepOutState.NOBODY and shares[stamp] >= SOMEBODY
+            for stamp, state in states.items()
+        ),
+        'in_view': len(whole),
+        'in_view_tracked': whole.count(KeepOutState.TRACKING),
+        'away': len(away),
+        'away_not_nobody': len(away) - away.count(KeepOutState.NOBODY),
+    }
+
+
 def _nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> list[LiveNode]:
-    """The nodes as the launch file starts them."""
+    """The nodes as the launch file starts them; the one that tracks is the first."""
+    from hmt_ros.nodes.person_node import used_of_each_other
+
     images = {
         'image_transport': case.transport,
         'background_file': str(clip / 'background.png'),
     }
-    used = {'use_keypoints': True} if case.keypoints else {'use_predictions': True}
-    chosen: dict[str, Any] = {
-        FILTER: replace(FilterParameters(), **images, **used, **case.filter),
-    }
-    if case.smoothed:
-        chosen[SMOOTHER] = SmootherParameters()
-    if not case.keypoints:
-        interval = {'tracked_interval': TRACKED_INTERVAL}
-        chosen[BME] = replace(BmeParameters(), **{**images, **interval, **case.bme})
+    detector = {DETECTOR: KeypointsParameters(image_transport=case.transport)}
+    names = (
+        FILTER,
+        *((SMOOTHER,) if case.smoothed else ()),
+        DETECTOR if case.detector else KEYPOINTS if case.keypoints else BME,
+    )
+    used = used_of_each_other(names)
+    chosen: dict[str, Any]
+    if case.people:
+        chosen = {PEOPLE_NODE: replace(PeopleParameters(), **images)}
+    else:
+        given = {'use_keypoints': True} if case.keypoints else {}
+        chosen = {
+            FILTER: replace(FilterParameters(), **images, **used[FILTER] | given | case.filter)
+        }
+        if case.smoothed:
+            chosen[SMOOTHER] = SmootherParameters()
+        if case.detector:
+            chosen |= detector
+        elif not case.keypoints:
+            chosen[BME] = replace(BmeParameters(), **images | used[BME] | case.bme)
     process = None
     if case.together:
         process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', tuple(chosen))
@@ -284,25 +441,12 @@ def _nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> list[Li
     return nodes
 
 
-def _detections(clip: Path, truth: Truth) -> Path:
-    """A file of keypoints of each image, as `benchmarks.camera` reads it."""
-    info, _ = read_messages(clip, [COMPRESSED], 1)
-    camera = np.asarray(info.k).reshape(3, 3)
-    joints = np.array([truth.joints[stamp] for stamp in sorted(truth.joints)])
-    known = np.isfinite(joints).all((0, 2))
-    seen = joints[:, known] @ camera.T
-    pixels = seen[..., :2] / seen[..., 2:]
-    height = np.ptp(pixels[..., 1], axis=1)[:, None, None]
-    pixels += NOISE * height * np.random.default_rng(0).standard_normal(pixels.shape)
-    names = np.array(truth.joint_names)[known]
-    target = clip / 'keypoints.npz'
-    np.savez(target, names=names, pixels=pixels)
-    return target
-
-
 def _listen(player: Player) -> dict[str, list[tuple[int, bytes, int]]]:
-    """Lists that fill with stamp, bytes and time of arrival of the mixtures, by topic."""
-    arrived: dict[str, list[tuple[int, bytes, int]]] = {POSTERIOR: [], SMOOTHED: []}
+    """Lists that fill with stamp, bytes and time of arrival of what arrives, by topic."""
+    from hmt_msgs.msg import KeepOut, People2D, PoseMixture
+
+    kinds = {POSTERIOR: PoseMixture, SMOOTHED: PoseMixture, TOLD: KeepOut, LISTED: People2D}
+    arrived: dict[str, list[tuple[int, bytes, int]]] = {topic: [] for topic in kinds}
 
     def into(messages: list[tuple[int, bytes, int]], data: bytes) -> None:
         messages.append((stamp_in(data), data, time.monotonic_ns()))
@@ -312,9 +456,7 @@ def _listen(player: Player) -> dict[str, list[tuple[int, bytes, int]]]:
         def heard(data: bytes, messages: Any = messages) -> None:
             into(messages, data)
 
-        player.node.create_subscription(
-            player.classes[POSE_MIXTURE], topic, heard, player.reliable, raw=True
-        )
+        player.node.create_subscription(kinds[topic], topic, heard, player.reliable, raw=True)
     return arrived
 
 
@@ -361,15 +503,24 @@ class _Camera:
         self.latest_ns = int(self._process.stdout.readline())
         return True
 
-    def spin(self, player: Player, done: Any, seconds: float) -> None:
-        """Listens until something is done.
+    def spin(
+        self,
+        player: Player,
+        done: Callable[[], bool],
+        seconds: float,
+        every: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Listens until something is done; does something else every few seconds.
 
         Raises:
             LiveNodeError: it takes too long, or the camera has ended.
         """
-        end = time.monotonic() + seconds
+        end, then = time.monotonic() + seconds, time.monotonic() + GLANCE
         while not done():
             player.executor.spin_once(timeout_sec=0.1)
+            if time.monotonic() > then:
+                then += GLANCE
+                every()
             if self._process.poll() is not None:
                 raise LiveNodeError(f'the camera ended with code {self._process.returncode}')
             if time.monotonic() > end:
@@ -381,9 +532,9 @@ class _Camera:
         self._process.stdin.flush()
 
 
-def _received(player: Player) -> int:
-    """Images that have reached the filter, by its diagnostics, which come once a second."""
-    return int(player.diagnostics.get(FILTER, {}).get('images received', '0'))
+def _received(player: Player, node: LiveNode) -> int:
+    """Images that have reached a node, by its diagnostics, which come once a second."""
+    return int(player.diagnostics.get(node.name, {}).get('images received', '0'))
 
 
 def _cpu_seconds(node: LiveNode) -> float:
@@ -411,38 +562,85 @@ def _ignored(topic: str, stamp: int, data: bytes) -> None:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Tables for people: one person in view, a visit, several people."""
+    found = {stage: result[stage] for stage in STAGES if stage in result}
+    visits = {stage: found.pop(stage) for stage in list(found) if _clip_of(stage) == VISIT}
+    crowds = {
+        stage: found.pop(stage) for stage in list(found) if _clip_of(stage).startswith(PEOPLE)
+    }
+    tables = []
+    if found:
+        tables.append(_table_of_one(found, markdown=markdown))
+    if visits:
+        columns = {
+            'false NOBODY': lambda x: str(x['nobody']),
+            'TRACKING, whole in view': lambda x: f'{x["in_view_tracked"]} of {x["in_view"]}',
+            'not NOBODY, left': lambda x: f'{x["away_not_nobody"]} of {x["away"]}',
+        }
+        tables.append(_short_table('a visit', visits, columns, markdown=markdown))
+    if crowds:
+        columns = {'people told of': lambda x: f'{x["people"]:.2f}'}
+        tables.append(_short_table('people', crowds, columns, markdown=markdown))
+    return '\n\n'.join(tables)
+
+
+def _clip_of(stage: str) -> str:
+    return CASES[stage].clip if stage in CASES else MOTION
+
+
+def _timing(found: dict[str, Any]) -> list[str]:
+    latency = found['latency_ms']
+    return [
+        str(found['images']), str(found['lost']),
+        f'{100 * found["answered"] / found["images"]:.0f} %',
+        *(f'{latency[x]:.0f} ms' for x in ('median', '95 %', '99 %')),
+        f'{found["cpu_ms_per_pose"]:.0f} ms', f'{found["memory_mb"]:.0f} MB',
+    ]  # fmt: skip
+
+
+TIMING = ['images', 'lost', 'answered', 'latency, median', '95 %', '99 %', 'CPU per pose', 'memory']
+
+
+def _short_table(
+    what: str,
+    found: Mapping[str, Any],
+    columns: Mapping[str, Callable[[dict[str, Any]], str]],
+    *,
+    markdown: bool,
+) -> str:
+    rows = [[what, *TIMING, *columns]]
+    for stage, one in found.items():
+        if isinstance(one, str):
+            rows.append([CASES[stage].what, one, *[''] * (len(rows[0]) - 2)])
+        else:
+            rows.append([CASES[stage].what, *_timing(one), *(x(one) for x in columns.values())])
+    return table(rows, markdown=markdown)
+
+
+def _table_of_one(found: Mapping[str, Any], *, markdown: bool) -> str:
     rows = [
         [
-            '', 'images', 'lost', 'answered', 'NOBODY', 'latency, median', '95 %', 'CPU per pose',
-            'memory', 'smoothed: age, median', '95 %', 'heaviest', 'best of K',
+            '', *TIMING, 'NOBODY', 'smoothed: age, median', '95 %', 'heaviest', 'best of K',
             'smoothed, heaviest',
         ]
     ]  # fmt: skip
-    for stage in STAGES:
-        found = result.get(stage)
-        if found is None:
-            continue
+    for stage, one in found.items():
         what = OFFLINE.get(stage) or CASES[stage].what
-        if isinstance(found, str):
-            rows.append([what, found, *[''] * 12])
+        if isinstance(one, str):
+            rows.append([what, one, *[''] * (len(rows[0]) - 2)])
             continue
         errors = [
-            f'{found[POSTERIOR]["heaviest_mm"]:.0f} mm', f'{found[POSTERIOR]["best_mm"]:.0f} mm',
-            f'{found[SMOOTHED]["heaviest_mm"]:.0f} mm' if SMOOTHED in found else '',
+            f'{one[POSTERIOR]["heaviest_mm"]:.0f} mm', f'{one[POSTERIOR]["best_mm"]:.0f} mm',
+            f'{one[SMOOTHED]["heaviest_mm"]:.0f} mm' if SMOOTHED in one else '',
         ]  # fmt: skip
         if stage in OFFLINE:
-            rows.append([what, str(found['images']), '0', '100 %', *[''] * 7, *errors])
+            rows.append([what, str(one['images']), '0', '100 %', *[''] * 8, *errors])
             continue
-        latency, age = found['latency_ms'], found['age_s']
-        rows.append(
-            [
-                what, str(found['images']), str(found['lost']),
-                f'{100 * found["answered"] / found["images"]:.0f} %', str(found['nobody']),
-                f'{latency["median"]:.0f} ms', f'{latency["95 %"]:.0f} ms',
-                f'{found["cpu_ms_per_pose"]:.0f} ms', f'{found["memory_mb"]:.0f} MB',
-                *('' if math.isnan(age[x]) else f'{age[x]:.2f} s' for x in ('median', '95 %')),
-                *errors,
-            ]
-        )  # fmt: skip
+        age = one['age_s']
+        ages = ('' if math.isnan(age[x]) else f'{age[x]:.2f} s' for x in ('median', '95 %'))
+        rows.append([what, *_timing(one), str(one['nobody']), *ages, *errors])
     return table(rows, markdown=markdown)
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

@@ -36,6 +36,7 @@ from msg_tools import BagReader
 
 ROOT = Path(__file__).resolve().parents[1]
 FILE = ROOT / 'launch' / 'hmt.launch.py'
+CAMERA_FILE = ROOT / 'launch' / 'camera.launch.py'
 REACH = ROOT / 'bags' / 'reach'
 NAMESPACE = '/humans/bodies/p1'
 # The likelihood may have to be compiled first.
@@ -71,8 +72,10 @@ STAND_INS = {
     'launch.actions': {
         'DeclareLaunchArgument': Kept,
         'ExecuteProcess': type('ExecuteProcess', (Kept,), {}),
+        'IncludeLaunchDescription': type('IncludeLaunchDescription', (Kept,), {}),
         'OpaqueFunction': Kept,
     },
+    'launch.launch_description_sources': {'PythonLaunchDescriptionSource': Kept},
     'launch.substitutions': {'LaunchConfiguration': Configuration},
     'launch_ros': {},
     'launch_ros.actions': {'Node': type('Node', (Kept,), {})},
@@ -83,15 +86,19 @@ STAND_INS = {
 }
 
 
-@pytest.fixture(scope='module')
-def description():
-    """Everything in the launch file, with stand-ins."""
+def with_stand_ins(file: Path) -> dict[str, Any]:
+    """Everything in a launch file, with stand-ins."""
     with pytest.MonkeyPatch.context() as patch:
         for name, content in STAND_INS.items():
             module = types.ModuleType(name)
             module.__dict__.update(content)
             patch.setitem(sys.modules, name, module)
-        return runpy.run_path(str(FILE))
+        return runpy.run_path(str(file))
+
+
+@pytest.fixture(scope='module')
+def description():
+    return with_stand_ins(FILE)
 
 
 @pytest.fixture
@@ -371,6 +378,56 @@ def test_views_are_upright(actions):
     assert list(actions(nodes='bme_node')) == ['bme_node']
 
 
+@pytest.mark.parametrize(
+    ('given', 'options', 'nodes'),
+    [
+        ({'detector': 'false'}, ['/dev/video0'], 'filter_node smoother_node bme_node'),
+        (
+            {'video': 'a.mp4', 'fov': '70', 'detector': 'true'},
+            ['a.mp4', '--fov', '70'],
+            'filter_node smoother_node keypoints_node',
+        ),
+        (
+            {'device': '/dev/video2', 'calibration': 'c.yaml'},
+            ['/dev/video2', '--calibration', 'c.yaml'],
+            'filter_node smoother_node bme_node',
+        ),
+    ],
+)
+def test_one_line_from_a_webcam_to_a_person(given, options, nodes, monkeypatch):
+    monkeypatch.delenv('HMT_ROS_DETECTOR_PYTHON', raising=False)
+    camera_file = with_stand_ins(CAMERA_FILE)
+    *declared, function = camera_file['generate_launch_description']().arguments[0]
+    context = {one.arguments[0]: one.options['default_value'] for one in declared}
+    assert given.keys() <= context.keys()
+    camera, person = function.options['function']({**context, **given})
+    assert (camera.options['executable'], camera.options['namespace']) == ('camera_node', 'camera')
+    assert camera.options['arguments'] == options
+    handed = dict(person.options['launch_arguments'])
+    assert handed == {'image': '/camera/image_raw', 'nodes': nodes}
+    (source,) = person.arguments
+    assert source.arguments == (str(ROOT / 'hmt_ros' / 'launch' / 'hmt.launch.py'),)
+    # Neither file has an argument of the other's name.
+    assert not context.keys() & {name for name, _, _ in with_stand_ins(FILE)['ARGUMENTS']}
+
+
+def test_arguments_of_the_camera_that_can_not_be_used():
+    actions_of = with_stand_ins(CAMERA_FILE)['actions_of']
+    usual = {name: default for name, default, _ in with_stand_ins(CAMERA_FILE)['ARGUMENTS']}
+    for given, text in (
+        ({'fov': '60', 'calibration': 'c.yaml'}, 'fov and calibration: wanted one of them'),
+        ({'detector': 'yes'}, "detector: wanted 'auto', 'true' or 'false', saw 'yes'"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            actions_of({**usual, **given}, ROOT)
+
+
+def test_a_detector_is_used_where_there_is_one(monkeypatch):
+    has_detector = with_stand_ins(CAMERA_FILE)['_has_detector']
+    monkeypatch.setenv('HMT_ROS_DETECTOR_PYTHON', '/somewhere/python')
+    assert has_detector('auto')
+
+
 def test_everything_is_installed(monkeypatch):
     import setuptools
 
@@ -381,6 +438,7 @@ def test_everything_is_installed(monkeypatch):
     installed = {f'{target}/{Path(x).name}' for target, files in given['data_files'] for x in files}
     assert {
         'share/hmt_ros/launch/hmt.launch.py',
+        'share/hmt_ros/launch/camera.launch.py',
         'share/hmt_ros/rviz/hmt.rviz',
         'share/hmt_ros/foxglove/hmt.json',
         'share/hmt_ros/foxglove/hmt_bag.json',

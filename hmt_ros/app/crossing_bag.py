@@ -1,8 +1,8 @@
-"""A rendered bag of two people who walk past each other, one before the other.
+"""A rendered bag of several people, such as two who walk past each other, one before the other.
 
 The bag has the topics `/image/compressed`, `/camera_info`, `/detections` (hmt_msgs/People2D: COCO
 keypoints of both, without identities), `/tf_static` and `/humans/bodies/a/ground_truth`,
-`.../b/ground_truth` (hmt_msgs/PoseMixture). A keypoint that the other person hides is not detected,
+`.../b/ground_truth` (hmt_msgs/PoseMixture). A keypoint that another person hides is not detected,
 and somebody of whom fewer than `FEWEST` keypoints are seen is not detected at all. The order of the
 people in a message is random. Beside the bag are `background.png`, and `truth_a.npz` and
 `truth_b.npz` as those of `rendered_bag`, without masks.
@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from string import ascii_lowercase
 
 import cv2
 import numpy as np
@@ -72,7 +73,7 @@ def crossing_takes(
     return takes
 
 
-def write_crossing(
+def write_people(
     folder: Path,
     takes: Sequence[Take],
     camera: Camera,
@@ -81,14 +82,16 @@ def write_crossing(
     quality: int = 90,
     progress: bool = False,
 ) -> None:
-    """Renders people into a new bag folder; arguments as for `rendered_bag.write_bag`.
+    """Renders people, called a, b and so on, into a new bag folder.
+
+    The arguments are those of `rendered_bag.write_bag`.
 
     Raises:
         BagError: the folder exists or can not be written.
     """
     messages = RosbagsMessages()
     rng = np.random.default_rng([scene.seed, OF_DETECTIONS])
-    count = len(takes[0].poses)
+    count, names = len(takes[0].poses), ascii_lowercase[: len(takes)]
     joints = [take.body.joint_positions(take.poses) for take in takes]
     with (
         BagWriter(folder) as bag,
@@ -112,14 +115,14 @@ def write_crossing(
             bag.write('detections', stamp, message)
             picture = compressed_image_message(messages, image, stamp, FRAME_ID, quality)
             bag.write('image/compressed', stamp, picture)
-            for name, take, places in zip(PEOPLE, takes, joints, strict=True):
+            for name, take, places in zip(names, takes, joints, strict=True):
                 truth = ground_truth(messages, take.body, take.poses[frame], places[frame], stamp)
                 bag.write(f'humans/bodies/{name}/ground_truth', stamp, truth)
             bar.update()
     empty = np.rint(scene.background(camera)).astype(np.uint8)
     if not cv2.imwrite(str(folder / 'background.png'), empty):
         raise OSError(f'{folder / "background.png"} can not be written')
-    for name, take, places in zip(PEOPLE, takes, joints, strict=True):
+    for name, take, places in zip(names, takes, joints, strict=True):
         np.savez_compressed(
             folder / f'truth_{name}.npz',
             stamps=np.array([take.stamp_ns(frame) for frame in range(count)]),

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.crossing_bag import CROSSING, crossing_takes, write_crossing
+from hmt_ros.app.crossing_bag import CROSSING, crossing_takes, write_people
 from hmt_ros.app.rendered_bag import MEASURED, Take, new_bag_folder, write_bag
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
@@ -185,7 +185,7 @@ def _make_bag(arguments: argparse.Namespace) -> int:
         if options.name == CROSSING and options.mocap is None:
             if arguments.depth:
                 raise ValueError(f'--depth does not go with {CROSSING}, which has no depth images')
-            write_crossing(folder, _crossing(options, viewpoint), camera, scene, **given)
+            write_people(folder, _crossing(options, viewpoint), camera, scene, **given)
         else:
             take = motion_of(options, viewpoint)
             write_bag(folder, take, camera, scene, with_depth=arguments.depth, **given)

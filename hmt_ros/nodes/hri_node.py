@@ -75,9 +75,6 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         for namespace in p.named or self._found():
             yield self._mixtures_in(namespace)
 
-    def _finish(self, session: HriSession) -> None:
-        self._tell(session.finish())
-
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listens."""
         result = super().on_activate(state)

@@ -99,6 +99,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._warn_of_unknown(qos=False)
         lists = {p.name for p in declared if isinstance(p.default, tuple)}
         self.add_pre_set_parameters_callback(partial(with_empty_lists, names=lists))
+        # An empty list of a parameter file has come as no value, too.
+        self.set_parameters([Parameter(name) for name in lists if values[name] is None])
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._refuse_impossible_transitions()
         self.preparing = False
@@ -158,9 +160,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             ValueError: none of those that would do is installed.
         """
         return {}
-
-    def _finish(self, session: AnySession) -> None:
-        """Publishes what is left when the node does not listen any more."""
 
     # What all nodes do.
 
@@ -258,7 +257,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._unsubscribe()
         self.stop()
         if self._session is not None:
-            self._finish(self._session)
+            self._tell(self._session.finish())
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:

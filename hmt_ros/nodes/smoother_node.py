@@ -38,9 +38,6 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield mixture_topic(MIXTURE, 'likelihood_mixture')
 
-    def _finish(self, session: SmootherSession) -> None:
-        self._tell(session.finish())
-
     def _on_smooth_window(
         self, request: SmoothWindow.Request, response: SmoothWindow.Response
     ) -> SmoothWindow.Response:

@@ -243,9 +243,7 @@ class CameraSession(Session[CameraParameters, State]):
         if order is Order.SKIPPED:
             return
         if order is Order.JUMP:
-            # What an image waits for will not come any more.
-            while self._waiting and self._camera is not None:
-                self._estimate_next(self._camera)
+            self._end()
             self._log.counts['dropped'] += len(self._waiting)
             self._waiting.clear()
             self._newest = None
@@ -258,6 +256,12 @@ class CameraSession(Session[CameraParameters, State]):
             return
         self._newest, self._fresh = stamp, self._fresh + 1
         self._waiting.append(WaitingImage(image, stamp, str(message.header.frame_id)))
+
+    def _end(self) -> int:
+        """Estimates from the images that wait for what does not come any more."""
+        while self._waiting and self._camera is not None:
+            self._estimate_next(self._camera)
+        return self._newest or 0
 
     def _look_at_scene(
         self, waiting: WaitingImage, background: BackgroundModel, remedy: str

@@ -29,7 +29,7 @@ from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import Joint, ReferenceHuman, fit_reference_human
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, camera_info_fault
-from hmt_ros.sessions.handled import Fault, Handled, Output
+from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.session import (
     NeededInput,
@@ -74,7 +74,6 @@ BODY_TOPICS = {
     'cropped': PublishedTopic('sensor_msgs/msg/Image'),
 }
 MIXTURE = 'pose_mixture'
-FINISH = 'finish'  # what `finish` calls the end of the stream
 # Share of the weight of the heaviest mode with which a mode goes on to be shown.
 _KEPT = 0.5
 # Change of a length above which a body is described anew, m.
@@ -198,14 +197,13 @@ class HriSession(Session[HriParameters, HriState]):
         """What has to come at present; may be called by any thread."""
         return [NeededInput((mixture_source(name),)) for name in self.parameters.named]
 
-    def finish(self) -> Handled:
+    def _end(self) -> int:
         """Tells that nobody is tracked any more."""
-        self._log.begin()
         tracked = bool(self._tracked())
         self.restart()
         if tracked:
             self._tell_tracked(self._now)
-        return self._handled(FINISH, self._now)
+        return self._now
 
     def _forget(self) -> None:
         # The numbers of their bodies are not given again.

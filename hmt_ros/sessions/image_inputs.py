@@ -13,21 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
-
-import numpy as np
 
 from hmt_ros.image.terms.depth import FURTHEST, NEAREST, usable_depths
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.handled import Fault, HandlingLog
-from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
 from msg_tools.messages import keypoints
-from msg_tools.messages.depth_images import decode_depth, depth_message
+from msg_tools.messages.depth_images import decode_depth
 from msg_tools.messages.detections import BOXES, FLOATS, PEOPLE_2D, SKELETON_2D, YOLO
-from msg_tools.messages.headers import header_message
-from msg_tools.messages.images import MAX_PIXELS, decode_mask, image_message
+from msg_tools.messages.images import MAX_PIXELS, decode_mask
 from msg_tools.messages.keypoints import positions_of
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
@@ -65,7 +60,6 @@ class ImageInput:
         largest: size of the largest message that is taken, bytes.
         reliable: whether none may be lost on its way.
         together: whether those of images that were left out stay, to be used with the next.
-        after: message of a stamp that ends the wait for those before; None: a bag has none.
     """
 
     name: str
@@ -81,7 +75,6 @@ class ImageInput:
     largest: int = LARGEST
     reliable: bool = False
     together: bool = False
-    after: Callable[[int], Any] | None = None
 
     def is_used(self, parameters: Any) -> bool:
         """Whether images wait for it, by the parameters of a node."""
@@ -109,39 +102,24 @@ def _read_positions(message: Any, _stamp: int) -> Any:
     return positions_of(message) if len(message.names) else None
 
 
-def _without_names(msgtype: str, stamp_ns: int) -> Any:
-    """hmt_msgs/Keypoints2D or 3D of an image without joints."""
-    messages = RosbagsMessages()
-    return messages.create(msgtype, header=header_message(messages, stamp_ns, ''))
-
-
-def _empty_mask(stamp_ns: int) -> Any:
-    return image_message(RosbagsMessages(), np.zeros((1, 1), np.uint8), stamp_ns + 1, '')
-
-
-def _some_depth(stamp_ns: int) -> Any:
-    return depth_message(RosbagsMessages(), np.ones((1, 1), np.float32), stamp_ns + 1, '')
-
-
 MASK_INPUT = ImageInput(
     MASK, {MASK: IMAGE_TYPE, COMPRESSED_MASK: COMPRESSED_TYPE}, 'use_mask',
     Fault.MASK, Fault.NO_MASK, _read_mask, lone=Fault.LONE_MASK, told=True, pixels='',
-    remembered=FEWER, largest=LARGEST_MASK, after=_empty_mask,
+    remembered=FEWER, largest=LARGEST_MASK,
 )  # fmt: skip
 DEPTH_INPUT = ImageInput(
     DEPTH, {DEPTH: IMAGE_TYPE}, 'use_depth',
     Fault.DEPTH, Fault.NO_DEPTH, _read_depth, lone=Fault.LONE_DEPTH, told=True,
     pixels=': use depth that is registered to the colour camera',
-    remembered=FEWER, largest=LARGEST_DEPTH, after=_some_depth,
+    remembered=FEWER, largest=LARGEST_DEPTH,
 )  # fmt: skip
 KEYPOINTS_INPUT = ImageInput(
     KEYPOINTS, {KEYPOINTS: keypoints.KEYPOINTS_2D}, 'use_keypoints',
-    Fault.KEYPOINTS, Fault.NO_KEYPOINTS, after=partial(_without_names, keypoints.KEYPOINTS_2D),
+    Fault.KEYPOINTS, Fault.NO_KEYPOINTS,
 )  # fmt: skip
 KEYPOINTS_3D_INPUT = ImageInput(
     KEYPOINTS_3D, {KEYPOINTS_3D: keypoints.KEYPOINTS_3D}, 'use_keypoints_3d',
     Fault.KEYPOINTS_3D, Fault.NO_KEYPOINTS_3D, _read_positions,
-    after=partial(_without_names, keypoints.KEYPOINTS_3D),
 )  # fmt: skip
 PREDICTION_INPUT = ImageInput(
     PREDICTION, {PREDICTION: POSE_MIXTURE}, 'use_predictions',

@@ -59,7 +59,7 @@ def keypoints_input(source: str) -> ImageInput:
     """The input of keypoints with messages of a `source`."""
     if source == OWN_KEYPOINTS:
         return KEYPOINTS_INPUT
-    return replace(KEYPOINTS_INPUT, types={DETECTIONS: SOURCES[source]}, after=None)
+    return replace(KEYPOINTS_INPUT, types={DETECTIONS: SOURCES[source]})
 
 
 class KeypointReader:

@@ -28,7 +28,7 @@ from hmt_ros.image.scene_watch import SceneWatch
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_session import IMAGE, WaitingImage
-from hmt_ros.sessions.handled import Fault, Handled, Output
+from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.image_inputs import (
     DEPTH_INPUT,
     DETECTIONS,
@@ -108,7 +108,7 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         wanted: Callable[[str], bool] = everything,
     ) -> None:
         super().__init__(parameters, publish, wanted)
-        self._reader = PeopleReader(parameters, self._log)
+        self._reader, self._used = PeopleReader(parameters, self._log), parameters
         self._forget()
         self.state = self._present_state()
 
@@ -117,13 +117,6 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         """See `CameraSession`."""
         detections = {DETECTIONS: SOURCES[parameters.source]}
         return replace(DETECTIONS_INPUT, types=detections), DEPTH_INPUT, MASK_INPUT
-
-    def finish(self) -> Handled:
-        """Tracks the images that wait for inputs, which do not come any more."""
-        self._log.begin()
-        while self._waiting and self._camera is not None:
-            self._estimate_next(self._camera)
-        return self._handled('finish', 0 if self._newest is None else self._newest)
 
     def _forget(self) -> None:
         self._people: list[_Person] = []
@@ -157,6 +150,10 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
             # From another view the scene is another.
             self._scene.see_from(CameraPose.of(pose.translation, pose.rotation), camera)
         p, found = self.parameters, []
+        if p is not self._used:
+            self._used = p
+            for person in self._people:
+                person.session.use(p)
         if detected is not None:
             found = self._reader.found(
                 detected, self.start.body, p.keypoint_scheme, use_keypoints=p.use_keypoints

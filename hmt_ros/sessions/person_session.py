@@ -42,6 +42,12 @@ def person_of(topic: str) -> str:
     return '' if name == topic else name.partition('/')[0]
 
 
+def _of_person(person: str, parameters: FilterParameters) -> FilterParameters:
+    """The parameters of the filter of a person; the background is that of all."""
+    prefix = f'{parameters.frame_prefix}body_{person}/'
+    return replace(parameters, frame_prefix=prefix, background_file='')
+
+
 class PersonSession(FilterSession):
     """Tracks one of several people; see `Session`.
 
@@ -68,9 +74,8 @@ class PersonSession(FilterSession):
     ) -> None:
         self._person = person
         self._shared_start = start
-        prefix = f'{parameters.frame_prefix}body_{person}/'
         super().__init__(
-            replace(parameters, frame_prefix=prefix, background_file=''),
+            _of_person(person, parameters),
             publish,
             lambda topic: wanted(topic_of(person, topic)),
         )
@@ -81,6 +86,10 @@ class PersonSession(FilterSession):
         self.frames = frames
         self._log = log
         self._background = background
+
+    def use(self, parameters: FilterParameters) -> None:
+        """Takes the parameters of all, of which those that take effect at once do."""
+        self.parameters = _of_person(self._person, parameters)
 
     def restart(self, start: TrackStart | None = None) -> None:
         """See `FilterSession.restart`; without a start that of all people."""

@@ -24,6 +24,7 @@ from msg_tools.messages.images import decode_image
 
 # Key of the diagnostics, before the name of a topic, for the number of its subscribers.
 SUBSCRIBERS = 'subscribers of '
+FINISH = 'finish'  # what `finish` calls the end of the stream
 
 
 class PublishedTopic(NamedTuple):
@@ -211,6 +212,15 @@ class Session(ABC, Generic[Parameters, State]):
         self._forget()
         self._weights = np.empty(0)
         self.state = self._present_state()
+
+    def finish(self) -> Handled:
+        """Uses what waits for messages that do not come any more."""
+        self._log.begin()
+        return self._handled(FINISH, self._end())
+
+    def _end(self) -> int:
+        """Uses what waits; the stamp of the newest message, ns, or 0."""
+        return 0
 
     def refuse(self, source: str, text: str, *, more: bool = False) -> Handled:
         """Counts a message that could not be read; `more` as for `take`."""

@@ -41,7 +41,7 @@ from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.body.whole_turns import free_limits, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.handled import Fault, Handled, Output
+from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.image_evidence import (
     Evidence,
     KeptMixtures,
@@ -75,7 +75,6 @@ from msg_tools.messages.pose_mixtures import (
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
 MIXTURE = 'likelihood_mixture'
-FINISH = 'finish'  # what `finish` calls the end of the stream
 NOBODY = 'nobody'  # status while nobody is in view
 # Change of a length from one mixture to the next above which it is another person's, m.
 SAME_PERSON = 0.02
@@ -165,12 +164,11 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
     # Inputs.
 
-    def finish(self) -> Handled:
+    def _end(self) -> int:
         """Publishes the poses that are still open; the next mixture begins a new window."""
-        self._log.begin()
         stamp = self._newest or 0
         self._end_window()
-        return self._handled(FINISH, stamp)
+        return stamp
 
     def _forget(self) -> None:
         self._window = None

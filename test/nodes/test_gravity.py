@@ -134,3 +134,15 @@ def test_no_value_is_an_empty_list_and_the_parameter_stays(world):
         [],
     )
     assert one.set(gravity=[0.0, 2.0, 0.0]) == (True, '')
+
+
+def test_an_empty_list_of_a_file_is_one_to_ros(world, tmp_path):
+    from hmt_ros.nodes.filter_node import FilterNode
+
+    context, file = world().node.context, tmp_path / 'given.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    gravity: []\n', 'utf-8')
+    node = FilterNode(context=context, cli_args=['--ros-args', '--params-file', str(file)])
+    assert node.get_parameter('gravity').value == []
+    assert node.set_parameters([node.get_parameter('gravity')])[0].successful
+    assert node.get_parameter('gravity').value == []
+    node.destroy_node()

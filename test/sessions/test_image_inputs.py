@@ -35,7 +35,6 @@ def _read_distance(message, stamp):
 # A radio that tells how far away the person is. What another input takes: this row ...
 UWB = ImageInput(
     'uwb', {'uwb': RANGE}, 'use_uwb', Fault.DEPTH, Fault.NO_DEPTH, _read_distance,
-    after=lambda stamp: None,
 )  # fmt: skip
 
 

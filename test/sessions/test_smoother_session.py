@@ -7,9 +7,10 @@ import pytest
 
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.session import FINISH
 from hmt_ros.sessions.smoothed_messages import TOPICS
 from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
-from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.track_messages import links_of
 from hmt_ros.smoothing import MixtureSmoother
 from hmt_ros.smoothing.likelihood import counted, or_missed

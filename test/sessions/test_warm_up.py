@@ -11,8 +11,9 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession
+from hmt_ros.sessions.session import FINISH
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.warm_up import film, likelihoods, warm_up_tracking
 from hmt_ros.tracking import Status, Tracker
 

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.import_video.camera_file import camera_of_view, read_camera
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection, open_source
 from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
 from hmt_ros.app.import_video.masks import Masks
@@ -28,6 +27,7 @@ from hmt_ros.body import Camera
 from hmt_ros.detectors.mediapipe_pose import MediaPipePose
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
+from hmt_ros.sessions.camera_file import camera_of_view, read_camera
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.detections import NO_KEYPOINTS

@@ -14,6 +14,7 @@ from hmt_ros.sessions.image_inputs import (
     DETECTIONS_INPUT,
     IMAGE_TYPE,
     INPUTS,
+    PREDICTION_INPUT,
     SOURCES,
 )
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
@@ -27,7 +28,7 @@ CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 _USUAL = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
 # What a bag may have of the table of inputs: predictions are made anew.
-RECORDED = (*(row for row in INPUTS if row.after is not None), DETECTIONS_INPUT)
+RECORDED = (*(row for row in INPUTS if row is not PREDICTION_INPUT), DETECTIONS_INPUT)
 # Frames with z up that stand still [REP 105]; messages that are searched for a way to one.
 UPRIGHT_FRAMES = ('odom', 'map', 'world')
 _SEARCHED = 2000

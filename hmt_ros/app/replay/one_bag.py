@@ -8,8 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hmt_ros.app.progress import Progress, show_progress
 from hmt_ros.app.replay.background import ReadAhead, WriteBehind
 from hmt_ros.app.replay.inputs import GROUND_TRUTH, RECORDED, RecordedInput
@@ -18,20 +16,18 @@ from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PeopleTrack, Play
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.declared_parameters import LONGEST_TIMEOUT
 from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession
 from hmt_ros.sessions.track_start import prepare_start
-from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
+from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
-from msg_tools.messages.headers import SECOND_NS, time_ns
+from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import ImageError, decode_image, image_message
-from msg_tools.messages.states import transforms_message
 
 Tell = Callable[[str], None]
 
@@ -190,12 +186,6 @@ def _play(
                 result.images += 1
                 result.last_stamp = time_ns(stored.message.header.stamp)
                 bar.update()
-        # The last images need not wait any longer.
-        for row in RECORDED:
-            if row.after is not None and recorded.of(row.name) is not None:
-                check(track.take(row.name, row.after(result.last_stamp)))
-        if recorded.transforms is not None:
-            check(track.take(TF, _transform_after(result.last_stamp)))
         check(track.finish())
     return result
 
@@ -240,14 +230,6 @@ def _readable(
             tell(str(error))
             continue
         yield found
-
-
-def _transform_after(stamp_ns: int) -> Any:
-    """tf2_msgs/TFMessage after the last image, which no transform of that image can follow."""
-    after = stamp_ns + round(LONGEST_TIMEOUT) * SECOND_NS + 1
-    return transforms_message(
-        RosbagsMessages(), ['hmt_ros'], ['hmt_ros/end'], np.eye(3)[None], np.zeros((1, 3)), after
-    )
 
 
 def _why_nothing(result: Replayed, subject: object) -> str:

@@ -3,7 +3,7 @@
 The BME takes each image before the filter, which takes the `pose_prediction` of the BME; the
 smoother takes the `likelihood_mixture` of the filter, and the BME its `pose_mixture` if it is to
 predict less often while the person is tracked; then the next message follows. At the end of
-the bag the smoother finishes: no message tells the node, so it is deactivated.
+the bag they finish, in the same order: no message tells a node, so it is deactivated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession, published_topic
-from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
+from hmt_ros.sessions.session import FINISH
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools.messages.cdr import deserialise
 
@@ -79,12 +80,27 @@ class OfflineTrack(PlayedTrack):
         """See `PlayedTrack`."""
         result = None
         if self._bme is not None and source in self._seen:
-            result = self._bme.take(source, message)
-            predicted, self._predicted = self._predicted, []
-            for topic, _, data in predicted:
-                read = deserialise(data, bme_session.TOPICS[topic].msgtype)
-                result = _together(result, self._filter.take(PREDICTION, read))
-        result = _together(result, self._filter.take(source, message))
+            result = self._hand_to_filter(self._bme.take(source, message))
+        return self._hand_on(_together(result, self._filter.take(source, message)))
+
+    def finish(self) -> Handled:
+        """See `PlayedTrack`."""
+        result = None
+        if self._bme is not None:
+            result = self._hand_to_filter(self._bme.finish())
+        result = self._hand_on(_together(result, self._filter.finish()))
+        return result if self._smoother is None else _together(result, self._smoother.finish())
+
+    def _hand_to_filter(self, result: Handled) -> Handled:
+        """What has been predicted."""
+        predicted, self._predicted = self._predicted, []
+        for topic, _, data in predicted:
+            read = deserialise(data, bme_session.TOPICS[topic].msgtype)
+            result = _together(result, self._filter.take(PREDICTION, read))
+        return result
+
+    def _hand_on(self, result: Handled) -> Handled:
+        """What the filter has published, to smoother and BME."""
         handed, self._handed = self._handed, []
         for topic, _, data in handed:
             read = deserialise(data, track_messages.TOPICS[topic].msgtype)
@@ -93,12 +109,6 @@ class OfflineTrack(PlayedTrack):
             if self._bme is not None and topic in self._heard:
                 result = _together(result, self._bme.take(topic, read))
         return result
-
-    def finish(self) -> Handled:
-        """See `PlayedTrack`."""
-        if self._smoother is None:
-            return Handled(FINISH, 0, (), (), ())
-        return self._smoother.finish()
 
     def _predict(self, output: Output) -> None:
         self._write(*output)
@@ -236,24 +246,38 @@ class LiveTrack(PlayedTrack):
         self._filter.publish(source, message)
         result = None
         if self._bme is not None and source in self._seen:
-            result = self._bme.answer(source)
-            # The filter gets the prediction as well, before or after its image.
-            for topic, _ in result.published:
-                result = _together(result, self._filter.answer(topic))
-        result = _together(result, self._filter.answer(source))
+            result = self._answers_to_predictions(self._bme.answer(source))
+        return self._answers_to_mixtures(_together(result, self._filter.answer(source)))
+
+    def finish(self) -> Handled:
+        """See `PlayedTrack`."""
+        result = None
+        if self._bme is not None:
+            self._bme.deactivate()
+            result = self._answers_to_predictions(self._bme.answer(FINISH))
+        self._filter.deactivate()
+        result = _together(result, self._filter.answer(FINISH))
+        if self._smoother is None:
+            return result
+        for topic, _ in result.published:
+            if topic in HANDED_ON:
+                result = _together(result, self._smoother.answer(topic))
+        self._smoother.deactivate()
+        return _together(result, self._smoother.answer(FINISH))
+
+    def _answers_to_predictions(self, result: Handled) -> Handled:
+        """The filter gets the prediction as well, before or after its image."""
+        for topic, _ in result.published:
+            result = _together(result, self._filter.answer(topic))
+        return result
+
+    def _answers_to_mixtures(self, result: Handled) -> Handled:
         for topic, _ in result.published:
             if self._smoother is not None and topic in HANDED_ON:
                 result = _together(result, self._smoother.answer(topic))
             if self._bme is not None and topic in self._heard:
                 result = _together(result, self._bme.answer(topic))
         return result
-
-    def finish(self) -> Handled:
-        """See `PlayedTrack`."""
-        if self._smoother is None:
-            return Handled(FINISH, 0, (), (), ())
-        self._smoother.deactivate()
-        return self._smoother.answer(FINISH)
 
 
 def _is_recorded(topic: str) -> bool:

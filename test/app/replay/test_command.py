@@ -394,12 +394,12 @@ def keypoints(stamp, names=('head', 'left_hip', 'right_hip')):
 
 def test_keypoints_of_the_bag_are_used(still, entries, tmp_path):
     stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
-    # The detector is late, and finds nobody in the last image.
+    # The detector is late, and says nothing of the last image.
     extra = [('/keypoints', stamps[0] + 1000, keypoints(stamps[0]))]
     bag = write(tmp_path / 'bag', sorted(entries + extra, key=lambda entry: entry[1]))
     options = [*SUBJECT, '--quiet', '-o']
     assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
-    assert still[-1].keypoints == [('head', 'left_hip', 'right_hip'), ()]
+    assert still[-1].keypoints == [('head', 'left_hip', 'right_hip'), None]
     assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
     assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_keypoints=false']) == 0
     assert still[-1].keypoints == [None] * IMAGES
@@ -414,13 +414,12 @@ def test_predictions_from_the_keypoints_of_the_bag(still, entries, tmp_path):
     entries = [*entries, ('/keypoints', stamps[0] + 1000, seen)]
     bag = write(tmp_path / 'bag', sorted(entries, key=lambda entry: entry[1]))
     options = [*SUBJECT, '--quiet', '--bme', '--set', 'use_keypoints=false']
-    counts = {'silhouettes': IMAGES, 'keypoints': 2, 'both': IMAGES}
+    counts = {'silhouettes': IMAGES, 'keypoints': 1, 'both': IMAGES}
     for cue, count in counts.items():
         out = tmp_path / cue
         cues = ['--set', f'bme.predict_from={cue}', '--set', 'input_timeout=0.0']
         assert main([str(bag), *options, *cues, '-o', str(out)]) == 0
         found = [pose_mixture_of(x.message) for x in read(out)['/pose_prediction']]
-        # The keypoints at the end of the bag, which show nobody, have a prediction, too.
         assert len(found) == count
         assert (len(found[0].weights) > 0) == (cue != 'silhouettes')
 
@@ -614,3 +613,16 @@ def test_full_disk(still, short, tmp_path, capsys, options):
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f'replay: {tmp_path / "out"} can not be written: File too large'
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_last_images_do_not_wait_for_what_a_bag_does_not_have(still, entries, tmp_path):
+    """Whatever the type of the detections: no message can say that there are no more."""
+    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
+    layout = MESSAGES.create('std_msgs/msg/MultiArrayLayout', dim=[], data_offset=0)
+    data = np.array([stamps[0] // 10**9, stamps[0] % 10**9, *[100.0, 100.0, 0.9] * 17], np.float32)
+    extra = ('/detections', stamps[0] + 1000, MESSAGES.create(
+        'std_msgs/msg/Float32MultiArray', layout=layout, data=data))  # fmt: skip
+    bag = write(tmp_path / 'bag', sorted([*entries, extra], key=lambda entry: entry[1]))
+    options = [*SUBJECT, '--quiet', '--set', 'source=floats', '--set', 'use_keypoints=true']
+    assert main([str(bag), *options, '-o', str(tmp_path / 'out'), '--keep-going']) == 0
+    assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES

@@ -1,4 +1,4 @@
-"""The camera of a video: from its field of view, or from a calibration file.
+"""The camera of images: from its field of view, or from a calibration file.
 
 Calibration files are those of OpenCV (FileStorage: YAML, XML or JSON) and those of ROS
 (camera_calibration, or a camera_info as `ros2 topic echo --once` prints it).

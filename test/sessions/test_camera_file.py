@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.app.import_video.camera_file import camera_of_view, read_camera
+from hmt_ros.sessions.camera_file import camera_of_view, read_camera
 
 K = np.array([[500.0, 0.0, 320.5], [0.0, 510.0, 239.0], [0.0, 0.0, 1.0]])
 SIZE = (640, 480)
