@@ -139,6 +139,9 @@ def test_commands_are_understood(page):
             parse(words[3:])
         elif words[:3] == ['python', '-m', 'benchmarks']:
             assert words[3] in BENCHMARKS
+        elif words[0] == 'python':
+            assert words[1].startswith('examples/'), words
+            assert (ROOT / words[1]).is_file(), words
         elif words[0] == 'make':
             named = [word for word in words[1:] if '=' not in word]
             assert set(named) <= targets, words

@@ -489,6 +489,15 @@ def test_page_lists_the_arguments(description):
     given = re.findall(r'([a-z_]+):=', ' '.join(commands))
     assert len(given) > 10
     assert set(given) <= set(listed)
+    of_camera = re.findall(
+        r'^ros2 launch hmt_ros camera.launch.py(.*)$',
+        '\n'.join(path.read_text('utf-8') for path in pages),
+        re.MULTILINE,
+    )
+    given = re.findall(r'([a-z_]+):=', ' '.join(of_camera))
+    own = {name for name, _, _ in with_stand_ins(CAMERA_FILE)['ARGUMENTS']}
+    assert own & set(given)
+    assert set(given) <= own | set(listed) - {'image', 'nodes'}
 
 
 def test_a_configuration_file_alone_changes_nothing(actions):
