@@ -56,18 +56,18 @@ class CommandParser(argparse.ArgumentParser):
         )  # fmt: skip
 
     def add_motions(self) -> None:
-        """Adds what a command takes that learns from recorded motions, and its output."""
+        """Adds the motions and the body of a command that learns from recorded motions."""
         self.add_argument(
             'motions', nargs='+', type=Path, metavar='MOTION',
             help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
         )  # fmt: skip
+        add_body(self)
+
+    def add_model(self) -> None:
+        """Adds --output, --overwrite and --quiet of a command that learns a model."""
         self.add_argument(
             '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
         )
-        self.add_argument(
-            '--body', default='human37', help='body model: a name or a YAML file (human37)'
-        )
-        add_sources(self)
         self.add_argument('--overwrite', action='store_true', help='replace an existing file')
         self.add_argument('--quiet', action='store_true', help='no progress, no summary')
 
@@ -103,15 +103,35 @@ class CommandParser(argparse.ArgumentParser):
         )
 
 
-def add_sources(parser: argparse._ActionsContainer) -> None:
-    """Adds --without and --acknowledgement of a command that learns from recorded motions."""
+def add_body(parser: argparse._ActionsContainer) -> None:
+    """Adds --body."""
+    parser.add_argument(
+        '--body', default='human37', help='body model: a name or a YAML file (default: human37)'
+    )
+
+
+def add_seed(parser: argparse._ActionsContainer) -> None:
+    """Adds --seed."""
+    parser.add_argument(
+        '--seed', type=whole_number(0), default=0, help='seed of all random choices (default: 0)'
+    )
+
+
+def add_sources(parser: argparse._ActionsContainer, said: str = '--acknowledgement') -> None:
+    """Adds --without, and what a file says of its motions, of a command that learns from them.
+
+    Args:
+        parser: to which they are added.
+        said: name of the argument for that.
+    """
     parser.add_argument(
         '--without', nargs='+', default=[], metavar='NAME',
         help='motions to leave out, names of files without suffix; * stands for any letters',
     )  # fmt: skip
     parser.add_argument(
-        '--acknowledgement', default='', metavar='TEXT', help='what the file says of the sources'
-    )
+        said, default='', metavar='TEXT',
+        help='what the motions are, their licence and whom to acknowledge; kept in the file',
+    )  # fmt: skip
 
 
 def add_people(parser: argparse._ActionsContainer) -> None:

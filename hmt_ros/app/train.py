@@ -12,7 +12,6 @@ import argparse
 import hashlib
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,7 +19,9 @@ import numpy as np
 
 from hmt_ros.app.command_line import (
     CommandParser,
+    add_body,
     add_people,
+    add_seed,
     add_sources,
     model_file,
     run_command,
@@ -45,6 +46,7 @@ from hmt_ros.experts.training_set import (
     PoseSequence,
     TrainingSettings,
     procedural_sequence,
+    recorded_sequence,
     training_set,
     typical_body,
 )
@@ -57,72 +59,19 @@ PROCEDURAL_SEEDS, PROCEDURAL_SECONDS = 5, 12.0
 TESTED, BEST_OF = 1000, 5
 
 
-@dataclass(frozen=True)
-class TrainingOptions:
-    """Options of the command.
-
-    Attributes:
-        output: File of the model; '.npz' is appended where it is missing.
-        overwrite: Whether an existing file is replaced.
-        quiet: Whether progress and summary are suppressed.
-        seed: Seed of all random choices.
-        report: Folder of the figures; None takes MODEL_report.
-        mocap: Files or folders of recorded motions.
-        without: Names of motions that are left out, without suffix.
-        alike: Names that start with it are of few motions, each done many times.
-        alike_share: Share of the poses of these that are taken.
-        test: Folder of motions of other people to score on, or None.
-        acknowledgement: What to say of the sources in the file.
-        motions: 'procedural' for all procedural motions, names with commas, or None.
-        body: Body model: a name or a YAML file.
-        model: Name of the model that learns.
-        experts: Number of experts; None takes the default of the model.
-        samples: Number of silhouettes.
-        dynamics: Whether p(x_t | x_t-1, r_t) is learned as well.
-        resume: Whether a training that was broken off goes on.
-    """
-
-    output: Path
-    overwrite: bool
-    quiet: bool
-    seed: int
-    report: Path | None
-    mocap: list[Path]
-    without: list[str]
-    alike: str
-    alike_share: float
-    test: Path | None
-    acknowledgement: str
-    motions: str | None
-    body: str
-    model: str
-    experts: int | None
-    samples: int
-    dynamics: bool
-    resume: bool
-
-
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
-    return run_command(
-        _parser(), lambda arguments: _train(TrainingOptions(**vars(arguments))), argv
-    )
+    return run_command(_parser(), _train, argv)
 
 
 def _parser() -> CommandParser:
     parser = CommandParser(
         prog='train', description='Learns to predict poses from silhouettes of motions.'
     )
+    parser.add_model()
+    add_seed(parser)
     parser.add_argument(
-        '-o', '--output', type=Path, required=True, metavar='MODEL.npz', help='file of the model'
-    )
-    parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
-    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
-    parser.add_argument(
-        '--seed', type=whole_number(0), default=0, help='seed of all random choices (0)'
-    )
-    parser.add_argument(
-        '--report', type=Path, metavar='DIR', help='folder for the figures (MODEL_report)'
+        '--report', type=Path, metavar='DIR', help='folder for the figures (FILE_report)'
     )
 
     motion = parser.add_argument_group('motions')
@@ -136,9 +85,7 @@ def _parser() -> CommandParser:
         '--motions', metavar='NAMES',
         help=f'"procedural" for all, or names with commas ({", ".join(PROCEDURAL_MOTIONS)})',
     )  # fmt: skip
-    motion.add_argument(
-        '--body', default='human37', help='body model: a name or a YAML file (human37)'
-    )
+    add_body(motion)
 
     learning = parser.add_argument_group('learning')
     learning.add_argument(
@@ -162,12 +109,12 @@ def _parser() -> CommandParser:
     )  # fmt: skip
     learning.add_argument(
         '--resume', action='store_true',
-        help='go on with a training that was broken off; its silhouettes are kept beside MODEL',
+        help='go on with a training that was broken off; its silhouettes are kept beside FILE',
     )  # fmt: skip
     return parser
 
 
-def _train(options: TrainingOptions) -> int:
+def _train(options: argparse.Namespace) -> int:
     output = model_file(options.output, overwrite=options.overwrite)
     if options.model == 'network':
         check_tools()
@@ -204,7 +151,7 @@ def _train(options: TrainingOptions) -> int:
         predictor = learned_predictor(body, seen, model, dynamics, notes, options.seed)
     if options.test is not None:
         files = chosen_motions([options.test], [])
-        tested = read_motions('train', files, options.body, quiet=options.quiet)
+        tested = read_motions('train', files, options.body, recorded_sequence, quiet=options.quiet)
         predictor.notes['scored on'] = sorted(one.name for one in tested)
         with show_progress('scoring', quiet=options.quiet):
             predictor.notes['scores'] = _scores(predictor, tested)
@@ -238,12 +185,12 @@ def _bars(quiet: bool) -> Callable[[str, str], Callable[[Iterable[Item], int], I
     return bar
 
 
-def _say(options: TrainingOptions, text: str) -> None:
+def _say(options: argparse.Namespace, text: str) -> None:
     if not options.quiet:
         print(text, flush=True)
 
 
-def _sequences(options: TrainingOptions, body: Body) -> tuple[list[PoseSequence], int]:
+def _sequences(options: argparse.Namespace, body: Body) -> tuple[list[PoseSequence], int]:
     """Motions to learn from, and the number of files that cannot be used."""
     if not options.mocap and options.motions is None:
         raise ValueError('nothing to learn from: give --mocap DIR or --motions procedural')
@@ -255,9 +202,7 @@ def _sequences(options: TrainingOptions, body: Body) -> tuple[list[PoseSequence]
                 for i in range(PROCEDURAL_SEEDS)
             ]
     files = chosen_motions(options.mocap, options.without)
-    read = read_motions('train', files, options.body, quiet=options.quiet)
-    if files and not read:
-        raise ValueError(f'none of the {len(files)} motions in {options.mocap[0]} can be used')
+    read = read_motions('train', files, options.body, recorded_sequence, quiet=options.quiet)
     return [*sequences, *read], len(files) - len(read)
 
 
