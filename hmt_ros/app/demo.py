@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app.bag_scores import score_gravity
 from hmt_ros.app.command_line import CommandParser, run_command
-from hmt_ros.app.evaluate import as_text
+from hmt_ros.app.evaluate import as_text, score_gravity
 from hmt_ros.app.replay.command import tell
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions

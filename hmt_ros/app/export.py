@@ -21,8 +21,7 @@ import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import show_progress
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
-from hmt_ros.app.report.grounds import read_grounds
+from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics, read_grounds
 from hmt_ros.app.truth import mixture_topics
 from hmt_ros.body import Body
 from hmt_ros.inference.arrays import Array

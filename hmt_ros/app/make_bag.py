@@ -14,8 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.crossing_bag import CROSSING, crossing_takes, write_people
-from hmt_ros.app.rendered_bag import MEASURED, Take, new_bag_folder, write_bag
+from hmt_ros.app.rendered_bag import (
+    CROSSING,
+    MEASURED,
+    Take,
+    crossing_takes,
+    new_bag_folder,
+    write_bag,
+    write_people,
+)
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.inference.arrays import Array

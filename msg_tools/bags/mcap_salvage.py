@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from msg_tools.bags.contents import BagError, Channel, reason
-from msg_tools.bags.decompression import MAX_BYTES
 from msg_tools.bags.mcap_records import (
     ATTACHMENT,
     CHANNEL,
@@ -28,6 +27,7 @@ from msg_tools.bags.mcap_records import (
     FOOTER_BYTES,
     HEADER,
     MAGIC,
+    MAX_BYTES,
     MESSAGE,
     MESSAGE_HEAD,
     MESSAGE_INDEX,

@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection, open_source
+from hmt_ros.app.import_video.frames import Frame, FrameSource, Masks, Selection, open_source
 from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
-from hmt_ros.app.import_video.masks import Masks
 from hmt_ros.app.import_video.persons import Choice, Chooser
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS

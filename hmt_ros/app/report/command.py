@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmt_ros.app.bag_scores import chosen_topics, score_bag
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
+from hmt_ros.app.evaluate import chosen_topics, score_bag
 from hmt_ros.app.progress import Progress, show_progress
-from hmt_ros.app.recorded_bodies import body_topics
-from hmt_ros.app.report.grounds import read_grounds
+from hmt_ros.app.recorded_bodies import body_topics, read_grounds
 from hmt_ros.app.report.images import FilmStrip, ImageSource, film_strip, image_source
 from hmt_ros.app.report.mixtures import RecordedMixtures, read_mixtures
 from hmt_ros.app.report.page import Content, data_size, page_html
