@@ -14,6 +14,7 @@ from msg_tools.files.error_line import error_line
 
 # Exit codes of programs that the interrupt key or SIGPIPE has ended, as shells report them.
 INTERRUPTED, NOBODY_READS = 130, 141
+LARGEST = 10_000  # largest side of an image, px
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -113,7 +114,7 @@ def add_body(parser: argparse._ActionsContainer) -> None:
 def add_seed(parser: argparse._ActionsContainer) -> None:
     """Adds --seed."""
     parser.add_argument(
-        '--seed', type=whole_number(0), default=0, help='seed of all random choices (default: 0)'
+        '--seed', type=whole_number(0), default=0, help='seed of all random numbers (default: 0)'
     )
 
 
@@ -239,6 +240,16 @@ def number(
         return value
 
     return read
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Reads width and height of images, px."""
+    width, _, height = text.lower().partition('x')
+    if not (width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f'wanted a size such as 640x480, saw {text!r}')
+    if not (8 <= int(width) <= LARGEST and 8 <= int(height) <= LARGEST):
+        raise argparse.ArgumentTypeError(f'wanted sides of 8 to {LARGEST} px, saw {text!r}')
+    return int(width), int(height)
 
 
 def whole_number(low: int, high: int = 2**63 - 1) -> Callable[[str], int]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -353,7 +352,3 @@ def _check_frame(track: TrackScorer, frame_id: str) -> None:
         raise ValueError(
             f'{track.name} is in the frame {frame_id!r}, {track.truth.source} in {wanted!r}'
         )
-
-
-if __name__ == '__main__':
-    sys.exit(main())

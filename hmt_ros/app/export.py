@@ -9,7 +9,6 @@ import argparse
 import csv
 import io
 import os
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -449,7 +448,3 @@ def _notes(steps: Sequence[TrackedPose], end: int) -> list[str]:
             f'lengths of segments change by up to {1e3 * change:.0f} mm: skeletons have the last'
         )
     return notes
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -9,7 +9,6 @@ make people left out.
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +75,3 @@ def _lengths(path: Path, body: Body) -> tuple[str, Array]:
     lengths = body_from_motion(motion, body).skeleton.lengths
     relative_lengths(body, lengths[None])
     return path.stem, lengths
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -9,7 +9,6 @@ its path.
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -142,7 +141,3 @@ def _scores(
             f'{s.log_density:.2f} nats, {100 * s.within:.0f} % within 90'
         )
     return result
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import fnmatch
 import os
-import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -159,7 +158,3 @@ def data_card(sequences: list[PoseSequence], acknowledgement: str) -> str:
     names = ', '.join(sorted(one.name for one in sequences))
     said = f'{acknowledgement.strip()}\n' if acknowledgement.strip() else ''
     return f'{said}Learned from {len(sequences)} motions, {seconds:.0f} s: {names}.'
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -175,7 +174,3 @@ def _describe_test(body: Body, found: LearnedPrior, data: PriorData, dofs: Index
         name = 'mean of the people' if person is None else person
         learned, usual = own.score(found.mixture.log_density), own.score(plain)
         print(f'  {name:20s} {learned:8.2f} {usual:8.2f}')
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -386,7 +385,3 @@ def _example_figure(pairs: TrainingSet) -> Figure:
             one.set_title(pairs.activities[sample], fontsize=6.0, pad=1.0)
         figure.subplots_adjust(0.01, 0.01, 0.99, 0.95, 0.05, 0.2)
     return figure
-
-
-if __name__ == '__main__':
-    sys.exit(main())

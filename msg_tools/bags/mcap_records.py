@@ -10,6 +10,7 @@ from typing import BinaryIO
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
+from mcap.opcode import Opcode
 
 from msg_tools.bags.contents import reason
 
@@ -27,22 +28,17 @@ RECORD = struct.Struct('<BQ')
 MESSAGE_HEAD = struct.Struct('<HIQQ')
 CHUNK_HEAD = struct.Struct('<QQQI')
 
-HEADER = 1
-FOOTER = 2
-SCHEMA = 3
-CHANNEL = 4
-MESSAGE = 5
-CHUNK = 6
-MESSAGE_INDEX = 7
-ATTACHMENT = 9
-STATISTICS = 11
-METADATA = 12
-DATA_END = 15
-
 FOOTER_BYTES = RECORD.size + 20
 
 # These are read whole, and small; a larger one is damage.
-_READ_WHOLE = (HEADER, FOOTER, SCHEMA, CHANNEL, STATISTICS, DATA_END)
+_READ_WHOLE = (
+    Opcode.HEADER,
+    Opcode.FOOTER,
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.STATISTICS,
+    Opcode.DATA_END,
+)
 _SMALL_RECORD_BYTES = 2**24
 
 _U16 = struct.Struct('<H')
@@ -222,8 +218,8 @@ def record_head(file: BinaryIO, offset: int, size: int) -> tuple[int, int]:
     opcode, length = RECORD.unpack(read_exactly(file, RECORD.size))
     if opcode == 0:
         raise DamageError(f'is damaged at byte {offset}: record of type 0')
-    if opcode in (MESSAGE, CHUNK):
-        smallest = MESSAGE_HEAD.size if opcode == MESSAGE else CHUNK_HEAD.size
+    if opcode in (Opcode.MESSAGE, Opcode.CHUNK):
+        smallest = MESSAGE_HEAD.size if opcode == Opcode.MESSAGE else CHUNK_HEAD.size
         largest = MAX_BYTES
     else:
         smallest = 0
@@ -283,7 +279,7 @@ def records_in(data: memoryview, offset: int) -> Iterator[tuple[int, int, int]]:
         at = body + length
         if at > len(data):
             raise DamageError(f'is damaged in {place}: a record breaks off')
-        if opcode == MESSAGE and length < MESSAGE_HEAD.size:
+        if opcode == Opcode.MESSAGE and length < MESSAGE_HEAD.size:
             raise DamageError(f'is damaged in {place}: a message has {length} bytes')
         yield opcode, body, at
 

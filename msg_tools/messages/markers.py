@@ -22,7 +22,7 @@ from msg_tools.messages.ground import GroundState
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_error import MessageError
 from msg_tools.messages.message_types import MessageFactory
-from msg_tools.messages.states import quaternions
+from msg_tools.messages.states import pose_message, quaternions
 
 _ADD, _DELETE = 0, 2
 _CUBE, _LINE_LIST, _SPHERE_LIST = 1, 5, 7
@@ -308,19 +308,13 @@ def _floor(messages: MessageFactory, header: Any, plane: Array, over: Array) -> 
     x /= np.linalg.norm(x)
     rotation = np.stack([x, np.cross(up, x), up], axis=1)
     place = over - (over @ up + height + _THICK / 2) * up
-    qx, qy, qz, qw = quaternions(rotation[None])[0].tolist()
-    px, py, pz = place.tolist()
     return messages.create(
         'visualization_msgs/msg/Marker',
         header=header,
         ns=FLOOR,
         type=_CUBE,
         action=_ADD,
-        pose=messages.create(
-            'geometry_msgs/msg/Pose',
-            position=messages.create('geometry_msgs/msg/Point', x=px, y=py, z=pz),
-            orientation=messages.create('geometry_msgs/msg/Quaternion', x=qx, y=qy, z=qz, w=qw),
-        ),
+        pose=pose_message(messages, place, quaternions(rotation[None])[0]),
         scale=messages.create('geometry_msgs/msg/Vector3', x=_SIDE, y=_SIDE, z=_THICK),
         color=_colour(messages, *_FLOOR_COLOUR),
     )

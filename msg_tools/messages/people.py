@@ -31,7 +31,7 @@ from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_error import MessageError, check_finite
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.pose_mixtures import PoseMixture
-from msg_tools.messages.states import quaternions
+from msg_tools.messages.states import pose_message, quaternions
 
 Array = NDArray[np.float64]
 
@@ -107,18 +107,12 @@ def person_pose_message(
     """
     for values in pose:
         check_finite(values, 'person_pose')
-    x, y, z = pose.position.tolist()
-    qx, qy, qz, qw = quaternions(pose.rotation[None])[0].tolist()
     return messages.create(
         PERSON_POSE,
         header=header_message(messages, stamp_ns, frame_id),
         pose=messages.create(
             'geometry_msgs/msg/PoseWithCovariance',
-            pose=messages.create(
-                'geometry_msgs/msg/Pose',
-                position=messages.create('geometry_msgs/msg/Point', x=x, y=y, z=z),
-                orientation=messages.create('geometry_msgs/msg/Quaternion', x=qx, y=qy, z=qz, w=qw),
-            ),
+            pose=pose_message(messages, pose.position, quaternions(pose.rotation[None])[0]),
             covariance=pose.covariance.ravel(),
         ),
     )
@@ -201,13 +195,7 @@ def detections_message(
         x, y, z = (person.corners[1] - person.corners[0]).tolist()
         box = messages.create(
             'vision_msgs/msg/BoundingBox3D',
-            center=messages.create(
-                'geometry_msgs/msg/Pose',
-                position=_point(messages, person.corners.mean(0)),
-                orientation=messages.create(
-                    'geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0
-                ),
-            ),
+            center=pose_message(messages, person.corners.mean(0), (0.0, 0.0, 0.0, 1.0)),
             size=messages.create('geometry_msgs/msg/Vector3', x=x, y=y, z=z),
         )
         pose = person_pose_message(messages, person.pose, stamp_ns, frame_id).pose

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -204,7 +203,3 @@ def _shown(mixtures: RecordedMixtures, most: int) -> list[int]:
     stamps = mixtures.stamps
     most = min(most, int(len(stamps) * min(DATA_BYTES / data_size(mixtures), 1.0)))
     return stamps[:: -(-len(stamps) // max(most, 1))]
-
-
-if __name__ == '__main__':
-    sys.exit(main())
