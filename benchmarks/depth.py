@@ -36,7 +36,7 @@ from hmt_ros.image.observation import observe
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings, read_subject
 from msg_tools import BagReader
-from msg_tools.messages.depth_images import decode_depth
+from msg_tools.messages.images import decode_depth
 
 MADE = ('walk', 'reach', 'dance')
 RECORDED = ('cmu_06_15_shoot.bvh', 'cmu_14_washwindow.bvh', 'cmu_15_wander.bvh', 'fair_dab.bvh')

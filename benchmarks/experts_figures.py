@@ -30,7 +30,7 @@ from benchmarks.experts_motion import (
     wrapped,
 )
 from hmt_ros.app.report.skeletons import STYLE, bones_of
-from hmt_ros.app.training_report import write_report
+from hmt_ros.app.train import write_report
 from hmt_ros.body import Body
 from hmt_ros.body.mirror import root_rotations
 from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts

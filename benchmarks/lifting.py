@@ -41,7 +41,7 @@ from hmt_ros.experts.lifted_fit import UNKNOWN_SIZE, lift_poses, poses_of
 from hmt_ros.experts.lifter import SHIPPED, KeypointHistory, Lifter, load_lifter
 from hmt_ros.experts.lifter_learning import PELVIS, SCORED, lifter_scores
 from hmt_ros.experts.predictor_learning import kinds, new_model
-from hmt_ros.experts.training_set import motion_files
+from hmt_ros.experts.training_set import motion_files, recorded_sequence
 from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
@@ -137,7 +137,7 @@ def motions_of(lifter: Lifter, mocap: Path, *, quick: bool = False) -> Motions:
         files = [x for part in parts if (mocap / part).is_dir() for x in motion_files(mocap / part)]
         files = [x for x in files if parts != LEARNED or x.stem in names]
         files = files[: 3 if quick else None]
-        read = read_motions('lifting', files, lifter.usual.name, quiet=False)
+        read = read_motions('lifting', files, lifter.usual.name, recorded_sequence)
         shares = shares_of(read, ALIKE, ALIKE_SHARE)
         found.append(keypoint_tracks(lifter.usual, read, shares, variants=variants))
     return Motions(*found)

@@ -44,7 +44,7 @@ from benchmarks.live_clips import (
     shares_in_view,
 )
 from benchmarks.nodes import PROFILE
-from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.replay import command as replay
 from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
 from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER

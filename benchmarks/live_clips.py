@@ -15,8 +15,7 @@ import numpy as np
 
 from benchmarks.clips import COMPRESSED, read_messages
 from hmt_ros.app import make_bag
-from hmt_ros.app.crossing_bag import write_people
-from hmt_ros.app.rendered_bag import FRAME_ID, Take
+from hmt_ros.app.rendered_bag import FRAME_ID, Take, write_people
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint

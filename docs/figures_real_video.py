@@ -31,7 +31,7 @@ from matplotlib.patches import Ellipse  # noqa: E402
 
 from benchmarks.clips import read_messages  # noqa: E402
 from hmt_ros.app import main as run_command  # noqa: E402
-from hmt_ros.app.report.grounds import read_grounds  # noqa: E402
+from hmt_ros.app.recorded_bodies import read_grounds  # noqa: E402
 from hmt_ros.app.report.mixtures import Moment, read_mixtures  # noqa: E402
 from hmt_ros.app.report.skeletons import STYLE, bones_of, draw_overlays  # noqa: E402
 from hmt_ros.body import Camera  # noqa: E402

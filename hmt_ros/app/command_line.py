@@ -14,6 +14,7 @@ from msg_tools.files.error_line import error_line
 
 # Exit codes of programs that the interrupt key or SIGPIPE has ended, as shells report them.
 INTERRUPTED, NOBODY_READS = 130, 141
+LARGEST = 10_000  # largest side of an image, px
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -56,18 +57,18 @@ class CommandParser(argparse.ArgumentParser):
         )  # fmt: skip
 
     def add_motions(self) -> None:
-        """Adds what a command takes that learns from recorded motions, and its output."""
+        """Adds the motions and the body of a command that learns from recorded motions."""
         self.add_argument(
             'motions', nargs='+', type=Path, metavar='MOTION',
             help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
         )  # fmt: skip
+        add_body(self)
+
+    def add_model(self) -> None:
+        """Adds --output, --overwrite and --quiet of a command that learns a model."""
         self.add_argument(
             '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
         )
-        self.add_argument(
-            '--body', default='human37', help='body model: a name or a YAML file (human37)'
-        )
-        add_sources(self)
         self.add_argument('--overwrite', action='store_true', help='replace an existing file')
         self.add_argument('--quiet', action='store_true', help='no progress, no summary')
 
@@ -103,15 +104,35 @@ class CommandParser(argparse.ArgumentParser):
         )
 
 
-def add_sources(parser: argparse._ActionsContainer) -> None:
-    """Adds --without and --acknowledgement of a command that learns from recorded motions."""
+def add_body(parser: argparse._ActionsContainer) -> None:
+    """Adds --body."""
+    parser.add_argument(
+        '--body', default='human37', help='body model: a name or a YAML file (default: human37)'
+    )
+
+
+def add_seed(parser: argparse._ActionsContainer) -> None:
+    """Adds --seed."""
+    parser.add_argument(
+        '--seed', type=whole_number(0), default=0, help='seed of all random numbers (default: 0)'
+    )
+
+
+def add_sources(parser: argparse._ActionsContainer, said: str = '--acknowledgement') -> None:
+    """Adds --without, and what a file says of its motions, of a command that learns from them.
+
+    Args:
+        parser: to which they are added.
+        said: name of the argument for that.
+    """
     parser.add_argument(
         '--without', nargs='+', default=[], metavar='NAME',
         help='motions to leave out, names of files without suffix; * stands for any letters',
     )  # fmt: skip
     parser.add_argument(
-        '--acknowledgement', default='', metavar='TEXT', help='what the file says of the sources'
-    )
+        said, default='', metavar='TEXT',
+        help='what the motions are, their licence and whom to acknowledge; kept in the file',
+    )  # fmt: skip
 
 
 def add_people(parser: argparse._ActionsContainer) -> None:
@@ -219,6 +240,16 @@ def number(
         return value
 
     return read
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Reads width and height of images, px."""
+    width, _, height = text.lower().partition('x')
+    if not (width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f'wanted a size such as 640x480, saw {text!r}')
+    if not (8 <= int(width) <= LARGEST and 8 <= int(height) <= LARGEST):
+        raise argparse.ArgumentTypeError(f'wanted sides of 8 to {LARGEST} px, saw {text!r}')
+    return int(width), int(height)
 
 
 def whole_number(low: int, high: int = 2**63 - 1) -> Callable[[str], int]:

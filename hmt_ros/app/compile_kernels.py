@@ -7,7 +7,6 @@ What it runs is what the nodes run before they are active. What is compiled is k
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 
 from hmt_ros.app.command_line import CommandParser, run_command
@@ -43,7 +42,3 @@ def _compile(arguments: argparse.Namespace) -> int:
         count, spent = compiled.count - before, time.monotonic() - start
         print(f'{count} functions compiled in {spent:.0f} s, kept in {folder_in_use()}')
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -8,14 +8,14 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app.bag_scores import score_gravity
 from hmt_ros.app.command_line import CommandParser, run_command
-from hmt_ros.app.evaluate import as_text
-from hmt_ros.app.replay.command import tell
+from hmt_ros.app.evaluate import as_text, score_gravity
+from hmt_ros.app.progress import tell_user
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import ReportOptions, write_report
@@ -67,7 +67,7 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
         background=beside('background.png'),
     )
     start = time.monotonic()
-    replayed = replay_bag(source, target, options, tell)
+    replayed = replay_bag(source, target, options, partial(tell_user, 'replay'))
     spent = time.monotonic() - start
     print(f'{replayed} in {spent:.1f} s')
     truth = beside('truth.npz') if recorded_truth(target) is None else None

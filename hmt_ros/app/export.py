@@ -9,7 +9,6 @@ import argparse
 import csv
 import io
 import os
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,8 +20,7 @@ import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import show_progress
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
-from hmt_ros.app.report.grounds import read_grounds
+from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics, read_grounds
 from hmt_ros.app.truth import mixture_topics
 from hmt_ros.body import Body
 from hmt_ros.inference.arrays import Array
@@ -450,7 +448,3 @@ def _notes(steps: Sequence[TrackedPose], end: int) -> list[str]:
             f'lengths of segments change by up to {1e3 * change:.0f} mm: skeletons have the last'
         )
     return notes
-
-
-if __name__ == '__main__':
-    sys.exit(main())

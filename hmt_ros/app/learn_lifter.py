@@ -8,16 +8,16 @@ its path.
 
 from __future__ import annotations
 
-import sys
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from pathlib import Path
+import argparse
+from dataclasses import asdict, replace
 
 import numpy as np
 
 from hmt_ros.app.command_line import (
     CommandParser,
     add_people,
+    add_seed,
+    add_sources,
     model_file,
     run_command,
     whole_number,
@@ -29,54 +29,15 @@ from hmt_ros.experts.keypoint_training import WindowSettings, keypoint_tracks, t
 from hmt_ros.experts.lifter import Lifter
 from hmt_ros.experts.lifter_learning import LearningSettings, learn_lifter, lifter_scores
 from hmt_ros.experts.network_learning import check_tools
-from hmt_ros.experts.training_set import PoseSequence
+from hmt_ros.experts.training_set import PoseSequence, recorded_sequence
 
 # Windows that a lifter is scored on.
 SCORED_WINDOWS = 2000
 
 
-@dataclass(frozen=True)
-class LifterOptions:
-    """Options of the command.
-
-    Attributes:
-        motions: Files or folders of recorded motions.
-        output: File to write; '.npz' is appended where it is missing.
-        without: Names of motions that are left out, without suffix.
-        test: Folder of motions of other people to score on, or None.
-        alike: Names that start with it are of few motions, each done many times.
-        alike_share: Factor on how often a window is drawn from these.
-        body: Body model: a name or a YAML file.
-        steps: Number of steps.
-        batch: Windows a step.
-        experts: Number of experts.
-        seed: Seed of all random choices.
-        resume: Whether a training that was broken off goes on.
-        acknowledgement: What to say of the sources in the file.
-        overwrite: Whether an existing file is replaced.
-        quiet: Whether progress and summary are suppressed.
-    """
-
-    motions: list[Path]
-    output: Path
-    without: list[str]
-    test: Path | None
-    alike: str
-    alike_share: float
-    body: str
-    steps: int
-    batch: int
-    experts: int
-    seed: int
-    resume: bool
-    acknowledgement: str
-    overwrite: bool
-    quiet: bool
-
-
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
-    return run_command(_parser(), lambda arguments: _learn(LifterOptions(**vars(arguments))), argv)
+    return run_command(_parser(), _learn, argv)
 
 
 def _parser() -> CommandParser:
@@ -86,6 +47,8 @@ def _parser() -> CommandParser:
         description='Learns to tell the depths of joints from windows of keypoints.',
     )
     parser.add_motions()
+    parser.add_model()
+    add_sources(parser)
     add_people(parser)
     parser.add_argument(
         '--steps',
@@ -100,9 +63,7 @@ def _parser() -> CommandParser:
         '--experts', type=whole_number(1, 32), default=usual.experts,
         help=f'number of experts ({usual.experts})',
     )  # fmt: skip
-    parser.add_argument(
-        '--seed', type=whole_number(0), default=0, help='seed of all random choices (0)'
-    )
+    add_seed(parser)
     parser.add_argument(
         '--resume', action='store_true',
         help='go on with a training that was broken off, marked beside FILE as FILE.resume',
@@ -110,18 +71,20 @@ def _parser() -> CommandParser:
     return parser
 
 
-def _learn(options: LifterOptions) -> int:
+def _learn(options: argparse.Namespace) -> int:
     output, quiet = model_file(options.output, overwrite=options.overwrite), options.quiet
     mark = output.with_suffix('.resume')
     if mark.exists() and not options.resume:
         raise ValueError(f'{mark} marks a training that was broken off: --resume, or remove it')
     check_tools()
     body = load_body(options.body)
-    read = partial(read_motions, 'learn-lifter', body=options.body, quiet=quiet)
-    learned = read(chosen_motions(options.motions, options.without))
-    if not learned:
-        raise ValueError('none of the motions can be used')
-    tested = [] if options.test is None else read(chosen_motions([options.test], []))
+    learned, tested = (
+        read_motions('learn-lifter', paths, options.body, recorded_sequence, quiet=quiet)
+        for paths in (
+            chosen_motions(options.motions, options.without),
+            [] if options.test is None else chosen_motions([options.test], []),
+        )
+    )
     shares = shares_of(learned, options.alike, options.alike_share)
     settings = LearningSettings(
         experts=options.experts, steps=options.steps, batch=options.batch, seed=options.seed
@@ -178,7 +141,3 @@ def _scores(
             f'{s.log_density:.2f} nats, {100 * s.within:.0f} % within 90'
         )
     return result
-
-
-if __name__ == '__main__':
-    sys.exit(main())

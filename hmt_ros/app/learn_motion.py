@@ -8,17 +8,18 @@ file, in `hmt_ros/body/models`, as BODY_motion.npz.
 
 from __future__ import annotations
 
+import argparse
 import fnmatch
 import os
-import sys
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, model_file, run_command
+from hmt_ros.app.command_line import CommandParser, add_sources, model_file, run_command
 from hmt_ros.app.progress import show_progress, tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.model_file import write_arrays
@@ -36,35 +37,12 @@ from msg_tools.files.error_line import error_line
 # Relative difference of a motion's rate from that of the poses which is put up with.
 SAME_RATE = 0.01
 
-
-@dataclass(frozen=True)
-class LearningOptions:
-    """Options of the command.
-
-    Attributes:
-        motions: Files or folders of recorded motions.
-        output: File to write; '.npz' is appended where it is missing.
-        without: Names of motions that are left out, without suffix.
-        body: Body model: a name or a YAML file.
-        acknowledgement: What to say of the sources in the file.
-        overwrite: Whether an existing file is replaced.
-        quiet: Whether progress and summary are suppressed.
-    """
-
-    motions: list[Path]
-    output: Path
-    without: list[str]
-    body: str
-    acknowledgement: str
-    overwrite: bool
-    quiet: bool
+Item = TypeVar('Item')
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
-    return run_command(
-        _parser(), lambda arguments: _learn(LearningOptions(**vars(arguments))), argv
-    )
+    return run_command(_parser(), _learn, argv)
 
 
 def _parser() -> CommandParser:
@@ -72,29 +50,35 @@ def _parser() -> CommandParser:
         prog='learn-motion', description='Learns how the poses of a body move, from motions.'
     )
     parser.add_motions()
+    parser.add_model()
+    add_sources(parser)
     return parser
 
 
-def _learn(options: LearningOptions) -> int:
-    output = model_file(options.output, overwrite=options.overwrite)
-    body = load_body(options.body)
-    paths = chosen_motions(options.motions, options.without)
-    quiet = options.quiet
-    shown = with_progress(paths, 'reading', 'motions', len(paths), quiet=quiet)
-    read = [_sequence(path, body) for path in shown]
-    sequences = [one for one in read if one is not None]
-    if not sequences:
-        raise ValueError(f'none of the {len(paths)} motions can be used')
-    card = data_card(sequences, options.acknowledgement)
+def _learn(arguments: argparse.Namespace) -> int:
+    output = model_file(arguments.output, overwrite=arguments.overwrite)
+    body, quiet = load_body(arguments.body), arguments.quiet
+    paths = chosen_motions(arguments.motions, arguments.without)
+    sequences = read_motions('learn-motion', paths, arguments.body, _at_rate, quiet=quiet)
+    card = data_card(sequences, arguments.acknowledgement)
     with show_progress('learning', quiet=quiet):
         model = learned_motion(body, [one.poses for one in sequences], RATE, card)
     write_arrays(output, model.arrays())
-    if not options.quiet:
+    if not quiet:
         skipped = len(paths) - len(sequences)
         skips = f', {skipped} skipped' if skipped else ''
         size = output.stat().st_size / 1e3
         print(f'{output}: {len(sequences)} motions{skips}, {size:.0f} kB', flush=True)
     return 0
+
+
+def _at_rate(path: Path, body: Body) -> PoseSequence:
+    """The motion in a file, whose rate has to be that of the poses, or a multiple."""
+    fps = read_motion(path).fps
+    rate = fps / max(round(fps / RATE), 1)
+    if abs(rate / RATE - 1.0) > SAME_RATE:
+        raise ValueError(f'{fps:g} frames per second, wanted a multiple of {RATE:g}')
+    return recorded_sequence(path, body)
 
 
 def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
@@ -121,47 +105,46 @@ def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
     return [path for path in found if path.stem not in left_out]
 
 
-def _sequence(path: Path, body: Body) -> PoseSequence | None:
-    """The motion of a file; None, with one line on stderr, if the file cannot be used."""
-    try:
-        fps = read_motion(path).fps
-        rate = fps / max(round(fps / RATE), 1)
-        if abs(rate / RATE - 1.0) > SAME_RATE:
-            raise ValueError(f'{fps:g} frames per second, wanted a multiple of {RATE:g}')
-        return recorded_sequence(path, body)
-    except (ValueError, OSError, ArithmeticError) as error:
-        tell_user('learn-motion', f'skipped {path.name}: {error_line(error)}')
-        return None
-
-
-def read_motions(command: str, paths: list[Path], body: str, *, quiet: bool) -> list[PoseSequence]:
-    """The motions that can be used, as poses of a body; a line on stderr for each other one.
+def read_motions(
+    command: str,
+    paths: list[Path],
+    body: str,
+    read: Callable[[Path, Body], Item],
+    *,
+    quiet: bool = False,
+) -> list[Item]:
+    """What is read from motions for a body; a line on stderr for each that can not be used.
 
     Args:
         command: that reads them, for that line.
         paths: of motions.
         body: name or file of the body.
+        read: reads one; errors of input and of arithmetic say that it can not be used.
         quiet: no progress.
+
+    Raises:
+        ValueError: there are motions, and none can be used.
     """
-    sequences = []
+    found = []
     with ProcessPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-        found = pool.map(partial(_recorded, body=body), paths, chunksize=2)
-        for path, one in zip(
-            paths, with_progress(found, 'reading', 'motions', len(paths), quiet=quiet), strict=True
-        ):
-            if isinstance(one, str):
-                tell_user(command, f'skipped {path.name}: {one}')
+        reading = pool.map(partial(_read_one, read=read, body=body), paths, chunksize=2)
+        shown = with_progress(reading, 'reading', 'motions', len(paths), quiet=quiet)
+        for path, (one, why) in zip(paths, shown, strict=True):
+            if one is None:
+                tell_user(command, f'skipped {path.name}: {why}')
             else:
-                sequences.append(one)
-    return sequences
+                found.append(one)
+    if paths and not found:
+        raise ValueError(f'none of the {len(paths)} motions can be used')
+    return found
 
 
-def _recorded(path: Path, body: str) -> PoseSequence | str:
-    """The motion of a file, or why it can not be used."""
+def _read_one(path: Path, read: Callable[[Path, Body], Item], body: str) -> tuple[Item | None, str]:
+    """What is read from a motion; or why it can not be used."""
     try:
-        return recorded_sequence(path, load_body(body))
+        return read(path, load_body(body)), ''
     except (ValueError, OSError, ArithmeticError, np.linalg.LinAlgError) as error:
-        return error_line(error)
+        return None, error_line(error)
 
 
 def shares_of(sequences: list[PoseSequence], alike: str, share: float) -> list[float]:
@@ -175,7 +158,3 @@ def data_card(sequences: list[PoseSequence], acknowledgement: str) -> str:
     names = ', '.join(sorted(one.name for one in sequences))
     said = f'{acknowledgement.strip()}\n' if acknowledgement.strip() else ''
     return f'{said}Learned from {len(sequences)} motions, {seconds:.0f} s: {names}.'
-
-
-if __name__ == '__main__':
-    sys.exit(main())

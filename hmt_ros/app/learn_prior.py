@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from hmt_ros.app.command_line import CommandParser, model_file, run_command, whole_number
-from hmt_ros.app.progress import tell_user, with_progress
+from hmt_ros.app.command_line import (
+    CommandParser,
+    add_sources,
+    model_file,
+    run_command,
+    whole_number,
+)
+from hmt_ros.app.learn_motion import chosen_motions, read_motions
+from hmt_ros.app.progress import with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.model_file import write_arrays
 from hmt_ros.experts.prior_learning import (
@@ -28,9 +32,8 @@ from hmt_ros.experts.prior_learning import (
     prior_data,
     recorded_dofs,
 )
-from hmt_ros.experts.training_set import PoseSequence, motion_files, recorded_sequence
+from hmt_ros.experts.training_set import PoseSequence, recorded_sequence
 from hmt_ros.inference.arrays import Array, Index
-from msg_tools.files.error_line import error_line
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -43,25 +46,10 @@ def _parser() -> CommandParser:
     parser = CommandParser(
         prog='learn-prior', description='Learns the prior of the joint angles from motion files.'
     )
-    parser.add_argument(
-        'files', type=Path, nargs='+', metavar='FILES',
-        help='motion files (.bvh, or .amc beside its .asf), or folders of them',
-    )  # fmt: skip
-    parser.add_argument(
-        '-o', '--output', type=Path, required=True, metavar='PRIOR.npz', help='file of the prior'
-    )
-    parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
-    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
-    parser.add_argument('--body', default='human37', help='body model: a name or a YAML file')
-    parser.add_argument(
-        '--without', nargs='+', default=[], metavar='NAME',
-        help='names of motion files without suffix that are not used',
-    )  # fmt: skip
-    parser.add_argument(
-        '--people', type=Path, nargs='+', default=[], metavar='FILE.csv',
-        help='tables with the columns file and subject: whose motion a file is (default: the first '
-        'two words of its name)',
-    )  # fmt: skip
+    parser.add_motions()
+    parser.add_model()
+    add_sources(parser, '--source')
+    add_people_tables(parser)
     parser.add_argument(
         '--test', type=Path, nargs='+', default=[], metavar='FILES',
         help='motions of other people, whose log likelihood is printed',
@@ -78,10 +66,6 @@ def _parser() -> CommandParser:
     parser.add_argument(
         '--seed', type=whole_number(0), default=s.seed, help=f'seed of the starts ({s.seed})'
     )
-    parser.add_argument(
-        '--source', default='', metavar='TEXT',
-        help='what the motions are, their licence and whom to acknowledge; kept in the file',
-    )  # fmt: skip
     return parser
 
 
@@ -94,7 +78,8 @@ def _learn(arguments: argparse.Namespace) -> int:
     body = load_body(arguments.body)
     owners = people_in(arguments.people)
     quiet = arguments.quiet
-    sequences, people = _motions(arguments.files, arguments.without, owners, body, quiet)
+    motions, name = arguments.motions, arguments.body
+    sequences, people = _motions(motions, arguments.without, owners, name, quiet)
     dofs = recorded_dofs(body, sequences, people)
     data = prior_data(body, sequences, people, settings)
 
@@ -108,10 +93,24 @@ def _learn(arguments: argparse.Namespace) -> int:
         return 0
     _describe(output, found)
     if arguments.test:
-        tested, others = _motions(arguments.test, [], owners, body, quiet)
+        tested, others = _motions(arguments.test, [], owners, name, quiet)
         every = replace(settings, novelty=0.0, most_poses=max(len(x.poses) for x in tested))
         _describe_test(body, found, prior_data(body, tested, others, every), dofs)
     return 0
+
+
+def add_people_tables(parser: CommandParser) -> None:
+    """Adds --people, for `people_in`."""
+    parser.add_argument(
+        '--people', type=Path, nargs='+', default=[], metavar='FILE.csv',
+        help='tables with the columns file and subject: whose motion a file is (default: the first '
+        'two words of its name)',
+    )  # fmt: skip
+
+
+def person_of(name: str, owners: dict[str, str]) -> str:
+    """The person of a motion file, by `people_in`, or else by its name without suffix."""
+    return owners.get(name) or '_'.join(name.split('_')[:2])
 
 
 def people_in(tables: Iterable[Path]) -> dict[str, str]:
@@ -134,26 +133,12 @@ def people_in(tables: Iterable[Path]) -> dict[str, str]:
 
 
 def _motions(
-    sources: Iterable[Path], without: Iterable[str], owners: dict[str, str], body: Body, quiet: bool
+    sources: list[Path], without: list[str], owners: dict[str, str], body: str, quiet: bool
 ) -> tuple[list[PoseSequence], list[str]]:
     """Motions and their people; files that cannot be used give one line on stderr."""
-    paths = [
-        x for source in sources for x in (motion_files(source) if source.is_dir() else [source])
-    ]
-    sequences, people = [], []
-    left_out = set(without)
-    for path in with_progress(paths, 'reading', 'motions', len(paths), quiet=quiet):
-        if path.stem in left_out:
-            continue
-        try:
-            sequences.append(recorded_sequence(path, body))
-        except (ValueError, OSError, np.linalg.LinAlgError) as error:
-            tell_user('learn-prior', f'skipped {path.name}: {error_line(error)}')
-            continue
-        people.append(owners.get(path.stem) or '_'.join(path.stem.split('_')[:2]))
-    if not sequences:
-        raise ValueError(f'none of the {len(paths)} motions can be used')
-    return sequences, people
+    paths = chosen_motions(sources, without)
+    sequences = read_motions('learn-prior', paths, body, recorded_sequence, quiet=quiet)
+    return sequences, [person_of(one.name, owners) for one in sequences]
 
 
 def _method(s: PriorSettings, people: Iterable[str]) -> str:
@@ -189,7 +174,3 @@ def _describe_test(body: Body, found: LearnedPrior, data: PriorData, dofs: Index
         name = 'mean of the people' if person is None else person
         learned, usual = own.score(found.mixture.log_density), own.score(plain)
         print(f'  {name:20s} {learned:8.2f} {usual:8.2f}')
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -8,7 +8,6 @@ See `experts.lifter`; with images, `track-video` says more.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import numpy as np
 from hmt_ros.app.command_line import (
     CommandParser,
     gravity_of,
+    image_size,
     number,
     run_command,
     whole_number,
@@ -77,7 +77,7 @@ def _parser() -> CommandParser:
     parser.add_output('DIR', 'result', 'folder for the bag and the report')
     add_camera_arguments(parser)
     parser.add_argument(
-        '--size', type=_size, metavar='WxH',
+        '--size', type=image_size, metavar='WxH',
         help='width and height of the images, px; not needed where the file tells it',
     )  # fmt: skip
     parser.add_argument(
@@ -115,16 +115,6 @@ def _parser() -> CommandParser:
         help='file that learn-lifter wrote (default: the one that ships)',
     )  # fmt: skip
     return parser
-
-
-def _size(text: str) -> tuple[int, int]:
-    try:
-        width, height = (int(x) for x in text.lower().split('x'))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f'wanted WxH, such as 640x480, saw {text!r}') from None
-    if min(width, height) < 1:
-        raise argparse.ArgumentTypeError(f'wanted a size above 0, saw {text!r}')
-    return width, height
 
 
 class _NoFrames(FrameSource):
@@ -208,7 +198,3 @@ def _body(camera: Camera, arguments: argparse.Namespace) -> Body:
         subject = read_subject(arguments.subject, body)
         return start_from_keypoints(body, camera, subject).body
     return body if arguments.stature is None else body.with_stature(arguments.stature)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -7,15 +7,29 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.crossing_bag import CROSSING, crossing_takes, write_people
-from hmt_ros.app.rendered_bag import MEASURED, Take, new_bag_folder, write_bag
+from hmt_ros.app.command_line import (
+    CommandParser,
+    add_body,
+    add_seed,
+    image_size,
+    number,
+    run_command,
+    whole_number,
+)
+from hmt_ros.app.rendered_bag import (
+    CROSSING,
+    MEASURED,
+    Take,
+    crossing_takes,
+    new_bag_folder,
+    write_bag,
+    write_people,
+)
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.inference.arrays import Array
@@ -26,7 +40,6 @@ from hmt_ros.motion.retarget import body_from_motion, retarget
 from hmt_ros.rendering.scene import Scene
 
 DURATION, HEADING = 4.0, 30.0  # s; degrees, of recorded motions
-LARGEST = 10_000  # largest side of an image, px
 
 
 @dataclass(frozen=True)
@@ -57,17 +70,13 @@ def _parser() -> CommandParser:
         'who walk past each other, or any name with --mocap',
     )
     parser.add_output('DIR', 'bag', 'folder of the bag')
-    parser.add_argument(
-        '--seed', type=whole_number(0), default=0, help='seed of all random numbers (default: 0)'
-    )
+    add_seed(parser)
 
     motion = parser.add_argument_group('motion')
     motion.add_argument(
         '--mocap', type=Path, metavar='FILE', help='recorded motion (.bvh, or .amc beside its .asf)'
     )
-    motion.add_argument(
-        '--body', default='human37', help='body model: a name or a YAML file (default: human37)'
-    )
+    add_body(motion)
     motion.add_argument(
         '--stature',
         type=number(0.3, 3),
@@ -101,7 +110,7 @@ def _parser() -> CommandParser:
     camera = parser.add_argument_group('camera and scene')
     camera.add_argument(
         '--size',
-        type=_size,
+        type=image_size,
         default=(640, 480),
         metavar='WxH',
         help='size of the images, px (default: 640x480)',
@@ -155,15 +164,6 @@ def _parser() -> CommandParser:
         help='JPEG quality, 1 to 100 (default: 90)',
     )
     return parser
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition('x')
-    if not (width.isdecimal() and height.isdecimal()):
-        raise argparse.ArgumentTypeError(f'wanted a size such as 640x480, saw {text!r}')
-    if not (8 <= int(width) <= LARGEST and 8 <= int(height) <= LARGEST):
-        raise argparse.ArgumentTypeError(f'wanted sides of 8 to {LARGEST} px, saw {text!r}')
-    return int(width), int(height)
 
 
 def _make_bag(arguments: argparse.Namespace) -> int:
@@ -288,7 +288,3 @@ def _placed(
     centre = 0.5 * (pelvis.min(0) + pelvis.max(0))
     centre[2] = np.percentile(lowest, 10) - ankle_height
     return viewpoint.rotation @ rotation, viewpoint.translation - viewpoint.rotation @ centre
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""The bodies that the mixtures in a bag are about.
+"""The bodies that the mixtures in a bag are about, and the ground that they stand on.
 
 A mixture that carries segment lengths names its own body. One without (of another publisher, or in
 a bag older than the fields) is about the body on the Body topic of its namespace, or of the bag's
@@ -7,11 +7,13 @@ only Body topic.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from hmt_ros.body import Body, load_body, named_body
 from msg_tools import BagMessage, BagReader
 from msg_tools.messages.bodies import body_of, resized
+from msg_tools.messages.ground import GROUND, GroundState, ground_of
 from msg_tools.messages.message_error import MessageError, lengths_of
 from msg_tools.messages.pose_mixtures import PoseMixture
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
@@ -70,6 +72,40 @@ class RecordedBodies:
     def _model_of(self, name: str) -> Body:
         """The body that was chosen, or that ships under a name; names in bags lead to no files."""
         return named_body(name) if self._model is None else load_body(self._model)
+
+
+def read_grounds(path: Path, topic: str, frame_id: str) -> dict[int, GroundState]:
+    """What a bag tells of the ground, by stamp in ns; nothing if it has no such topic.
+
+    Args:
+        path: path of the bag.
+        topic: topic of the mixtures that are shown: the ground is on the topic of the same
+            namespace, or else on the only one of the bag.
+        frame_id: frame of the mixtures; a ground in another frame is left out.
+
+    Raises:
+        ValueError: a message that can not be understood.
+    """
+    with BagReader(path) as bag:
+        names = [
+            each.name
+            for each in bag.topics.values()
+            if each.msgtype == GROUND and each.message_count
+        ]
+        beside = [name for name in names if _namespace(name) == _namespace(topic)]
+        chosen = beside or names
+        if len(chosen) != 1:
+            return {}
+        found = {}
+        for stored in bag.messages(chosen):
+            try:
+                content = ground_of(stored.message)
+            except ValueError as error:
+                where = f'{path}: {stored.topic} at {stored.log_time_ns} ns'
+                raise ValueError(f'{where}: {error}') from error
+            if content.frame_id == frame_id:
+                found[content.stamp_ns] = content
+    return found
 
 
 def _namespace(topic: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, run_command
@@ -69,7 +68,3 @@ def _recover(arguments: argparse.Namespace) -> int:
     if not found.losses and not found.lost_messages:
         print('lost: nothing')
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -5,33 +5,47 @@ and `/body` (hmt_msgs/Body, latched), and `/depth` (sensor_msgs/Image, 16UC1) on
 also has the files that replay and evaluate need: `background.png` (the empty scene), `subject.yaml`
 (joints as clicked in the first image) and `truth.npz` (joints, pixels, silhouettes, gravity and the
 height of the camera). `/tf_static` tells where the camera is in `odom`, as a robot would.
+
+A bag of several people, such as two who walk past each other, has instead of `/ground_truth` and
+`/body` the topics `/humans/bodies/a/ground_truth`, `.../b/ground_truth` and `/detections`
+(hmt_msgs/People2D: COCO keypoints of all, without identities). A keypoint that another person hides
+is not detected, and somebody of whom fewer than `FEWEST` keypoints are seen is not detected at all.
+The order of the people in a message is random. Beside it are `background.png`, and `truth_a.npz`
+and `truth_b.npz`, without silhouettes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.camera import Viewpoint
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
 from hmt_ros.inference.arrays import Array
+from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.depth_sensor import sensed_depth
-from hmt_ros.rendering.renderer import render_frames
+from hmt_ros.rendering.renderer import render_frames, render_people
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.sessions.transform_buffer import TRANSFORMS_TYPE
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.files.new_folder import FolderKind
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.camera_info import camera_info_message
-from msg_tools.messages.depth_images import depth_message
+from msg_tools.messages.detections import DetectedPerson, people_message
 from msg_tools.messages.headers import SECOND_NS
-from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.images import compressed_image_message, depth_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.messages.states import transforms_message
 
@@ -48,6 +62,18 @@ MEASURED = (
     'thigh', 'shin', 'foot', 'upper_arm', 'forearm', 'hand', 'hip_width', 'shoulder_width', 'trunk',
     'neck_to_head',
 )  # fmt: skip
+
+CROSSING = 'crossing'
+PEOPLE = ('a', 'b')
+# How far one walks before the other, m, and the most that each turns from walking straight across.
+BEFORE = 0.9
+TURN = np.radians(12.0)
+# Statures, as a share of the model's.
+STATURES = (0.94, 1.06)
+# Noise of the keypoints, m on the person; their confidence; fewest that are a detection.
+NOISE, CONFIDENCE = 0.02, 0.9
+FEWEST = 5
+OF_PEOPLE, OF_DETECTIONS = 6, 7  # streams of random numbers of a seed
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +123,7 @@ def write_bag(
         BagError: the folder exists or can not be written.
     """
     joints = take.body.joint_positions(take.poses)
-    pixels = camera.project(joints)
-    subject = subject_text(take, camera, pixels[0], scene.seed)
+    subject = subject_text(take, camera, camera.project(joints[:1])[0], scene.seed)
     messages = RosbagsMessages()
     masks = np.empty((len(take.poses), camera.height, (camera.width + 7) // 8), dtype=np.uint8)
     with (
@@ -123,23 +148,42 @@ def write_bag(
             masks[frame] = np.packbits(shown.mask, axis=1)
             bar.update()
     (folder / 'subject.yaml').write_text(subject, encoding='utf-8')
+    _write_background(folder, camera, scene)
+    _write_truth(folder / 'truth.npz', take, joints, camera, scene, masks)
+
+
+def _write_background(folder: Path, camera: Camera, scene: Scene) -> None:
+    """Writes an image of the empty scene."""
     empty = np.rint(scene.background(camera)).astype(np.uint8)
     if not cv2.imwrite(str(folder / 'background.png'), empty):
         raise OSError(f'{folder / "background.png"} can not be written')
+
+
+def _write_truth(
+    path: Path,
+    take: Take,
+    joints: Array,
+    camera: Camera,
+    scene: Scene,
+    masks: NDArray[np.uint8] | None = None,
+) -> None:
+    """Writes what is true of a motion; without silhouettes where there are none."""
+    silhouettes: dict[str, Any] = {} if masks is None else {'masks': masks}
+    count = len(take.poses)
     np.savez_compressed(
-        folder / 'truth.npz',
-        stamps=np.array([take.stamp_ns(frame) for frame in range(len(take.poses))]),
+        path,
+        stamps=np.array([take.stamp_ns(frame) for frame in range(count)]),
         joint_names=np.array(take.body.joint_names),
         joints=joints,
-        pixels=pixels,
-        masks=masks,
+        pixels=camera.project(joints),
+        **silhouettes,
         K=camera.matrix,
         fps=np.array(take.fps),
         source=np.array(take.source),
         dof_names=np.array(take.body.dof_names),
         poses=take.poses,
-        gravity=np.tile(true_gravity(scene.viewpoint), (len(take.poses), 1)),
-        camera_height=np.full(len(take.poses), scene.viewpoint.height),
+        gravity=np.tile(true_gravity(scene.viewpoint), (count, 1)),
+        camera_height=np.full(count, scene.viewpoint.height),
     )
 
 
@@ -214,3 +258,106 @@ def new_bag_folder(target: Path, *, overwrite: bool) -> AbstractContextManager[P
     """A folder for the bag, which replaces the target when all is written, or never."""
     files = (f'{target.absolute().name}.mcap', *FILES_BESIDE)
     return FolderKind('a bag', 'metadata.yaml', files).new(target, overwrite=overwrite)
+
+
+def crossing_takes(
+    body: Body, duration: float, fps: float, seed: int, viewpoint: Viewpoint
+) -> list[Take]:
+    """The motions of two people who cross in the middle of the image at half the time."""
+    rng = np.random.default_rng([seed, OF_PEOPLE])
+    first = rng.choice([-1.0, 1.0])
+    takes = []
+    for number, name in enumerate(PEOPLE):
+        side = first if number == 0 else -first
+        own = body.with_stature(body.stature * rng.uniform(*STATURES))
+        heading = side * 0.5 * np.pi + rng.uniform(-TURN, TURN)
+        poses = procedural_motion(
+            'walk', own, duration, fps, 2 * seed + number, heading=heading, viewpoint=viewpoint
+        )
+        depth = (0.5 if number == 0 else -0.5) * BEFORE
+        poses[:, :3] += viewpoint.rotation @ np.array([0.0, depth, 0.0])
+        takes.append(Take(f'{CROSSING}, seed {seed}, person {name}', own, poses, fps))
+    return takes
+
+
+def write_people(
+    folder: Path,
+    takes: Sequence[Take],
+    camera: Camera,
+    scene: Scene,
+    *,
+    quality: int = 90,
+    progress: bool = False,
+) -> None:
+    """Renders people, called a, b and so on, into a new bag folder.
+
+    The arguments are those of `write_bag`.
+
+    Raises:
+        BagError: the folder exists or can not be written.
+    """
+    messages = RosbagsMessages()
+    rng = np.random.default_rng([scene.seed, OF_DETECTIONS])
+    count, names = len(takes[0].poses), ascii_lowercase[: len(takes)]
+    joints = [take.body.joint_positions(take.poses) for take in takes]
+    with (
+        BagWriter(folder) as bag,
+        show_progress(folder.name, 'images', count, quiet=not progress) as bar,
+    ):
+        write_camera_place(bag, messages, scene.viewpoint, takes[0].stamp_ns(0))
+        for frame in range(count):
+            stamp = takes[0].stamp_ns(frame)
+            poses = [take.poses[frame] for take in takes]
+            image, owners = render_people(
+                [take.body for take in takes], poses, camera, scene, frame
+            )
+            bag.write('camera_info', stamp, camera_info_message(messages, camera, stamp, FRAME_ID))
+            found = [
+                detection(take.body, pose, camera, owners == number, rng)
+                for number, (take, pose) in enumerate(zip(takes, poses, strict=True))
+            ]
+            people = [DetectedPerson('', x) for x in found if x.seen.sum() >= FEWEST]
+            shuffled = [people[i] for i in rng.permutation(len(people))]
+            message = people_message(messages, shuffled, stamp, FRAME_ID)
+            bag.write('detections', stamp, message)
+            picture = compressed_image_message(messages, image, stamp, FRAME_ID, quality)
+            bag.write('image/compressed', stamp, picture)
+            for name, take, places in zip(names, takes, joints, strict=True):
+                truth = ground_truth(messages, take.body, take.poses[frame], places[frame], stamp)
+                bag.write(f'humans/bodies/{name}/ground_truth', stamp, truth)
+            bar.update()
+    _write_background(folder, camera, scene)
+    for name, take, places in zip(names, takes, joints, strict=True):
+        _write_truth(folder / f'truth_{name}.npz', take, places, camera, scene)
+
+
+def detection(
+    body: Body, pose: Array, camera: Camera, own: Array, rng: np.random.Generator
+) -> Keypoints:
+    """COCO keypoints of a person as a detector would see them.
+
+    Args:
+        body, pose: the person, pose (d,).
+        camera: that sees the person.
+        own: (H, W) pixels that show the person.
+        rng: of the noise.
+    """
+    scheme, skeleton = schemes()['coco17'], body.skeleton
+    marks = [x for x in zip(scheme.names, scheme.landmarks, strict=True) if x[1].joint]
+    at = skeleton.joint_index([mark.joint for _, mark in marks])
+    offsets = np.array([mark.offset for _, mark in marks]) * body.stature / USUAL_STATURE
+    frames = forward(skeleton, pose[None])
+    local = skeleton.joint_offsets[at] + offsets
+    points = frames.points(skeleton.joint_segments[at], local)[:, :, 0]
+    exact = camera.project(points)
+    pixels = exact + rng.normal(0.0, NOISE, exact.shape) * (camera.fx / points[:, 2:])
+    # What lies on the edge of the person belongs to it.
+    near = cv2.dilate(own.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    column, row = np.nan_to_num(np.round(exact), nan=-1.0).astype(int).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    seen = inside & near[np.where(inside, row, 0), np.where(inside, column, 0)]
+    names = tuple(name for name, _ in marks)
+    unknown = np.full((len(names), 2, 2), np.nan)
+    found = Keypoints(names, pixels, unknown, np.full(len(names), CONFIDENCE))
+    kept = np.where(seen, CONFIDENCE, 0.0)
+    return replace(found, confidences=kept)

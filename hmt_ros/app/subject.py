@@ -8,13 +8,12 @@ The schemes of keypoints say at which joint a landmark lies (`hmt_ros.image.keyp
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
+from hmt_ros.app.command_line import CommandParser, add_body, number, run_command, whole_number
 from hmt_ros.app.progress import with_progress
 from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.body import Body, load_body
@@ -104,9 +103,7 @@ def _parser() -> CommandParser:
         help='standard deviation of a keypoint, px (default: 3 %% of the size of the person in the '
         'image, at least 2)',
     )  # fmt: skip
-    parser.add_argument(
-        '--body', default='human37', help='body model: a name or a YAML file (default: human37)'
-    )
+    add_body(parser)
     return parser
 
 
@@ -221,7 +218,3 @@ def subject_text(seen: Seen, *, stature: float | None = None, sigma: float | Non
     if stature is not None:
         lines.append(f'stature_m: {stature:g}')
     return '\n'.join(lines) + '\n'
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -6,7 +6,7 @@ track-video walk.mp4 -o walk --fov 60 --keypoints walk.json
 from __future__ import annotations
 
 import argparse
-import sys
+from functools import partial
 from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, gravity_of, number, run_command
@@ -73,6 +73,7 @@ def _parser() -> CommandParser:
 
 def _track(arguments: argparse.Namespace) -> int:
     folder, quiet = arguments.output, arguments.quiet
+    tell = partial(tell_user, 'track-video')
     overwrite, stature = arguments.overwrite, arguments.stature
 
     def say(text: object) -> None:
@@ -119,12 +120,3 @@ def _of_gravity(arguments: argparse.Namespace) -> list[str]:
     """The setting of the tracker that tells how the camera is tilted, if it is known."""
     gravity = gravity_of(arguments)
     return [] if gravity is None else [f'gravity={gravity}']
-
-
-def tell(text: str) -> None:
-    """Prints a line for the user on stderr, above the progress bar."""
-    tell_user('track-video', text)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

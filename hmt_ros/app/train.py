@@ -10,17 +10,19 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import sys
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 
 from hmt_ros.app.command_line import (
     CommandParser,
+    add_body,
     add_people,
+    add_seed,
     add_sources,
     model_file,
     run_command,
@@ -28,26 +30,34 @@ from hmt_ros.app.command_line import (
 )
 from hmt_ros.app.learn_motion import chosen_motions, data_card, read_motions, shares_of
 from hmt_ros.app.progress import show_progress, with_progress
-from hmt_ros.app.training_report import write_report
+from hmt_ros.app.report.skeletons import STYLE
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN
 from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.network_learning import check_tools
+from hmt_ros.experts.pose_encoding import AXES
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.experts.predictor_learning import (
     KINDS,
+    Described,
+    affinities,
     described,
     learned_predictor,
+    multimodality,
     new_model,
 )
 from hmt_ros.experts.rendering_mark import RenderingMark
 from hmt_ros.experts.training_set import (
     PoseSequence,
+    TrainingSet,
     TrainingSettings,
     procedural_sequence,
+    recorded_sequence,
+    seen_from,
     training_set,
     typical_body,
 )
+from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS
 
 Item = TypeVar('Item')
@@ -55,74 +65,27 @@ Item = TypeVar('Item')
 PROCEDURAL_SEEDS, PROCEDURAL_SECONDS = 5, 12.0
 # Silhouettes that a predictor is scored on, and components of a prediction.
 TESTED, BEST_OF = 1000, 5
-
-
-@dataclass(frozen=True)
-class TrainingOptions:
-    """Options of the command.
-
-    Attributes:
-        output: File of the model; '.npz' is appended where it is missing.
-        overwrite: Whether an existing file is replaced.
-        quiet: Whether progress and summary are suppressed.
-        seed: Seed of all random choices.
-        report: Folder of the figures; None takes MODEL_report.
-        mocap: Files or folders of recorded motions.
-        without: Names of motions that are left out, without suffix.
-        alike: Names that start with it are of few motions, each done many times.
-        alike_share: Share of the poses of these that are taken.
-        test: Folder of motions of other people to score on, or None.
-        acknowledgement: What to say of the sources in the file.
-        motions: 'procedural' for all procedural motions, names with commas, or None.
-        body: Body model: a name or a YAML file.
-        model: Name of the model that learns.
-        experts: Number of experts; None takes the default of the model.
-        samples: Number of silhouettes.
-        dynamics: Whether p(x_t | x_t-1, r_t) is learned as well.
-        resume: Whether a training that was broken off goes on.
-    """
-
-    output: Path
-    overwrite: bool
-    quiet: bool
-    seed: int
-    report: Path | None
-    mocap: list[Path]
-    without: list[str]
-    alike: str
-    alike_share: float
-    test: Path | None
-    acknowledgement: str
-    motions: str | None
-    body: str
-    model: str
-    experts: int | None
-    samples: int
-    dynamics: bool
-    resume: bool
+# Figures of the training set: affinities (BME fig. 7), multimodality (BME fig. 6), examples.
+ACTIVITIES = 3  # maximum number of activities whose affinities are drawn
+FRAMES = 120  # maximum number of frames of each
+ANALYSED = 2000  # maximum number of samples whose multimodality is counted
+FINE, COARSE = 0.956, 0.70  # clusters per sample, as in the paper: 1912 and 1409 of 2000
+EXAMPLES = (4, 12)  # rows and columns of silhouettes
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
-    return run_command(
-        _parser(), lambda arguments: _train(TrainingOptions(**vars(arguments))), argv
-    )
+    return run_command(_parser(), _train, argv)
 
 
 def _parser() -> CommandParser:
     parser = CommandParser(
         prog='train', description='Learns to predict poses from silhouettes of motions.'
     )
+    parser.add_model()
+    add_seed(parser)
     parser.add_argument(
-        '-o', '--output', type=Path, required=True, metavar='MODEL.npz', help='file of the model'
-    )
-    parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
-    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
-    parser.add_argument(
-        '--seed', type=whole_number(0), default=0, help='seed of all random choices (0)'
-    )
-    parser.add_argument(
-        '--report', type=Path, metavar='DIR', help='folder for the figures (MODEL_report)'
+        '--report', type=Path, metavar='DIR', help='folder for the figures (FILE_report)'
     )
 
     motion = parser.add_argument_group('motions')
@@ -136,9 +99,7 @@ def _parser() -> CommandParser:
         '--motions', metavar='NAMES',
         help=f'"procedural" for all, or names with commas ({", ".join(PROCEDURAL_MOTIONS)})',
     )  # fmt: skip
-    motion.add_argument(
-        '--body', default='human37', help='body model: a name or a YAML file (human37)'
-    )
+    add_body(motion)
 
     learning = parser.add_argument_group('learning')
     learning.add_argument(
@@ -162,12 +123,12 @@ def _parser() -> CommandParser:
     )  # fmt: skip
     learning.add_argument(
         '--resume', action='store_true',
-        help='go on with a training that was broken off; its silhouettes are kept beside MODEL',
+        help='go on with a training that was broken off; its silhouettes are kept beside FILE',
     )  # fmt: skip
     return parser
 
 
-def _train(options: TrainingOptions) -> int:
+def _train(options: argparse.Namespace) -> int:
     output = model_file(options.output, overwrite=options.overwrite)
     if options.model == 'network':
         check_tools()
@@ -204,7 +165,7 @@ def _train(options: TrainingOptions) -> int:
         predictor = learned_predictor(body, seen, model, dynamics, notes, options.seed)
     if options.test is not None:
         files = chosen_motions([options.test], [])
-        tested = read_motions('train', files, options.body, quiet=options.quiet)
+        tested = read_motions('train', files, options.body, recorded_sequence, quiet=options.quiet)
         predictor.notes['scored on'] = sorted(one.name for one in tested)
         with show_progress('scoring', quiet=options.quiet):
             predictor.notes['scores'] = _scores(predictor, tested)
@@ -238,12 +199,12 @@ def _bars(quiet: bool) -> Callable[[str, str], Callable[[Iterable[Item], int], I
     return bar
 
 
-def _say(options: TrainingOptions, text: str) -> None:
+def _say(options: argparse.Namespace, text: str) -> None:
     if not options.quiet:
         print(text, flush=True)
 
 
-def _sequences(options: TrainingOptions, body: Body) -> tuple[list[PoseSequence], int]:
+def _sequences(options: argparse.Namespace, body: Body) -> tuple[list[PoseSequence], int]:
     """Motions to learn from, and the number of files that cannot be used."""
     if not options.mocap and options.motions is None:
         raise ValueError('nothing to learn from: give --mocap DIR or --motions procedural')
@@ -255,9 +216,7 @@ def _sequences(options: TrainingOptions, body: Body) -> tuple[list[PoseSequence]
                 for i in range(PROCEDURAL_SEEDS)
             ]
     files = chosen_motions(options.mocap, options.without)
-    read = read_motions('train', files, options.body, quiet=options.quiet)
-    if files and not read:
-        raise ValueError(f'none of the {len(files)} motions in {options.mocap[0]} can be used')
+    read = read_motions('train', files, options.body, recorded_sequence, quiet=options.quiet)
     return [*sequences, *read], len(files) - len(read)
 
 
@@ -304,5 +263,125 @@ def _procedural_names(text: str) -> list[str]:
     return names
 
 
-if __name__ == '__main__':
-    sys.exit(main())
+def write_report(
+    folder: Path,
+    body: Body,
+    sequences: Sequence[PoseSequence],
+    pairs: TrainingSet,
+    training: Described,
+) -> list[tuple[Path, str]]:
+    """Draws the figures into a folder.
+
+    Args:
+        folder: Folder that exists.
+        body: Body of the poses.
+        sequences: Motions.
+        pairs: Silhouettes and poses.
+        training: Descriptors and targets.
+
+    Returns:
+        The path of each figure, and a description.
+    """
+    figures = [
+        (
+            _affinity_figure(body, sequences, training),
+            'affinities.png',
+            'affinity of joint angles and descriptors over time',
+        ),
+        (
+            _multimodality_figure(training),
+            'multimodality.png',
+            'clusters of poses under one cluster of descriptors',
+        ),
+        (_example_figure(pairs), 'silhouettes.png', 'silhouettes of the training set'),
+    ]
+    result = []
+    for figure, name, what in figures:
+        figure.savefig(folder / name)
+        result.append((folder / name, what))
+    return result
+
+
+def _affinity_figure(body: Body, sequences: Sequence[PoseSequence], training: Described) -> Figure:
+    chosen = _of_different_activities(sequences)
+    columns = ('joint angles', 'shape contexts', 'edge pairs', 'descriptor')
+    with mpl.rc_context(STYLE):
+        figure = Figure((1.9 * len(columns) + 0.4, 1.9 * len(chosen) + 0.5), dpi=110)
+        axes = figure.subplots(len(chosen), len(columns), squeeze=False)
+        for number, sequence in enumerate(chosen):
+            row = axes[number]
+            # The person on average looks across the image; long motions have half the rate.
+            step = 2 if len(sequence.poses) >= 2 * FRAMES else 1
+            poses, masks = seen_from(body, sequence, 90.0, frames=slice(0, FRAMES * step, step))
+            parts = [silhouette_parts(mask, training.descriptor.points) for mask in masks]
+            histograms = [training.descriptor.codebook_.histogram(part.contexts) for part in parts]
+            vectors = (
+                poses[:, AXES:],
+                np.sqrt(np.array(histograms)),
+                np.sqrt(np.array([part.edge_pairs for part in parts])),
+                training.descriptor.describe(parts),
+            )
+            for one, title, values in zip(row, columns, vectors, strict=True):
+                one.imshow(affinities(values), cmap='viridis', vmin=0.0, vmax=1.0)
+                one.set_xticks([])
+                one.set_yticks([])
+                if number == 0:
+                    one.set_title(title)
+            row[0].set_ylabel(f'{sequence.activity}, {len(masks)} frames')
+        figure.tight_layout()
+    return figure
+
+
+def _of_different_activities(sequences: Sequence[PoseSequence]) -> list[PoseSequence]:
+    """The longest motion of some activities, walking first."""
+    longest: dict[str, PoseSequence] = {}
+    for sequence in sequences:
+        known = longest.get(sequence.activity)
+        if known is None or len(sequence.poses) > len(known.poses):
+            longest[sequence.activity] = sequence
+    order = sorted(longest.values(), key=lambda x: (x.activity != 'walk', -len(x.poses), x.name))
+    return order[:ACTIVITIES]
+
+
+def _multimodality_figure(training: Described) -> Figure:
+    count = min(ANALYSED, len(training.targets))
+    rows = np.sort(np.random.default_rng(0).permutation(len(training.targets))[:count])
+    inputs, targets = training.descriptors[rows], _scaled(training.targets[rows])
+    before = _scaled(training.previous[rows])
+    before *= np.sqrt(inputs.var(0).sum() / max(before.var(0).sum(), 1e-12))
+    cases = (
+        ('p(x | r)', inputs, FINE),
+        ('p(x | x-, r)', np.hstack([before, inputs]), FINE),
+        ('p(x | x-, r)', np.hstack([before, inputs]), COARSE),
+    )
+    with mpl.rc_context(STYLE):
+        figure = Figure((8.0, 2.6), dpi=110)
+        for one, (title, values, share) in zip(figure.subplots(1, 3), cases, strict=True):
+            clusters = max(int(share * count), 1)
+            found = multimodality(values, targets, clusters)
+            one.bar(np.arange(1, len(found) + 1), np.maximum(found, 0.5), color='#3b6ea5')
+            one.set_yscale('log')
+            one.set_title(f'{title}, {clusters} clusters of {count}')
+            one.set_xlabel('clusters of poses')
+        figure.axes[0].set_ylabel('clusters of descriptors')
+        figure.tight_layout()
+    return figure
+
+
+def _scaled(values: Array) -> Array:
+    result: Array = values / np.maximum(values.std(0), 1e-6)
+    return result
+
+
+def _example_figure(pairs: TrainingSet) -> Figure:
+    rows, columns = EXAMPLES
+    chosen = np.linspace(0, len(pairs) - 1, rows * columns).astype(int)
+    with mpl.rc_context(STYLE):
+        figure = Figure((0.8 * columns, 1.0 * rows), dpi=110)
+        grid: Any = figure.subplots(rows, columns, squeeze=False)
+        for one, sample in zip(grid.ravel(), chosen, strict=True):
+            one.imshow(pairs.mask(int(sample)), cmap='gray_r')
+            one.set_axis_off()
+            one.set_title(pairs.activities[sample], fontsize=6.0, pad=1.0)
+        figure.subplots_adjust(0.01, 0.01, 0.99, 0.95, 0.05, 0.2)
+    return figure

@@ -20,9 +20,8 @@ from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from msg_tools.files.error_line import error_line
 from msg_tools.messages import keypoints
-from msg_tools.messages.depth_images import decode_depth
 from msg_tools.messages.detections import BOXES, FLOATS, PEOPLE_2D, SKELETON_2D, YOLO
-from msg_tools.messages.images import MAX_PIXELS, decode_mask
+from msg_tools.messages.images import MAX_PIXELS, decode_depth, decode_mask
 from msg_tools.messages.keypoints import positions_of
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 

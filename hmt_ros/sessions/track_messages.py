@@ -28,11 +28,10 @@ from hmt_ros.tracking.ground import Ground
 from msg_tools import MessageFactory
 from msg_tools.messages.bodies import description_message, message_of_body
 from msg_tools.messages.ground import GROUND, GroundState, ground_message
-from msg_tools.messages.ground_markers import ground_markers, removed_ground
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.keep_out import KEEP_OUT, keep_out_markers, keep_out_message
-from msg_tools.messages.markers import skeleton_markers
-from msg_tools.messages.person_poses import PERSON_POSE, person_pose, person_pose_message
+from msg_tools.messages.markers import ground_markers, removed_ground, skeleton_markers
+from msg_tools.messages.people import PERSON_POSE, person_pose, person_pose_message
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from msg_tools.bags.bag_folder import BagFolder, unfinished_folders
 from msg_tools.bags.bag_metadata import (
     DATABASE_SUFFIXES,
     FILE_NAME,
@@ -18,8 +17,9 @@ from msg_tools.bags.bag_metadata import (
     read_file_names,
     recorded_quality_of_service,
 )
+from msg_tools.bags.bag_writer import BagFolder, unfinished_folders
 from msg_tools.bags.contents import BagError, Channel, absolute_name, reason
-from msg_tools.bags.decompression import ZSTD_MAGIC, DecompressionError, decompress_file
+from msg_tools.bags.mcap_records import ZSTD_MAGIC, DecompressionError, decompress_file
 from msg_tools.bags.mcap_salvage import (
     Loss,
     McapSalvage,

@@ -2,8 +2,12 @@
 
 Topics have absolute names, because rosbag2 compares names as they are written: a relative name is
 in the namespace of the bag, as the one of a node is in the node's. Log time and publish time are
-both the stamp that the caller gives. `msg_tools.bags.bag_folder` describes what happens to a bag
-that is not completed.
+both the stamp that the caller gives.
+
+The bag is written into a hidden folder `.<name>.<random>.partial` next to its place and moved there
+when it is complete and on the disk; an error removes it. If the process is killed the hidden folder
+stays: each complete chunk is handed to the system at once, so that `bag_recovery` finds all but the
+last. Chunks, data and summary have checksums. The same calls write the same bytes.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
@@ -13,14 +17,276 @@ that is not completed.
 from __future__ import annotations
 
 import os
-from contextlib import AbstractContextManager
-from typing import Any, NamedTuple
+import re
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
 
-from msg_tools.bags.bag_folder import BagFolder
-from msg_tools.bags.bag_metadata import quality_of_service
+from mcap.writer import CompressionType, Writer
+
+from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES, VERSION, as_yaml, quality_of_service
 from msg_tools.bags.contents import BagError, Channel, absolute_name, reason
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.message_types import typestore
+
+LIBRARY = 'hmt_ros'
+CHUNK_BYTES = 2**20
+_PARTIAL = '.partial'
+
+
+@dataclass
+class _Written:
+    """A channel of the file."""
+
+    channel: Channel
+    offered_qos: list[dict[str, Any]]
+    type_hash: str
+    message_count: int = 0
+
+
+class BagFolder:
+    """A bag that is being written.
+
+    Args:
+        path: folder to write, `<name>`; the file in it is `<name>.mcap`.
+        overwrite: replace a bag that is there. Anything else that is there is never touched.
+        profile: of the MCAP file.
+
+    Raises:
+        BagError: the folder exists, can not be created or written.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], *, overwrite: bool = False, profile: str = 'ros2'
+    ) -> None:
+        self.path = Path(path).absolute()
+        self._overwrite = overwrite
+        self._check_target()
+        self._channels: dict[int, _Written] = {}
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._start: int | None = None
+        self._end = 0
+        self._folder: Path | None = self.path.with_name(
+            f'.{self.path.name}.{secrets.token_hex(4)}{_PARTIAL}'
+        )
+        self._file: BinaryIO | None = None
+        self._handed_over = 0
+        with self.dropping_on_error():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir()
+            self._file = (self._folder / self._file_name).open('xb')
+            self._writer = Writer(
+                self._file,
+                chunk_size=CHUNK_BYTES,
+                compression=CompressionType.ZSTD,
+                enable_crcs=True,
+                enable_data_crcs=True,
+            )
+            self._writer.start(profile=profile, library=LIBRARY)
+
+    def add_channel(
+        self, channel: Channel, offered_qos: list[dict[str, Any]], type_hash: str
+    ) -> int:
+        """Announces messages.
+
+        Args:
+            channel: what they are.
+            offered_qos: quality of service that their publishers offered, as in metadata.yaml.
+            type_hash: RIHS01 hash of the type, or ''.
+
+        Returns:
+            What `add_message` wants.
+        """
+        with self.dropping_on_error():
+            schema = 0
+            if channel.msgtype:
+                key = channel.msgtype, channel.definition_encoding, channel.definition
+                known = self._schemas.get(key)
+                schema = self._writer.register_schema(*key) if known is None else known
+                self._schemas[key] = schema
+            result = self._writer.register_channel(
+                channel.topic,
+                channel.encoding,
+                schema,
+                {'offered_qos_profiles': as_yaml(offered_qos), 'topic_type_hash': type_hash},
+            )
+        self._channels[result] = _Written(channel, offered_qos, type_hash)
+        return result
+
+    def add_message(
+        self, channel: int, log_time_ns: int, data: bytes, publish_time_ns: int, sequence: int = 0
+    ) -> None:
+        """Writes a message of a channel.
+
+        Raises:
+            BagError: the disk is full.
+        """
+        with self.dropping_on_error():
+            self._writer.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
+            self._hand_over()
+        self._channels[channel].message_count += 1
+        self._start = log_time_ns if self._start is None else min(self._start, log_time_ns)
+        self._end = max(self._end, log_time_ns)
+
+    def add_metadata(self, name: str, content: dict[str, str]) -> None:
+        """Writes a record of metadata."""
+        with self.dropping_on_error():
+            self._writer.add_metadata(name, content)
+
+    def add_attachment(
+        self, name: str, media_type: str, log_time_ns: int, create_time_ns: int, data: bytes
+    ) -> None:
+        """Writes an attachment."""
+        with self.dropping_on_error():
+            self._writer.add_attachment(create_time_ns, log_time_ns, name, media_type, data)
+
+    def close(self) -> None:
+        """Completes the bag and moves it to its place; does nothing when that has been done.
+
+        Raises:
+            BagError: the disk is full, or the place is taken meanwhile; nothing is left behind.
+        """
+        if self._folder is None or self._file is None:
+            return
+        with self.dropping_on_error():
+            information = self._information()
+            self._writer.add_metadata('rosbag2', {'serialized_metadata': as_yaml(information)})
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            with (self._folder / FILE_NAME).open('x', encoding='utf-8') as file:
+                file.write(as_yaml({'rosbag2_bagfile_information': information}))
+                file.flush()
+                os.fsync(file.fileno())
+            _sync_folder(self._folder)
+            self._move_into_place(self._folder)
+        self._folder = None
+
+    def abort(self) -> None:
+        """Drops everything that was written."""
+        folder, self._folder = self._folder, None
+        if folder is None:
+            return
+        if self._file is not None:
+            # Closing writes what is buffered, and fails again on a full disk: nothing is to be
+            # saved.
+            with suppress(OSError):
+                self._file.close()
+        shutil.rmtree(folder, ignore_errors=True)
+
+    @property
+    def _file_name(self) -> str:
+        return f'{self.path.name}.mcap'
+
+    @contextmanager
+    def dropping_on_error(self) -> Iterator[None]:
+        """Removes the unfinished bag when an exception passes, and turns OSError into BagError."""
+        if self._folder is None:
+            raise BagError(f'{self.path} is closed')
+        try:
+            yield
+        except OSError as error:
+            self.abort()
+            raise BagError(f'{self.path} can not be written: {reason(error)}') from error
+        except BaseException:
+            self.abort()
+            raise
+
+    def _check_target(self) -> None:
+        """The place must be free, or hold a bag that may be replaced."""
+        if self.path.name in ('', '..'):
+            raise BagError(f'{self.path} is not the name of a folder')
+        if not os.path.lexists(self.path):
+            return
+        if not self._overwrite:
+            raise BagError(f'{self.path} exists; give another name, or ask to overwrite it')
+        try:
+            names = sorted(path.name for path in self.path.iterdir())
+        except OSError as error:
+            raise BagError(f'{self.path} can not be replaced: {reason(error)}') from error
+        foreign = [name for name in names if name != FILE_NAME and not name.endswith(SUFFIXES)]
+        if self.path.is_symlink() or (names and FILE_NAME not in names) or foreign:
+            what = f'it has {foreign[0]}' if foreign else 'it is not the folder of a bag'
+            raise BagError(f'{self.path} is not replaced: {what}; give another name')
+
+    def _move_into_place(self, folder: Path) -> None:
+        self._check_target()
+        aside = folder.with_suffix('.replaced')
+        replaces = self.path.exists()
+        if replaces:
+            self.path.rename(aside)
+        try:
+            folder.rename(self.path)
+        except BaseException:
+            if replaces:
+                aside.rename(self.path)
+            raise
+        _sync_folder(self.path.parent)
+        if replaces:
+            shutil.rmtree(aside, ignore_errors=True)
+
+    def _hand_over(self) -> None:
+        """Hands what the library has written to the system, where it outlives the process."""
+        assert self._file is not None
+        written = self._file.tell()
+        if written != self._handed_over:
+            self._file.flush()
+            self._handed_over = written
+
+    def _information(self) -> dict[str, Any]:
+        """Content of metadata.yaml, as rosbag2 of Jazzy writes it."""
+        start = 2**63 - 1 if self._start is None else self._start
+        span = {
+            'duration': {'nanoseconds': max(0, self._end - start)},
+            'starting_time': {'nanoseconds_since_epoch': start},
+            'message_count': sum(written.message_count for written in self._channels.values()),
+        }
+        return {
+            'version': VERSION,
+            'storage_identifier': 'mcap',
+            **span,
+            'topics_with_message_count': [
+                {
+                    'topic_metadata': {
+                        'name': written.channel.topic,
+                        'type': written.channel.msgtype,
+                        'serialization_format': written.channel.encoding,
+                        'offered_qos_profiles': written.offered_qos,
+                        'type_description_hash': written.type_hash,
+                    },
+                    'message_count': written.message_count,
+                }
+                for written in self._channels.values()
+            ],
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [self._file_name],
+            'files': [{'path': self._file_name, **span}],
+            'custom_data': None,
+            'ros_distro': 'jazzy',
+        }
+
+
+def unfinished_folders(path: Path) -> list[Path]:
+    """Hidden folders of a bag whose writers were killed, or still write."""
+    path = path.absolute()
+    if not path.parent.is_dir():
+        return []
+    pattern = re.compile(rf'\.{re.escape(path.name)}\.[0-9a-f]{{8}}{re.escape(_PARTIAL)}')
+    return [folder for folder in sorted(path.parent.iterdir()) if pattern.fullmatch(folder.name)]
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 class _Topic(NamedTuple):

@@ -23,20 +23,14 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from mcap.opcode import Opcode
+
 from msg_tools.bags.contents import BagError, Channel, Source, StoredMessage, merge, reason
 from msg_tools.bags.mcap_records import (
-    CHANNEL,
-    CHUNK,
     CHUNK_HEAD,
-    DATA_END,
-    FOOTER,
-    HEADER,
     MAGIC,
-    MESSAGE,
     MESSAGE_HEAD,
     RECORD,
-    SCHEMA,
-    STATISTICS,
     DamageError,
     Fields,
     checksum_of,
@@ -172,9 +166,9 @@ class McapFile:
         while True:
             opcode, length = record_head(file, offset, size)
             body = offset + RECORD.size
-            if (opcode == HEADER) != (offset == len(MAGIC)):
+            if (opcode == Opcode.HEADER) != (offset == len(MAGIC)):
                 raise DamageError(f'is damaged at byte {offset}: record of type {opcode}')
-            if opcode == MESSAGE:
+            if opcode == Opcode.MESSAGE:
                 key, _, time, _ = MESSAGE_HEAD.unpack(read_exactly(file, MESSAGE_HEAD.size))
                 self._bare_counts[key] += 1
                 bytes_here = RECORD.size + length
@@ -187,16 +181,16 @@ class McapFile:
                 else:
                     run = _Block(time, time, offset, bytes_here, is_chunk=False)
                     self._blocks.append(run)
-            elif opcode == CHUNK:
+            elif opcode == Opcode.CHUNK:
                 start, end, _, _ = CHUNK_HEAD.unpack(read_exactly(file, CHUNK_HEAD.size))
                 self._blocks.append(_Block(start, end, body, length, is_chunk=True))
-            elif opcode in (SCHEMA, CHANNEL):
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._register(opcode, read_exactly(file, length), offset)
-            elif opcode == DATA_END:
+            elif opcode == Opcode.DATA_END:
                 fields = Fields(read_exactly(file, length), offset)
                 self._data_checksum = offset, fields.u32()
                 return body + length
-            elif opcode == FOOTER:
+            elif opcode == Opcode.FOOTER:
                 return offset
             offset = file.seek(body + length)
 
@@ -207,11 +201,11 @@ class McapFile:
         while True:
             opcode, length = record_head(file, offset, size)
             end = offset + RECORD.size + length
-            if opcode in (SCHEMA, CHANNEL):
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._register(opcode, read_exactly(file, length), offset)
-            elif opcode == STATISTICS:
+            elif opcode == Opcode.STATISTICS:
                 statistics = Fields(read_exactly(file, length), offset).statistics()
-            elif opcode == FOOTER:
+            elif opcode == Opcode.FOOTER:
                 fields = Fields(read_exactly(file, length), offset)
                 fields.skip(16)
                 checksum = fields.u32()
@@ -289,16 +283,16 @@ class McapFile:
     ) -> Iterator[tuple[int, int, memoryview]]:
         """Log time, channel and data of the messages, in the order of the file."""
         for opcode, start, end in records_in(data, block.offset):
-            if opcode == MESSAGE:
+            if opcode == Opcode.MESSAGE:
                 key, _, time, _ = MESSAGE_HEAD.unpack_from(data, start)
                 yield time, key, data[start + MESSAGE_HEAD.size : end]
-            elif opcode in (SCHEMA, CHANNEL):
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._register(opcode, data[start:end], block.offset)
 
     def _register(self, opcode: int, body: bytes | memoryview, offset: int) -> None:
         fields = Fields(body, offset)
         key = fields.u16()
-        if opcode == SCHEMA:
+        if opcode == Opcode.SCHEMA:
             schema = fields.text(), fields.text(), fields.block()
             if self._schemas.setdefault(key, schema) != schema:
                 raise DamageError(f'is damaged at byte {offset}: schema {key} is given twice')

@@ -3,7 +3,7 @@
 A chunk is intact if its checksum fits or, without a checksum, if it can be decompressed and divided
 into records; outside of chunks a record is intact if the file contains all of it. After damage the
 search goes on for the next chunk. An intact summary gives the channels whose description was lost,
-and the number of messages.
+and the number of messages. The library `mcap` has nothing of the kind: its readers end at damage.
 """
 
 from __future__ import annotations
@@ -16,25 +16,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from mcap.opcode import Opcode
+
 from msg_tools.bags.contents import BagError, Channel, reason
-from msg_tools.bags.decompression import MAX_BYTES
 from msg_tools.bags.mcap_records import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK,
     CHUNK_HEAD,
-    DATA_END,
-    FOOTER,
     FOOTER_BYTES,
-    HEADER,
     MAGIC,
-    MESSAGE,
+    MAX_BYTES,
     MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    METADATA,
     RECORD,
-    SCHEMA,
-    STATISTICS,
     DamageError,
     Fields,
     checksum_of,
@@ -45,7 +36,16 @@ from msg_tools.bags.mcap_records import (
 )
 
 # What stands before the summary.
-_DATA_RECORDS = (HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA)
+_DATA_RECORDS = (
+    Opcode.HEADER,
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.MESSAGE,
+    Opcode.CHUNK,
+    Opcode.MESSAGE_INDEX,
+    Opcode.ATTACHMENT,
+    Opcode.METADATA,
+)
 _DATA_END_BYTES = 4
 # As many bytes of the mark at the start may be wrong.
 _WRONG_BYTES = 2
@@ -167,7 +167,7 @@ class McapSalvage:
         """Header and summary; what is wrong with them is found by whoever reads up to there."""
         with suppress(DamageError):
             opcode, length = record_head(file, len(MAGIC), size)
-            if opcode == HEADER:
+            if opcode == Opcode.HEADER:
                 self.profile = Fields(read_exactly(file, length), len(MAGIC)).text()
         try:
             self._read_summary(file, size)
@@ -179,7 +179,7 @@ class McapSalvage:
         if offset < len(MAGIC):
             raise DamageError('has no end')
         file.seek(offset)
-        if record_head(file, offset, size)[0] != FOOTER:
+        if record_head(file, offset, size)[0] != Opcode.FOOTER:
             raise DamageError('has no end')
         fields = Fields(read_exactly(file, FOOTER_BYTES - RECORD.size), offset)
         start = fields.u64()
@@ -192,9 +192,9 @@ class McapSalvage:
         at = file.seek(start)
         while at < offset:
             opcode, length = record_head(file, at, size)
-            if opcode in (SCHEMA, CHANNEL):
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._register(opcode, Fields(read_exactly(file, length), at))
-            elif opcode == STATISTICS:
+            elif opcode == Opcode.STATISTICS:
                 self.announced = Fields(read_exactly(file, length), at).u64()
             at = file.seek(at + RECORD.size + length)
 
@@ -207,11 +207,11 @@ class McapSalvage:
             try:
                 opcode, length = record_head(file, offset, size)
                 end = offset + RECORD.size + length
-                if opcode == FOOTER:
+                if opcode == Opcode.FOOTER:
                     if end + len(MAGIC) == size and file.seek(end) and file.read() == MAGIC:
                         return
                     raise DamageError(f'is damaged at byte {offset}: it seems to end there')
-                if opcode == DATA_END and length == _DATA_END_BYTES:
+                if opcode == Opcode.DATA_END and length == _DATA_END_BYTES:
                     summary = True
                 elif not summary:
                     yield from self._record(file, opcode, length, offset)
@@ -229,24 +229,24 @@ class McapSalvage:
             raise DamageError(
                 f'is damaged at byte {offset}: record of type {opcode} with {length} bytes'
             )
-        if opcode == CHUNK:
+        if opcode == Opcode.CHUNK:
             yield from self._chunk(read_exactly(file, length), offset)
-        elif opcode == MESSAGE:
+        elif opcode == Opcode.MESSAGE:
             data = memoryview(read_exactly(file, length))
             message = self._message(data)
             if message is None:
                 raise DamageError(f'has a message at byte {offset} that nothing describes')
             yield message
-        elif opcode == HEADER:
+        elif opcode == Opcode.HEADER:
             Fields(read_exactly(file, length), offset).text()
-        elif opcode in (SCHEMA, CHANNEL):
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             yield from self._described(
                 self._register(opcode, Fields(read_exactly(file, length), offset))
             )
-        elif opcode == METADATA:
+        elif opcode == Opcode.METADATA:
             fields = Fields(read_exactly(file, length), offset)
             yield SavedMetadata(fields.text(), fields.texts())
-        elif opcode == ATTACHMENT:
+        elif opcode == Opcode.ATTACHMENT:
             yield _attachment(read_exactly(file, length), offset)
         else:
             # An index is not needed; but what looks like one may be something else, damaged.
@@ -262,13 +262,13 @@ class McapSalvage:
         undescribed: Counter[int] = Counter()
         for opcode, start, end in records:
             record = data[start:end]
-            if opcode == MESSAGE:
+            if opcode == Opcode.MESSAGE:
                 message = self._message(record)
                 if message is None:
                     undescribed[int.from_bytes(record[:2], 'little')] += 1
                 else:
                     yield message
-            elif opcode in (SCHEMA, CHANNEL):
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 yield from self._described(self._register(opcode, Fields(record, offset)))
         if undescribed:
             self.losses.append(
@@ -283,7 +283,7 @@ class McapSalvage:
     def _register(self, opcode: int, fields: Fields) -> int | None:
         """Keeps a schema or a channel; the key of a channel."""
         key = fields.u16()
-        if opcode == SCHEMA:
+        if opcode == Opcode.SCHEMA:
             self._schemas[key] = fields.text(), fields.text(), fields.block()
             self._saved_channels.clear()
             return None
@@ -326,7 +326,7 @@ class McapSalvage:
         """Whether a record of the data seems to begin somewhere."""
         try:
             file.seek(offset)
-            return record_head(file, offset, size)[0] in (*_DATA_RECORDS, DATA_END)
+            return record_head(file, offset, size)[0] in (*_DATA_RECORDS, Opcode.DATA_END)
         except DamageError:
             return False
 
@@ -342,7 +342,7 @@ class McapSalvage:
                 offset
                 for mark in _COMPRESSIONS
                 for offset in _places(piece, mark, before)
-                if piece[offset] == CHUNK
+                if piece[offset] == Opcode.CHUNK
             ]
             for offset in sorted(found):
                 (length,) = RECORD.unpack_from(piece, offset)[1:]

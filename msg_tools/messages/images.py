@@ -2,6 +2,10 @@
 
 A decoded picture is always BGR, uint8, (H, W, 3), contiguous and writable. Messages of `rosbags`
 and of ROS will both do: the data may be any buffer of bytes.
+
+A depth image is registered to a colour image of the same size: each value is the depth of what that
+pixel shows, along the axis of the camera (REP 118). `16UC1` counts millimetres, 0 where nothing was
+measured; `32FC1` counts metres, NaN where nothing was measured.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from msg_tools.messages.message_types import MessageFactory
 
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Depth = NDArray[np.float32]
 
 # Larger pictures are taken for damage, before memory is spent on them.
 MAX_PIXELS = 2**26
@@ -77,6 +82,8 @@ _MASKS = ('mono8', '8UC1')
 _PLANAR = ('nv12', 'nv21')
 # Two neighbours share their chroma, or a colour pattern repeats.
 _EVEN_WIDTH = ('yuv422', 'uyvy', 'yuv422_yuy2', 'yuyv', *_PLANAR)
+# Encoding: dtype and how many of its units are a metre. Some drivers say mono16 for 16UC1.
+_DEPTH_ENCODINGS = {'16UC1': ('u2', 1000), 'mono16': ('u2', 1000), '32FC1': ('f4', 1)}
 
 
 def decode_image(message: Any) -> Picture:
@@ -327,4 +334,56 @@ def image_message(
         is_bigendian=0,
         step=width * (3 if image.ndim == 3 else 1),
         data=np.ascontiguousarray(image).reshape(-1),
+    )
+
+
+def decode_depth(message: Any) -> Depth:
+    """The depths (H, W) of a sensor_msgs/Image, m, float32; 0 or NaN where nothing was measured.
+
+    Raises:
+        ImageError: another encoding, or sizes that contradict each other.
+    """
+    encoding = str(message.encoding)
+    if encoding not in _DEPTH_ENCODINGS:
+        raise ImageError(f'depth has encoding {encoding!r}, wanted 16UC1 in mm or 32FC1 in m')
+    kind, units = _DEPTH_ENCODINGS[encoding]
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    dtype = np.dtype(kind).newbyteorder('>' if message.is_bigendian else '<')
+    row_bytes = width * dtype.itemsize
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise ImageError(f'depth has size {width}x{height}, wanted 1 to {MAX_PIXELS} pixels')
+    data = np.frombuffer(message.data, dtype=np.uint8) if len(message.data) else np.zeros(0, 'u1')
+    if step < row_bytes or len(data) != height * step:
+        raise ImageError(
+            f'depth has {len(data)} bytes and a step of {step}, wanted {height} rows of at least '
+            f'{row_bytes} for {width} {encoding}'
+        )
+    rows = np.ascontiguousarray(data.reshape(height, step)[:, :row_bytes])
+    result: Depth = rows.view(dtype).astype(np.float32) / np.float32(units)
+    return result
+
+
+def depth_message(
+    messages: MessageFactory, depth: NDArray[np.uint16] | Depth, stamp_ns: int, frame_id: str
+) -> Any:
+    """sensor_msgs/Image of depths (H, W): uint16 in mm becomes 16UC1, float32 in m 32FC1.
+
+    Raises:
+        ImageError: an array of another shape or type.
+    """
+    encoding = {'uint16': '16UC1', 'float32': '32FC1'}.get(depth.dtype.name)
+    if encoding is None or depth.ndim != 2 or not depth.size:
+        raise ImageError(
+            f'depth is {depth.dtype} {depth.shape}, wanted uint16 in mm or float32 in m, (H, W)'
+        )
+    little = np.ascontiguousarray(depth).astype(depth.dtype.newbyteorder('<'), copy=False)
+    return messages.create(
+        'sensor_msgs/msg/Image',
+        header=header_message(messages, stamp_ns, frame_id),
+        height=depth.shape[0],
+        width=depth.shape[1],
+        encoding=encoding,
+        is_bigendian=0,
+        step=depth.shape[1] * depth.dtype.itemsize,
+        data=little.view(np.uint8).reshape(-1),
     )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import MessageError, check_finite, freeze_arrays, numbers
 from msg_tools.messages.message_types import MessageFactory
+from msg_tools.messages.states import pose_message
 
 KEEP_OUT = 'hmt_msgs/msg/KeepOut'
 
@@ -137,7 +138,7 @@ def collision_shapes(messages: MessageFactory, content: KeepOut) -> tuple[list[A
         solids.append(
             messages.create('shape_msgs/msg/SolidPrimitive', type=solid, dimensions=dimensions)
         )
-        poses.append(_pose(messages, place, turn))
+        poses.append(pose_message(messages, place, turn))
     return solids, poses
 
 
@@ -158,7 +159,7 @@ def keep_out_markers(messages: MessageFactory, content: KeepOut) -> Any:
                 id=number,
                 type=kind,
                 action=_ADD,
-                pose=_pose(messages, place, turn),
+                pose=pose_message(messages, place, turn),
                 scale=messages.create('geometry_msgs/msg/Vector3', **scale),
                 color=colour,
             )
@@ -187,13 +188,3 @@ def _turn_to(axis: Array) -> Array:
     x, y, z = axis.tolist()
     turn = np.array([-y, x, 0.0, 1.0 + z]) if z > -0.999999 else np.array([1.0, 0.0, 0.0, 0.0])
     return np.asarray(turn / np.linalg.norm(turn))
-
-
-def _pose(messages: MessageFactory, place: Array, turn: Array) -> Any:
-    px, py, pz = place.tolist()
-    x, y, z, w = turn.tolist()
-    return messages.create(
-        'geometry_msgs/msg/Pose',
-        position=messages.create('geometry_msgs/msg/Point', x=px, y=py, z=pz),
-        orientation=messages.create('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
-    )

@@ -124,6 +124,17 @@ def quaternions(rotations: ArrayLike) -> Array:
     return result
 
 
+def pose_message(messages: MessageFactory, place: ArrayLike, turn: ArrayLike) -> Any:
+    """geometry_msgs/Pose of a place (3,), m, and a quaternion (4,) x, y, z, w."""
+    px, py, pz = np.asarray(place, dtype=np.float64).tolist()
+    x, y, z, w = np.asarray(turn, dtype=np.float64).tolist()
+    return messages.create(
+        'geometry_msgs/msg/Pose',
+        position=messages.create('geometry_msgs/msg/Point', x=px, y=py, z=pz),
+        orientation=messages.create('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
+    )
+
+
 def transforms_message(
     messages: MessageFactory,
     parents: Sequence[str],

@@ -14,8 +14,7 @@ from hmt_ros.sessions.transform_buffer import TransformBuffer
 from hmt_ros.tracking.subject import read_subject
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
-from msg_tools.messages.depth_images import decode_depth
-from msg_tools.messages.images import decode_image
+from msg_tools.messages.images import decode_depth, decode_image
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared'))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.app import track_video
-from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import load_body
 from hmt_ros.tracking import read_subject

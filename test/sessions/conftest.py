@@ -20,9 +20,8 @@ from hmt_ros.tracking.ground import Ground
 from hmt_ros.tracking.validity import Validity
 from msg_tools import RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
-from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.images import compressed_image_message, image_message
+from msg_tools.messages.images import compressed_image_message, depth_message, image_message
 from msg_tools.messages.message_types import register_definitions
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 

@@ -9,9 +9,9 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import DEPTH, FilterSession
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import DETECTIONS, PeopleSession
-from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.detections import PEOPLE_2D
 from msg_tools.messages.headers import header_message
+from msg_tools.messages.images import depth_message
 
 
 @pytest.fixture

@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection, open_source
+from hmt_ros.app.import_video.frames import Frame, FrameSource, Masks, Selection, open_source
 from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
-from hmt_ros.app.import_video.masks import Masks
 from hmt_ros.app.import_video.persons import Choice, Chooser
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
@@ -223,15 +222,11 @@ def person_choice(text: str) -> Choice:
 
 
 def _import(arguments: argparse.Namespace) -> int:
+    tell = partial(tell_user, 'import-video')
     imported = import_video(ImportOptions.of(arguments, arguments.output), tell)
     if not arguments.quiet:
         print(f'{arguments.output}: {imported}')
     return 0
-
-
-def tell(text: str) -> None:
-    """Prints a line for the user on stderr, above the progress bar."""
-    tell_user('import-video', text)
 
 
 def import_video(options: ImportOptions, tell: Tell) -> Imported:
@@ -427,7 +422,3 @@ def _check_keypoints(options: ImportOptions, result: Imported) -> None:
             f'{options.keypoints}: {result.outside} of {result.inside + result.outside} keypoints '
             'lie outside of the images; were they found in images of another size, or not upright?'
         )
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
+from functools import partial
 from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, run_command
@@ -208,7 +208,7 @@ def _namespace(text: str) -> str:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    values = vars(arguments)
+    values, tell = vars(arguments), partial(tell_user, 'replay')
     bags, output, scheduler = (values.pop(name) for name in ('bags', 'output', 'scheduler'))
     options = ReplayOptions(**values)
     if is_many(bags, scheduler):
@@ -217,12 +217,3 @@ def _replay(arguments: argparse.Namespace) -> int:
     if not options.quiet:
         print(f'{output}: {replayed}')
     return 0
-
-
-def tell(text: str) -> None:
-    """Prints a line for the user on stderr, above the progress bar."""
-    tell_user('replay', text)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -161,16 +161,9 @@ def node_parameters(options: ReplayOptions, recorded: RecordedInput) -> NodePara
 
 
 def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> FilterParameters:
-    values = _given_values(options, FILTER)
-    given = {
-        'random_seed': options.seed,
-        'body_model': options.body,
-        'subject_file': options.subject,
-        'background_file': options.background,
-    }
-    for name, value in given.items():
-        if value is not None:
-            values[name] = str(value) if isinstance(value, Path) else value
+    values = _tracking_values(options, recorded, FILTER)
+    if options.subject is not None:
+        values['subject_file'] = str(options.subject)
     has_keypoints = recorded.of(KEYPOINTS) is not None
     if (source := values.get('source', OWN_KEYPOINTS)) != OWN_KEYPOINTS:
         detections = recorded.of(DETECTIONS)
@@ -178,24 +171,30 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
     values.setdefault('use_keypoints', has_keypoints)
     has_depth = recorded.of(KEYPOINTS_3D) is not None and values['use_keypoints'] is True
     values.setdefault('use_keypoints_3d', has_depth)
-    _use_what_is_there(values, recorded, MASK, DEPTH)
-    _use_upright_frame(values, recorded)
-    values['image_transport'] = recorded.transport
-    values.setdefault('evaluation_budget', ACCURATE)
     return with_values(FilterParameters(), values)
 
 
-def _use_what_is_there(values: dict[str, Any], recorded: RecordedInput, *names: str) -> None:
-    """Inputs of the bag are used where the user says nothing of them."""
-    for row in (row for row in RECORDED if row.name in names):
-        values.setdefault(row.parameter, recorded.of(row.name) is not None)
+def _tracking_values(options: ReplayOptions, recorded: RecordedInput, node: str) -> dict[str, Any]:
+    """Values for a node that tracks; inputs and transforms of a bag are used where there are some.
 
-
-def _use_upright_frame(values: dict[str, Any], recorded: RecordedInput) -> None:
-    """What transforms of a bag tell is used where the user says nothing of it."""
+    What the user says of them counts.
+    """
+    values = _given_values(options, node)
+    given = {
+        'random_seed': options.seed,
+        'body_model': options.body,
+        'background_file': options.background and str(options.background),
+    }
+    values |= {name: value for name, value in given.items() if value is not None}
+    for row in RECORDED:
+        if row.name in (MASK, DEPTH):
+            values.setdefault(row.parameter, recorded.of(row.name) is not None)
     if 'gravity' not in values:
         values.setdefault('gravity_frame', recorded.upright_frame)
     values.setdefault('fixed_frame', recorded.upright_frame)
+    values['image_transport'] = recorded.transport
+    values.setdefault('evaluation_budget', ACCURATE)
+    return values
 
 
 def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> PeopleParameters:
@@ -217,18 +216,8 @@ def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> Peopl
     if detections is None or detections.msgtype not in sources:
         kinds = ', '.join(SOURCES[x].replace('/msg/', '/') for x in PeopleParameters.SOURCES)
         raise ValueError(f'--people needs the topic detections, of {kinds}: the bag has none')
-    values = _given_values(options, PEOPLE_NODE)
-    given = {
-        'random_seed': options.seed,
-        'body_model': options.body,
-        'background_file': None if options.background is None else str(options.background),
-    }
-    values |= {name: value for name, value in given.items() if value is not None}
+    values = _tracking_values(options, recorded, PEOPLE_NODE)
     values['source'] = sources[detections.msgtype]
-    _use_what_is_there(values, recorded, MASK, DEPTH)
-    _use_upright_frame(values, recorded)
-    values['image_transport'] = recorded.transport
-    values.setdefault('evaluation_budget', ACCURATE)
     return with_values(PeopleParameters(), values)
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmt_ros.app.bag_scores import chosen_topics, score_bag
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
+from hmt_ros.app.evaluate import chosen_topics, score_bag
 from hmt_ros.app.progress import Progress, show_progress
-from hmt_ros.app.recorded_bodies import body_topics
-from hmt_ros.app.report.grounds import read_grounds
+from hmt_ros.app.recorded_bodies import body_topics, read_grounds
 from hmt_ros.app.report.images import FilmStrip, ImageSource, film_strip, image_source
 from hmt_ros.app.report.mixtures import RecordedMixtures, read_mixtures
 from hmt_ros.app.report.page import Content, data_size, page_html
@@ -205,7 +203,3 @@ def _shown(mixtures: RecordedMixtures, most: int) -> list[int]:
     stamps = mixtures.stamps
     most = min(most, int(len(stamps) * min(DATA_BYTES / data_size(mixtures), 1.0)))
     return stamps[:: -(-len(stamps) // max(most, 1))]
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -10,7 +10,7 @@ import base64
 import html
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
@@ -18,10 +18,16 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.app.evaluate import as_json
-from hmt_ros.app.report.bands import ground_at, heights_of, intervals
-from hmt_ros.app.report.grounds import ground_data
 from hmt_ros.app.report.images import FilmStrip
-from hmt_ros.app.report.mixtures import Layer, Moment, RecordedMixtures, Window
+from hmt_ros.app.report.mixtures import (
+    Layer,
+    Moment,
+    RecordedMixtures,
+    Window,
+    ground_at,
+    heights_of,
+    intervals,
+)
 from hmt_ros.app.report.pictures import PROBABILITIES
 from hmt_ros.app.report.skeletons import LEFT, RIGHT, bones_of
 from hmt_ros.evaluation.pose_scores import LOST, ORIGIN, origin_joints
@@ -99,6 +105,29 @@ def page_html(content: Content) -> str:
     for name, text in parts.items():
         page = page.replace(f'<!-- {name} -->', text)
     return page
+
+
+def ground_data(grounds: dict[int, GroundState], stamps: Collection[int]) -> dict[str, Any] | None:
+    """The ground in the data of the page; None: nothing is known at these times.
+
+    Returns:
+        For each time or None: `planes`, (a, b, c, d) with a x + b y + c z + d = 0 on the floor, m,
+        camera optical frame; `contacts`, the probability that a foot stands on it by its side.
+    """
+    shown = [grounds.get(stamp) for stamp in stamps]
+    planes = [None if one is None else one.plane for one in shown]
+    contacts = [{} if one is None else one.contacts for one in shown]
+    if all(plane is None for plane in planes) and not any(contacts):
+        return None
+    return {
+        'planes': [
+            None if plane is None else [round(float(x), 6) for x in plane] for plane in planes
+        ],
+        'contacts': [
+            {foot.removesuffix('_foot'): round(float(p), 3) for foot, p in one.items()}
+            for one in contacts
+        ],
+    }
 
 
 def page_data(content: Content) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from hmt_ros.app.replay.background import ReadAhead, WriteBehind
+from hmt_ros.app.replay.one_bag import ReadAhead, WriteBehind
 
 
 def made(items):

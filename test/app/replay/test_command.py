@@ -26,9 +26,8 @@ from hmt_ros.tracking.validity import Validity
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.bodies import body_of
-from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import header_message, time_ns
-from msg_tools.messages.images import decode_image, image_message
+from msg_tools.messages.images import decode_image, depth_message, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from test.msg_tools.conftest import limited_file_size
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from hmt_ros.app.rendered_bag import FRAME_ID
-from hmt_ros.app.report.bands import PROBABILITIES, ground_at, intervals, marginals_of
+from hmt_ros.app.report.mixtures import PROBABILITIES, ground_at, intervals, marginals_of
 from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.ground import GroundState
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture

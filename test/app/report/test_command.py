@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.app.report import command as report
 from hmt_ros.app.report.images import ImageSource, film_strip

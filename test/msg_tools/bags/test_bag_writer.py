@@ -22,7 +22,7 @@ from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
-from msg_tools.bags import bag_folder
+from msg_tools.bags import bag_writer
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import typestore
 from test.msg_tools.conftest import limited_file_size
@@ -374,7 +374,7 @@ def test_failure_while_closing(
         return refuse() if path.suffix == '.partial' else rename(path, target)
 
     if step == 'fsync':
-        monkeypatch.setattr(bag_folder.os, 'fsync', refuse)
+        monkeypatch.setattr(bag_writer.os, 'fsync', refuse)
     else:
         rename = Path.rename
         monkeypatch.setattr(Path, 'rename', lambda a, b: refuse_the_new_folder(a, b, rename))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from msg_tools.bags import decompression
-from msg_tools.bags.decompression import (
+from msg_tools.bags import mcap_records
+from msg_tools.bags.mcap_records import (
     DecompressionError,
     decompress,
     decompress_file,
@@ -58,7 +58,7 @@ def test_unknown_compression() -> None:
 
 
 def test_more_than_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decompression, 'MAX_BYTES', 50_000)
+    monkeypatch.setattr(mcap_records, 'MAX_BYTES', 50_000)
     for packed in (zstandard.compress(DATA), zstd_without_size(DATA)):
         with pytest.raises(DecompressionError):
             decompress_zstd(packed)

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from msg_tools import RosbagsMessages
-from msg_tools.messages.depth_images import decode_depth, depth_message
 from msg_tools.messages.headers import time_ns
-from msg_tools.messages.images import ImageError
+from msg_tools.messages.images import ImageError, decode_depth, depth_message
 
 MESSAGES = RosbagsMessages()
 METRES = np.array([[0.0, 1.25, 2.5], [3.0, 0.5, 65.0]], np.float32)

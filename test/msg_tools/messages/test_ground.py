@@ -6,7 +6,7 @@ import pytest
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.messages.cdr import deserialise, serialise
 from msg_tools.messages.ground import GROUND, GroundState, ground_message, ground_of
-from msg_tools.messages.ground_markers import ground_markers, removed_ground
+from msg_tools.messages.markers import ground_markers, removed_ground
 
 STAMP = 1_700_000_000_123_456_789
 MESSAGES = RosbagsMessages()
