@@ -277,7 +277,7 @@ class MixtureFilter:
             candidates = candidates.joined(more)
         self._select(*self._weigh(search, search.optimise(candidates)), states, seen)
         self._stand(dt)
-        self._fit_shape(seen, ERRORS['shape'].share(dt), dt)
+        self._fit_shape(seen, ERRORS['shape'].share(dt))
         self.assess(seen, search)
 
     def assess(self, observation: Observation, search: Search | None = None) -> None:
@@ -442,7 +442,7 @@ class MixtureFilter:
             self._observed = observation, believed
         return self._observed[1]
 
-    def _fit_shape(self, observation: Observation, trust: float, dt: float = 0.0) -> bool:
+    def _fit_shape(self, observation: Observation, trust: float) -> bool:
         """Moves the shape by what an image says of it; False where that is nothing."""
         if not self.settings.estimate_shape:
             return False
@@ -453,7 +453,7 @@ class MixtureFilter:
         gradients, covariances = self._posterior.given_way(poses, observation)
         body = self.shape.update(
             self._posterior.likelihood, observation, poses[best], weights / weights.sum(),
-            gradients[best], covariances[best], trust=trust, dt=dt,
+            gradients[best], covariances[best], trust=trust,
         )  # fmt: skip
         self._posterior.evaluations += len(weights)
         self._use_body(body)

@@ -1,13 +1,17 @@
 """The shape of the person as a slow state: lengths and flesh, estimated as long as a track lasts.
 
     S_k = H_tt - H_tp C_k H_pt,    g_k = h_t - H_tp C_k h_p,    C_k = H_pp^-1            at mode k
-    P <- (( P + Q dt )^-1 + tau sum_k w_k S_k)^-1,    theta <- theta - tau P sum_k w_k g_k
     J_k = -C_k H_pt                                                                 dx_k / dtheta
+    A = sum tau S,    b = sum tau (S theta - g),    n = sum tau                over images and modes
+    P = (P_0^-1 + A / (1 + c n))^-1,    theta = P b / (1 + c n)
 
 theta is the shape (see `body.shape`), x_k the pose of mode k, h and H are gradient and Gauss-Newton
 Hessian of the energy of one image over both. A pose gives way to a wrong shape: what is left of the
-information when it does is the Schur complement S. Of every image only the share tau is believed
-(`inference.error_model`), as its errors are those of its neighbours. What is not known of the shape
+information when it does is the Schur complement S. Of every image only the share tau is believed,
+as its errors are those of its neighbours, and of all images together no more than 1 / c of one
+(`inference.error_model`): clothes, and what else the model lacks, are the same in all of them, and
+would in the end outweigh what is known of people. A person shrank by a tenth in half a minute so,
+seen by a silhouette that does not tell the size from the distance. What is not known of the shape
 is not known of the pose either: J P J' is added to the covariances of modes (a consider covariance,
 [Schmidt 1966]).
 """
@@ -25,13 +29,12 @@ from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.residuals import RECORDED
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import ERRORS
 
 # Standard deviations over people and clothes, by kind of growth: logarithms, m.
 SPREAD = dict(zip(GROWTH, (0.2, 0.2, 0.02, 0.02, 0.02), strict=True))
 # A length is hardly ever known better, m.
 LEAST_LENGTH_SIGMA = 0.008
-# What a shape wanders by itself in a second: a share of its standard deviation over people.
-WANDERING = 0.02
 # Largest change by one image, and in all, in standard deviations over people.
 LARGEST_STEP, LARGEST = 0.5, 3.0
 # The person stays as it was until the estimate is so far from it, in standard deviations over
@@ -77,7 +80,11 @@ class ShapeEstimate:
         self.covariance = np.diag(self._spread**2)
         own = slice(0, self._space.lengths)
         self.covariance[own, own] = body.length_covariance + np.diag(unknown)
-        self._offset = np.zeros(self._space.size)
+        self._prior = self.covariance
+        size = self._space.size
+        self._information, self._vector = np.zeros((size, size)), np.zeros(size)
+        self._count = 0.0
+        self._offset = np.zeros(size)
         # The offset of the person, who follows the estimate in steps.
         self._taken = self._offset
         self.images = 0
@@ -106,7 +113,6 @@ class ShapeEstimate:
         covariances: Array,
         *,
         trust: float,
-        dt: float,
     ) -> Body:
         """Uses one more image; returns the person.
 
@@ -117,7 +123,6 @@ class ShapeEstimate:
             gradients: (K, d) of the energy of the image and the body's prior, by the pose.
             covariances: (K, d, d) inverse Hessians of that energy; on a limit a variable has none.
             trust: tau, share of the image that is believed.
-            dt: time since the last image that was used, s.
         """
         size = self._space.size
         information, pull = np.zeros((size, size)), np.zeros(size)
@@ -129,11 +134,16 @@ class ShapeEstimate:
             shift = self._limited(covariance @ gradient, covariance)
             information += weight * (linear.curvature[k] - mixed @ (covariance @ mixed.T))
             pull += weight * (linear.by_shape[k] - mixed @ shift)
-        before = self.covariance + np.diag((WANDERING * self._spread) ** 2 * dt)
-        gained = trust * 0.5 * (information + information.T)
-        after = np.linalg.solve(np.eye(size) + before @ gained, before)
+        information = 0.5 * (information + information.T)
+        self._information += trust * information
+        self._vector += trust * (information @ self._taken - pull)
+        self._count += trust
+        believed = ERRORS['shape'].together(self._count)
+        after = np.linalg.solve(
+            np.eye(size) + believed * (self._prior @ self._information), self._prior
+        )
         self.covariance = 0.5 * (after + after.T)
-        move = -trust * self.covariance @ pull
+        move = believed * (self.covariance @ self._vector) - self._offset
         furthest = np.abs(move / self._spread).max()
         move *= min(1.0, LARGEST_STEP / max(float(furthest), 1e-12))
         limit = LARGEST * self._spread

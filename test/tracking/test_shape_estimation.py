@@ -17,6 +17,7 @@ from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
@@ -28,7 +29,6 @@ from hmt_ros.tracking.shape_estimation import (
     LARGEST_STEP,
     LEAST_LENGTH_SIGMA,
     SPREAD,
-    WANDERING,
     Linearised,
     ShapeEstimate,
 )
@@ -107,12 +107,12 @@ def toy(body, seed, noise=2e-3, measurements=120, pose_size=6):
     return Toy(body, by_shape, by_pose, measured), true
 
 
-def update(estimate, pose, trust=1.0, dt=0.0):
+def update(estimate, pose, trust=1.0):
     """One update from one mode with the energy of the toy."""
     gradient = estimate.by_pose.T @ estimate.error(pose) + pose
     covariance = np.linalg.inv(estimate.hessian())
     return estimate.update(
-        None, None, pose[None], np.ones(1), gradient[None], covariance[None], trust=trust, dt=dt
+        None, None, pose[None], np.ones(1), gradient[None], covariance[None], trust=trust
     )
 
 
@@ -125,7 +125,7 @@ def test_an_update_is_joint_least_squares_of_shape_and_pose(human37, trust, star
     prior = np.linalg.inv(estimate.covariance)
     size = len(prior)
     update(estimate, np.full(d, start), trust)
-    root = np.sqrt(trust)
+    root = np.sqrt(trust * ERRORS['shape'].together(trust))
     rows = np.block(
         [
             [root * estimate.by_shape, root * estimate.by_pose],
@@ -148,7 +148,7 @@ def test_modes_count_by_their_weights(human37):
     gradients = np.array([both.by_pose.T @ both.error(pose) + pose for pose in poses])
     both.update(
         None, None, poses, np.array([0.3, 0.7]), gradients, np.array([covariance] * 2),
-        trust=0.5, dt=0.0,
+        trust=0.5,
     )  # fmt: skip
     update(one, poses[0], trust=0.5)
     assert np.allclose(both.theta(), one.theta(), atol=1e-12)
@@ -167,15 +167,30 @@ def test_information_only_shrinks_what_is_not_known(human37):
     assert estimate.images == 3
 
 
-def test_a_shape_wanders_between_images(human37):
+def test_many_images_tell_no_more_than_their_common_error_lets_them(human37):
+    """Images that repeat each other: 1 / c of one is believed, and the prior of people stays."""
+    estimate, _ = toy(human37, 2)
+    prior = np.linalg.inv(estimate.covariance)
+    gained = []
+    for count in (1, 10, 1000):
+        while estimate.images < count:
+            update(estimate, np.zeros(6), trust=0.2)
+        gained.append(np.trace(np.linalg.inv(estimate.covariance) - prior))
+    c = ERRORS['shape'].constant
+    wanted = [0.2 * n / (1.0 + 0.2 * c * n) for n in (1, 10, 1000)]
+    assert np.array(gained) / gained[0] == pytest.approx(np.array(wanted) / wanted[0], rel=1e-6)
+    assert wanted[-1] < 1.0 / c
+
+
+def test_nothing_is_learned_where_nothing_is_seen(human37):
     estimate = ShapeEstimate(human37)
     empty = np.zeros((1, human37.dimension))
-    before = np.diagonal(estimate.covariance).copy()
+    before = estimate.covariance.copy()
     estimate.update(
         ImageLikelihood(human37, CAMERA), Observation(), empty, np.ones(1), empty,
-        np.eye(human37.dimension)[None], trust=0.35, dt=10.0,
+        np.eye(human37.dimension)[None], trust=0.35,
     )  # fmt: skip
-    assert np.diagonal(estimate.covariance) == pytest.approx(before * (1 + 10 * WANDERING**2))
+    assert np.allclose(estimate.covariance, before)
     assert estimate.body.segment_lengths == pytest.approx(human37.segment_lengths)
 
 
@@ -314,7 +329,7 @@ def fitted(model, person, poses, rounds=2):
             gradients, covariances = posterior.given_way(pose, image)
             estimate.update(
                 posterior.likelihood, image, pose, np.ones(1), gradients, covariances,
-                trust=0.35, dt=0.1,
+                trust=0.35,
             )  # fmt: skip
     return estimate
 
@@ -370,7 +385,7 @@ def test_lengths_come_nearer_to_the_true_ones_with_keypoints(human37, poses):
         pose = posterior.minimise(posterior.of_image(image), pose[None], 6).x
         estimate.update(
             posterior.likelihood, image, pose, np.ones(1), *posterior.given_way(pose, image),
-            trust=0.35, dt=0.1,
+            trust=0.35,
         )  # fmt: skip
     for name, true in long.items():
         before = true - human37.segment_lengths[name]
