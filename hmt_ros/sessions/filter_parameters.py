@@ -47,49 +47,45 @@ class FilterParameters(CameraNodeParameters):
     """All parameters of the filter node.
 
     Attributes:
-        subject_file: YAML file with the joints of the person in one image, which starts the track.
-            If empty, keypoints, a mask or a prediction, as far as they are used, or ~/reset starts
-            it.
-        background_file: Image of the empty scene as the camera sees it; if empty, the background is
-            learned from the images before the track starts.
+        subject_file: YAML file with the joints of the person in one image, which starts the track;
+            if empty, other inputs or ~/reset start it.
+        background_file: Image of the empty scene; if empty, the background is learned before the
+            track starts.
         body_model: Body model, 'human37', 'human34', 'human32' or a YAML file.
         random_seed: Seed of all random numbers; the same images give the same results.
-        use_keypoints: If true, keypoints are a measurement and start the track where there is no
-            subject_file, and an image waits for the keypoints of its stamp.
+        use_keypoints: If true, keypoints are a measurement and start a track without subject_file.
         use_keypoints_3d: If true, positions of the same landmarks in space (topic keypoints_3d) are
-            weak evidence of depth, and an image waits for those of its stamp.
-        keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px; 0
-            selects the learned one, which depends on confidence and size of the person.
-        use_depth: If true, depth images that are registered to the images (topic depth) are a
-            measurement; an image waits for that of its stamp.
-        use_predictions: If true, poses that bme_node predicts start a track without subject_file
-            and are hypotheses; an image waits for the prediction of its stamp.
-        gravity: Direction of gravity in the camera optical frame, three numbers of any length;
-            empty: the lines of the scene show it, if they can. A still camera that looks to the
-            horizon has [0.0, 1.0, 0.0].
+            weak evidence of depth.
+        keypoint_sigma_px: Standard deviation of keypoints without a covariance, px; 0 selects the
+            learned one, by confidence and size of the person.
+        use_depth: If true, depth images registered to the images (topic depth) are a measurement.
+        use_predictions: If true, predictions of bme_node start a track without subject_file and are
+            hypotheses.
+        gravity: Direction of gravity in the camera optical frame, three numbers of any length,
+            [0.0, 1.0, 0.0] for a level camera; if empty, lines of the scene show it where they can.
         camera_height: Height of the camera above the floor, m; 0 if unknown.
-        gravity_frame: Name of a frame with z up, such as odom or map; /tf then tells the direction
-            of gravity at every image and overrides gravity. Empty: off.
-        floor_in_gravity_frame: If true, the floor is the plane z = 0 of gravity_frame, and /tf and
-            /tf_static tell the height of the camera, before camera_height does.
-        fixed_frame: Name of a frame that stands still, such as odom; /tf then tells how the camera
-            moves. Motion prior, gravity, floor and contacts refer to that frame. Empty: off.
-        publish_in_fixed_frame: If true, markers and person_pose are published in fixed_frame, whose
-            z axis must point up, and mixtures in <fixed_frame>_optical. If false, all are in the
-            frame of the camera.
-        overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
+        gravity_frame: Frame with z up, such as odom or map; gravity from /tf then overrides the
+            parameter gravity at every image. Empty: off.
+        floor_in_gravity_frame: If true, the plane z = 0 of gravity_frame is the floor, and
+            overrides camera_height.
+        fixed_frame: Frame that stands still, such as odom; motion prior, gravity, floor and
+            contacts refer to it, and /tf gives the camera's motion. Empty: off.
+        publish_in_fixed_frame: If true, markers, person_pose and keep_out are in fixed_frame, whose
+            z axis must point up, and mixtures in <fixed_frame>_optical; if false, in the frame of
+            the camera.
+        overlay_modes: Maximum number of modes drawn on the image, heaviest first; 0 switches the
             overlay off.
-        publish_tf: If true, the links of the point estimate are published on /tf, and
-            camera_upright where gravity is known.
-        frame_prefix: Prefix of the names of the links on /tf and in human_description, which tells
-            persons apart; in a namespace its default is the namespace.
+        publish_tf: If true, /tf has the links of the point estimate, and camera_upright where
+            gravity is known.
+        frame_prefix: Prefix of link names on /tf and in human_description; in a namespace its
+            default is the namespace.
         keep_out_probability: Probability with which keep_out holds the person, of each part of the
             body and of the modes.
-        stale_time: Time without an answered image after which keep_out says so and grows, s.
-        forecast_rate: Number of poses a second on pose_forecast, at times after the images; 0
+        stale_time: Time without an answered image after which keep_out is STALE and grows, s.
+        forecast_rate: Number of poses per second on pose_forecast, at times after the images; 0
             switches it off.
-        forecast_horizon: Maximum time ahead of an image that is predicted from it, s; it covers the
-            time until the next image is answered.
+        forecast_horizon: Maximum time from an image to a forecast, s; it should last until the next
+            image is answered.
         tracker: settings of the tracker.
         background: settings of the background subtraction.
     """
