@@ -12,8 +12,7 @@ from hmt_ros.tracking import filter as filter_module
 from hmt_ros.tracking import observer as observer_module
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps
-from hmt_ros.tracking.proposals.limb_search import LimbSearch
+from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps, LimbSearch
 from hmt_ros.tracking.proposals.sampling import CovarianceScaledSamples
 
 # Part of the tracker -> name of the stage; time in a part that another part calls is its own.

@@ -59,7 +59,7 @@ from benchmarks.tracking_scores import (
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 from hmt_ros.tracking import TrackerSettings
-from hmt_ros.tracking.status import Status
+from hmt_ros.tracking.existence import Status
 
 ROOT = Path(__file__).resolve().parents[1]
 REACH = ROOT / 'bags' / 'reach'

@@ -8,8 +8,7 @@ from hmt_ros.experts.expert_mixture import (
     JointExperts,
     RelevanceVectorRegression,
 )
-from hmt_ros.experts.keypoint_predictor import KeypointPredictor
-from hmt_ros.experts.lifted_fit import lift_poses
+from hmt_ros.experts.lifted_fit import KeypointPredictor, lift_poses
 from hmt_ros.experts.lifter import Lifter, load_lifter
 from hmt_ros.experts.neighbour_models import LocalExperts, NearestNeighbours
 from hmt_ros.experts.network_experts import NetworkExperts

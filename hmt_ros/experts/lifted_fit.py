@@ -12,6 +12,7 @@ person is hardly shows: the spread of people's size is added along the line of s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,7 +22,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.body.pose_prior import LEARNED, pose_prior
 from hmt_ros.experts.keypoint_windows import landmark_offsets
-from hmt_ros.experts.lifter import Lifter, landmark_rays
+from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_rays
 from hmt_ros.image.keypoint_schemes import AUTO, noise_of
 from hmt_ros.image.lifted_poses import HIPS, WHOLE, LiftedPoses
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -217,3 +218,43 @@ def _marks(body: Body) -> tuple[Index, Array]:
     names, offsets = landmark_offsets(body)
     which = body.skeleton.joint_index(tuple(names))
     return body.skeleton.joint_segments[which], body.skeleton.joint_offsets[which] + offsets
+
+
+class KeypointPredictor:
+    """Predicts mixtures over the poses of one person, as images come; see `lift_poses`.
+
+    Args:
+        lifter: see `load_lifter`.
+        body: of the person, with the lengths as far as they are known.
+        camera: that sees the keypoints.
+        size_known: whether the body is as large as the person.
+
+    Attributes:
+        newest: time of the newest image, s.
+    """
+
+    def __init__(
+        self, lifter: Lifter, body: Body, camera: Camera, *, size_known: bool = False
+    ) -> None:
+        self._lifter, self._body = lifter, body
+        self._spread = KNOWN_SIZE if size_known else UNKNOWN_SIZE
+        self._history = KeypointHistory(camera)
+        self._shown: tuple[Array, Array] | None = None
+        self.newest = -math.inf
+
+    def add(self, keypoints: Keypoints, stamp: float) -> None:
+        """Takes the keypoints of the next image, of a time in s that is later than those before."""
+        self._shown, self.newest = self._history.add(keypoints, stamp), stamp
+
+    def predict(self, up: Array | None = None) -> GaussianMixture | None:
+        """The mixture at the newest image, heaviest first; None: nobody is seen.
+
+        Args:
+            up: (3,) unit vector against gravity, camera frame; None: unknown.
+        """
+        lifted = None if self._shown is None else self._history.lift(self._lifter, up)
+        if lifted is None or self._shown is None:
+            return None
+        rays, confidences = self._shown
+        (found,) = poses_of(self._body, [lifted], rays[None], confidences[None], self._spread)
+        return found

@@ -23,8 +23,7 @@ from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
 from hmt_ros.experts.density_propagation import joined, propagate, propagate_by_dynamics
-from hmt_ros.experts.descriptor.centred_view import centred_view
-from hmt_ros.experts.descriptor.contour import PersonBlob, person_blob
+from hmt_ros.experts.descriptor.contour import PersonBlob, centred_view, person_blob
 from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor, silhouette_parts
 from hmt_ros.experts.model_file import (
     FAULTS,

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Camera
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
-from hmt_ros.experts.keypoint_predictor import KeypointPredictor
+from hmt_ros.experts.lifted_fit import KeypointPredictor
 from hmt_ros.experts.pose_predictor import (
     ALONE,
     BY_EXPERTS,

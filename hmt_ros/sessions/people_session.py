@@ -44,8 +44,15 @@ from hmt_ros.sessions.person_session import BODIES, PersonSession, person_of
 from hmt_ros.sessions.session import PublishedTopic, everything
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
 from hmt_ros.sessions.tracking_session import TrackingSession
-from hmt_ros.tracking.areas import grown, hull, unknown_area
-from hmt_ros.tracking.association import GATE, ImageTrack, Sighting, assigned
+from hmt_ros.tracking.association import (
+    GATE,
+    ImageTrack,
+    Sighting,
+    assigned,
+    grown,
+    hull,
+    unknown_area,
+)
 from hmt_ros.tracking.camera_motion import CameraPose
 from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 from msg_tools.messages.detections import (

@@ -24,7 +24,7 @@ from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import HandlingLog, Output
 from hmt_ros.sessions.track_start import TrackStart
 from hmt_ros.tracking import Status, Tracker
-from hmt_ros.tracking.areas import moved
+from hmt_ros.tracking.association import moved
 from hmt_ros.tracking.hypotheses import LIKELY
 from hmt_ros.tracking.person_shape import covered
 

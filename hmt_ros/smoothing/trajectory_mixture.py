@@ -9,13 +9,12 @@ velocities, they are integrated out of everything that is returned.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
@@ -25,20 +24,6 @@ from hmt_ros.inference.block_tridiagonal import (
     BlockTridiagonal,
 )
 from hmt_ros.smoothing.smoothed_paths import SmoothedPath
-
-
-class TrajectoryContent(Protocol):
-    """What a message says of a mixture over trajectories."""
-
-    weights: Array
-    means: Array
-    marginal_covariances: Array | None
-    log_joint: Array
-    inflation: Array
-    stamps_ns: tuple[int, ...]
-    final_until_ns: int
-    free_energy: Array
-    identities: NDArray[np.uint32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,19 +189,6 @@ class TrajectoryMixture:
         result: Array = log - 0.5 * np.einsum('stn,stn->s', white, white)
         return result
 
-    def expectation(
-        self, function: Callable[[Array], Array], n: int, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
-        """Mean of f over n samples, and its standard error.
-
-        Args:
-            function: maps trajectories (n, T, d) to values (n, ...).
-            n: samples.
-            rng: source of the samples.
-        """
-        values = np.asarray(function(self.sample(n, rng)))
-        return values.mean(0), values.std(0, ddof=1) / np.sqrt(n)
-
     def mean(self) -> Array:
         """Expected poses, (T, d)."""
         result: Array = np.einsum('m,mtd->td', self.weights, self.means)
@@ -242,35 +214,3 @@ class TrajectoryMixture:
             'free_energy': self.free_energy,
             'identities': np.array(self.identities, dtype=np.uint32) if self.identities else None,
         }
-
-    @classmethod
-    def from_message_content(cls, content: TrajectoryContent) -> TrajectoryMixture:
-        """The mixture that a message tells of.
-
-        A message has the marginals of each component and nothing of how neighbouring poses vary
-        together, so that they are independent in what is returned.
-
-        Raises:
-            ValueError: a message without covariances, or with one that is not positive definite.
-        """
-        if content.marginal_covariances is None:
-            raise ValueError('a message without covariances says no density of trajectories')
-        _, times, d = content.means.shape
-        scale = content.inflation[:, None, None, None]
-        factors = []
-        for covariances in content.marginal_covariances / scale**2:
-            precision = np.linalg.inv(covariances)
-            uncoupled = BlockTridiagonal(precision, np.zeros((times - 1, d, d)))
-            factors.append(uncoupled.cholesky())
-        return cls(
-            weights=np.array(content.weights),
-            states=np.array(content.means),
-            factors=tuple(factors),
-            inflation=np.array(content.inflation),
-            log_joint=np.array(content.log_joint),
-            free_energy=np.array(content.free_energy),
-            dimension=d,
-            stamps_ns=tuple(content.stamps_ns),
-            final_until_ns=content.final_until_ns,
-            identities=tuple(int(number) for number in content.identities),
-        )

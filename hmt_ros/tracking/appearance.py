@@ -6,6 +6,27 @@
 Where the clothes have the colours of the room only a part of the model is foreground: the share is
 asked against what this track has seen so far. A person who has not been seen for a time t may have
 gone SPEED t further away; the usual area shrinks accordingly.
+
+The colours of a person, and whether an image shows them anywhere.
+
+    p(M | colour) = h_M / (h_M + h_around)              ratio of two histograms
+    B(x) = mean of p(M | colour) over a box at x        as large as the model
+    score = (max B - elsewhere) / (here - elsewhere)
+
+M are the pixels that the model covers. `here` and `elsewhere` are the usual value of B where the
+person is, and its usual maximum over boxes beside the person: the score is about 1 where the image
+shows somebody in these colours, wherever that is, and about 0 in a room without the person. Where
+the two are alike the colours say nothing, and where the colours of the image are not those of the
+images before: a covered lens, another light.
+
+That they are nowhere speaks against the person only where the scene is the one that they were
+learned in:
+
+    stillness = 1 - changed pixels beyond the model / (UNDECIDED pixels of the model), at least 0
+
+Else `elsewhere` is that of another scene: the camera has moved, and what has gone may be a thing
+that the model was on. Somebody who moves beyond the model changes as much. A colour that no image
+had may be the person's, who turns about.
 """
 
 from __future__ import annotations
@@ -15,12 +36,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.error_model import seconds
-from hmt_ros.tracking.colours import MEMORY, Colours
 from hmt_ros.tracking.person_shape import (
     Piece,
     counted,
@@ -34,11 +55,150 @@ from hmt_ros.tracking.view import View
 
 # Fraction of the usual value at which a silhouette says nothing; at none of it somebody is absent,
 # at twice as much present.
+# Beyond the model as many pixels may change as this share of those of the person, or of those
+# beyond if they are fewer: a shadow goes with the person. Of more the scene is another one.
 UNDECIDED = 0.25
 # Colours are learned once in so many seconds: they hardly change.
 LEARNED = 0.1
 # More than this fraction of an image, or of a person, is most of it.
 MOST = 0.5
+# Time constant of what is usual for a track, s.
+MEMORY = 2.0
+# Least difference between `here` and `elsewhere` that says something, a probability.
+LEAST_CONTRAST = 0.15
+# Bins of a colour channel.
+BINS = 8
+# A pixel that differs by more than this in a channel shows something else, grey levels; the means
+# of 3 x 3 pixels of the raster do not differ by that much from noise.
+OTHER = 24
+
+
+class Colours:
+    """The colours of one person against those of the surroundings.
+
+    Attributes:
+        size: (width, height) of the model, px of the raster.
+        here, elsewhere: usual means of p(M | colour) over a box at the person and beside; NaN:
+            unknown.
+    """
+
+    def __init__(self) -> None:
+        self.size = (0, 0)
+        self.here = self.elsewhere = math.nan
+        self._inside: Array | None = None
+        self._around = self._scene = np.zeros(BINS**3)
+        # The last image that was learned, and what the model did not cover in it.
+        self._image: Image | None = None
+        self._beyond: Mask | None = None
+
+    def score(self, image: Image, *, unseen: float = 0.0) -> float | None:
+        """How far an image (h, w, 3) BGR shows the person's colours; None: nothing can be told.
+
+        Args:
+            image: on the raster.
+            unseen: p(M | colour) of a colour that no image has had.
+        """
+        contrast = self.here - self.elsewhere
+        if self._inside is None or not contrast >= LEAST_CONTRAST:
+            return None
+        bins = binned(image)
+        if np.minimum(shares(bins), self._scene).sum() < 0.5:  # most of it has other colours
+            return None
+        return float((self._means(bins, unseen).max() - self.elsewhere) / contrast)
+
+    def stillness(self, image: Image) -> float:
+        """How far an image (h, w, 3) is of the scene that was learned last, from 0 to 1."""
+        if self._image is None or self._beyond is None:
+            return 0.0
+        changed = cv2.absdiff(cv2.blur(image, (3, 3)), self._image).max(axis=2) > OTHER
+        outside = counted(self._beyond)
+        least = min(self._beyond.size - outside, outside)
+        share = counted(changed & self._beyond) / max(least, 1)
+        return max(1.0 - share / UNDECIDED, 0.0)
+
+    def learn(self, image: Image, model: Mask, dt: float) -> None:
+        """Takes in an image (h, w, 3) with the person on the pixels (h, w) of the model.
+
+        Args:
+            image, model: on the raster.
+            dt: time since the last image that was learned, s.
+        """
+        around = surroundings(model)
+        if not model.any() or not around.any():
+            return
+        bins = binned(image)
+        # One pass: beside both, on the model, around it.
+        counts = np.bincount(
+            (bins + BINS**3 * (model + 2 * around.view(np.uint8)).astype(np.uint16)).ravel(),
+            minlength=3 * BINS**3,
+        ).reshape(3, -1)
+        on, off = (x / max(x.sum(), 1) for x in counts[1:])
+        scene = counts.sum(0) / bins.size
+        first = self._inside is None
+        gain = 1.0 if first else -math.expm1(-dt / MEMORY)
+        self._inside = on if self._inside is None else self._inside + gain * (on - self._inside)
+        self._around = self._around + gain * (off - self._around)
+        self._scene = self._scene + gain * (scene - self._scene)
+        x, y, width, height = cv2.boundingRect(model.view(np.uint8))
+        self.size = width, height
+        self._image, self._beyond = np.asarray(cv2.blur(image, (3, 3)), np.uint8), beyond(model)
+        means = self._means(bins)
+        row, column = y + height // 2, x + width // 2
+        here = float(means[row, column])
+        # Boxes that do not touch that of the person.
+        means[max(row - height, 0) : row + height, max(column - width, 0) : column + width] = -1.0
+        elsewhere = float(means.max())
+        self.here = _moved(self.here, here, gain)
+        if elsewhere >= 0.0:
+            self.elsewhere = _moved(self.elsewhere, elsewhere, gain)
+
+    def _means(self, bins: NDArray[np.uint16], unseen: float = 0.0) -> NDArray[np.float32]:
+        """Mean of p(M | colour) over a box at each pixel (h, w); beyond the image it is 0."""
+        assert self._inside is not None
+        # A colour of less than a pixel is nobody's.
+        whole = self._inside + self._around + 1.0 / bins.size
+        ratio = (self._inside / whole).astype(np.float32)
+        if unseen:
+            ratio[self._scene < 1.0 / bins.size] = unseen
+        size = (max(self.size[0], 1), max(self.size[1], 1))
+        means = cv2.boxFilter(ratio[bins], cv2.CV_32F, size, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(means, dtype=np.float32)
+
+
+def _moved(usual: float, value: float, gain: float) -> float:
+    return value if math.isnan(usual) else usual + gain * (value - usual)
+
+
+def binned(image: Image) -> NDArray[np.uint16]:
+    """The bin of the colour of each pixel (h, w) of an image (h, w, 3)."""
+    width = 256 // BINS
+    parts = (image // np.uint8(width)).astype(np.uint16)
+    result: NDArray[np.uint16] = (parts[..., 0] * BINS + parts[..., 1]) * BINS + parts[..., 2]
+    return result
+
+
+def shares(bins: NDArray[np.uint16]) -> Array:
+    """Share (BINS^3,) of each colour among pixels."""
+    return np.bincount(bins.ravel(), minlength=BINS**3) / bins.size
+
+
+def surroundings(model: Mask) -> Mask:
+    """Pixels (H, W) around those that the model covers, up to half its size away."""
+    x, y, width, height = cv2.boundingRect(model.view(np.uint8))
+    margin = max(width, height) // 2
+    rows = slice(max(y - margin, 0), y + height + margin)
+    columns = slice(max(x - margin, 0), x + width + margin)
+    result = np.zeros(model.shape, dtype=np.bool_)
+    result[rows, columns] = beyond(model)[rows, columns]
+    return result
+
+
+def beyond(model: Mask) -> Mask:
+    """Pixels (H, W) that are farther from those of the model than a tenth of its size."""
+    *_, width, height = cv2.boundingRect(model.view(np.uint8))
+    near = max(max(width, height) // 10, 1)
+    size = (2 * near + 1, 2 * near + 1)
+    return np.asarray(cv2.dilate(model.view(np.uint8), np.ones(size, np.uint8)) == 0)
 
 
 class Silhouetted(NamedTuple):

@@ -37,7 +37,7 @@ from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.gravity import Gravity
+from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.initialisation import (
     mixture_from_box,
     poses_from_keypoints,

@@ -31,6 +31,7 @@ above `ABSENT`.
 from __future__ import annotations
 
 import math
+from enum import Enum
 from typing import NamedTuple
 
 import cv2
@@ -59,6 +60,15 @@ PART = 0.6
 # levels; share of the pixels around keypoints that change when a person breathes or sways within
 # tenths of a second (0.003 and more on ten clips of people, 0 on a table); least contrast.
 BLUR, CHANGED, MOVING, CONTRAST = 1.5, 10.0, 0.002, 4.0
+
+
+class Status(Enum):
+    """What the tracker is doing."""
+
+    WAITING = 'waiting'  # for the subject's image, or for somebody
+    TRACKING = 'tracking'
+    LOST = 'lost'
+    NOBODY = 'nobody'  # is in view
 
 
 class Cue(NamedTuple):

@@ -36,7 +36,7 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction, Quadratic
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.gravity import Gravity
+from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.misfit import of_depth
 from hmt_ros.tracking.start_depth import FEWEST, JointDepths, joint_depths
 from hmt_ros.tracking.subject import Subject

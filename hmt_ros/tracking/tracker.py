@@ -30,10 +30,9 @@ from hmt_ros.inference.error_model import ERRORS, TOGETHER, seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.beginning import FROM_JOINTS, Beginning, Source, Starts, poses_to_search
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
-from hmt_ros.tracking.existence import GIVEN, Existence
+from hmt_ros.tracking.existence import GIVEN, Existence, Status
 from hmt_ros.tracking.filter import MixtureFilter
-from hmt_ros.tracking.gravity import Gravity
-from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround, unit_vector
+from hmt_ros.tracking.ground import Gravity, Ground, GroundEstimator, KnownGround, unit_vector
 from hmt_ros.tracking.hypotheses import LIKELY, Modes
 from hmt_ros.tracking.initialisation import check_box
 from hmt_ros.tracking.misfit import SILHOUETTE
@@ -44,7 +43,6 @@ from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.start_depth import depths_of
-from hmt_ros.tracking.status import Status
 from hmt_ros.tracking.subject import Subject
 from hmt_ros.tracking.validity import Validity
 from hmt_ros.tracking.view import View

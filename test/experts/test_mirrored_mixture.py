@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from hmt_ros.experts.mirrored_mixture import (
+from hmt_ros.experts.prior_learning import (
     CovariancePrior,
     MirroredSamples,
     fitted_mixture,

@@ -11,8 +11,8 @@ pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = [path.stem for path in sorted((ROOT / 'hmt_ros' / 'nodes').glob('*_node.py'))]
-# A way to run nodes, what some have in common, and a process of several.
-OTHERS = ('run_node', 'session_node', 'tracking_node', 'person_node')
+# A way to run nodes, what some have in common, a process of several, and a driver with arguments.
+OTHERS = ('run_node', 'session_node', 'tracking_node', 'person_node', 'camera_node')
 NODES = [name for name in NODES if name not in OTHERS]
 
 

@@ -91,8 +91,6 @@ def test_density_marginals_and_samples_agree_with_dense_algebra(kind, request):
     np.testing.assert_allclose(mixture.mean().reshape(-1), mean)
     covariance = second - np.outer(mean, mean)
     np.testing.assert_allclose(np.cov(flat.T), covariance, atol=0.05 * covariance.max())
-    value, error = mixture.expectation(lambda s: s[:, 2, 0], 20_000, np.random.default_rng(1))
-    assert abs(value - mixture.mean()[2, 0]) < 5 * error
     with pytest.raises(ValueError, match=r'wanted \(n, 4, 2\)'):
         mixture.log_density(x[:, :3])
 
@@ -112,15 +110,10 @@ def test_to_a_message_and_back(found):
     )
     messages = RosbagsMessages()
     message = trajectory_mixtures.trajectory_mixture_message(messages, content)
-    back = TrajectoryMixture.from_message_content(
-        trajectory_mixtures.trajectory_mixture_of(message, ('a', 'b'))
-    )
-    for t in range(4):
-        np.testing.assert_allclose(back.marginal(t).means, found.marginal(t).means)
-        np.testing.assert_allclose(back.marginal(t).weights, found.marginal(t).weights)
-        np.testing.assert_allclose(
-            back.marginal(t).covariances, found.marginal(t).covariances, rtol=1e-9, atol=1e-12
-        )
+    back = trajectory_mixtures.trajectory_mixture_of(message, ('a', 'b'))
+    np.testing.assert_allclose(back.means, found.means)
+    np.testing.assert_allclose(back.weights, found.weights)
+    np.testing.assert_allclose(back.marginal_covariances, found.marginal_covariances, rtol=1e-9)
     np.testing.assert_allclose(back.inflation, found.inflation)
     np.testing.assert_allclose(back.free_energy, found.free_energy)
     assert back.stamps_ns == found.stamps_ns

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.tracking.areas import hull, moved, unknown_area
-from hmt_ros.tracking.association import GATE, ImageTrack, Sighting, assigned
+from hmt_ros.tracking.association import (
+    GATE,
+    ImageTrack,
+    Sighting,
+    assigned,
+    hull,
+    moved,
+    unknown_area,
+)
 
 NAMES = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
 SHAPE = np.array([[-10.0, 20.0], [10.0, 20.0], [-15.0, -30.0], [15.0, -30.0]])

@@ -13,8 +13,7 @@ from hmt_ros.image.terms.keypoints import KEYPOINTS
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import Tracker, TrackerSettings
-from hmt_ros.tracking.exchanges import SideExchanges
-from hmt_ros.tracking.posterior import Posterior
+from hmt_ros.tracking.posterior import Posterior, SideExchanges
 from test.image.test_keypoints import BODY, CAMERA, exchanged, seen
 
 ARMS = ('shoulder', 'elbow', 'wrist', 'hand')

@@ -13,7 +13,7 @@ from hmt_ros.body.mirror import root_rotations
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import KnownGround, Tracker, TrackerSettings
-from hmt_ros.tracking.gravity import Gravity, shortest_turn
+from hmt_ros.tracking.ground import Gravity, shortest_turn
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.subject import Subject
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.experts.descriptor.contour import sample_contour
-from hmt_ros.experts.descriptor.contour_histograms import (
+from hmt_ros.experts.descriptor.silhouette_descriptor import (
     ANGULAR,
     PAIR_ANGLES,
     PAIR_BINS,

@@ -6,8 +6,7 @@ import pytest
 
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
-from hmt_ros.experts.descriptor.centred_view import centred_view
-from hmt_ros.experts.descriptor.contour import NoSilhouetteError, person_blob
+from hmt_ros.experts.descriptor.contour import NoSilhouetteError, centred_view, person_blob
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
     SilhouetteDescriptor,
     silhouette_parts,

@@ -10,7 +10,7 @@ from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.energy import Restricted, Student, Sum
 from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.proposals.limb_search import TAILS, LimbSearch
+from hmt_ros.tracking.proposals.kinematic_jumps import TAILS, LimbSearch
 from hmt_ros.tracking.settings import LimbSearchSettings, TrackerSettings
 
 CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
