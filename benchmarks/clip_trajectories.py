@@ -21,7 +21,7 @@ from hmt_ros.body.whole_turns import free_limits, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.sessions.image_evidence import Evidence
-from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.smoother_session import MERGED
 from hmt_ros.smoothing.likelihood import counted
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.paths import Paths, visiting_probabilities
@@ -132,7 +132,7 @@ def _evidence(seen: Sequence[Seen], body: Body, independent: bool) -> tuple[Gaus
         whole.append(replace(mixture, means=without_turns(body, mixture.means, before)))
     if independent:
         return tuple(counted(mixture, 1.0) for mixture in whole)
-    distance, befores = SmootherParameters().merge_distance, [None, *(x.stamp for x in seen)]
+    distance, befores = MERGED, [None, *(x.stamp for x in seen)]
     return tuple(
         Evidence(x.stamp, mixture, x.errors, None).since(before, body.rates, distance)
         for x, mixture, before in zip(seen, whole, befores)

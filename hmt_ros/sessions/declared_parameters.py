@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, TypeVar
 
-from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, schemes
+from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, Scheme, schemes
 
 # A tuple is a list of numbers.
 Value = bool | int | float | str | tuple[float, ...]
@@ -48,11 +48,16 @@ LONGEST_TIMEOUT = 60.0  # s
 # Value of `source` for messages of this package.
 OWN_KEYPOINTS = 'keypoints'
 
+# Scheme of keypoints that come without names, unless another is named.
+USUAL_ORDER = 'coco17'
+
 # Parameters that nodes had before, and what is there instead.
 _TRACKER = 'programs set it in TrackerSettings'
 _LIKELIHOOD = 'programs set it in LikelihoodSettings'
 _BACKGROUND = 'programs set it in BackgroundSettings'
 REMOVED = {
+    'scheme': 'keypoint_scheme tells the order of keypoints without names, too',
+    'merge_distance': 'modes of an image nearer than 1.75 standard deviations are merged',
     'absence_time': 'existence is a probability with rates per second: see existence_probability',
     'reweighting': 'the weight of a mode follows from all pairs of modes (docs/tracking.md)',
     'jump_probability': 'a jump costs what its distance does in the time between two images',
@@ -162,19 +167,17 @@ class CameraNodeParameters(ImageNodeParameters):
         source: Type of the messages with keypoints, 'keypoints' (hmt_msgs/Keypoints2D, on the topic
             keypoints), or on the topic detections 'skeleton2d' (hri_msgs/Skeleton2D), 'yolo'
             (yolo_msgs/DetectionArray) or 'floats' (std_msgs/Float32MultiArray).
-        scheme: Scheme whose order the keypoints of 'yolo' and 'floats' follow: 'coco17', 'halpe26',
-            'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
         person_id: Identity that the detector gives the tracked person; if empty, the largest person
             at first, then the one nearest to where this person was.
-        keypoint_scheme: Scheme of the names of keypoints: 'auto' (recognised by the names),
-            'joints' (those of the body itself), or a value that the parameter scheme takes.
+        keypoint_scheme: Scheme of keypoints, 'auto' (recognised by their names; the order of
+            'coco17' for 'yolo' and 'floats'), 'joints' (those of the body itself), 'coco17',
+            'halpe26', 'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
         input_timeout: Maximum time that an image waits for each input of its stamp, by the stamps
             of later messages, s. A later input of the kind ends the wait.
     """
 
     use_mask: bool = parameter_field(False, AT_ONCE)
     source: str = parameter_field(OWN_KEYPOINTS, NEXT_CONFIGURE)
-    scheme: str = parameter_field('coco17', NEXT_CONFIGURE)
     person_id: str = parameter_field('', AT_ONCE)
     keypoint_scheme: str = parameter_field(AUTO, AT_ONCE)
     input_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, LONGEST_TIMEOUT))
@@ -186,12 +189,16 @@ class CameraNodeParameters(ImageNodeParameters):
         super().__post_init__()
         known = {
             'source': self.SOURCES,
-            'scheme': tuple(schemes()),
             'keypoint_scheme': (AUTO, JOINTS, *schemes()),
         }
         for name, values in known.items():
             if (value := getattr(self, name)) not in values:
                 raise ValueError(f'{name} must be one of {values}, saw {value!r}')
+
+    @property
+    def order(self) -> Scheme:
+        """The scheme whose order keypoints without names follow."""
+        return schemes().get(self.keypoint_scheme) or schemes()[USUAL_ORDER]
 
 
 class ParameterError(ValueError):

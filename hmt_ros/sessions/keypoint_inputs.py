@@ -21,7 +21,7 @@ import numpy as np
 
 from hmt_ros.body import Body, Camera
 from hmt_ros.experts.lifter import Lifter, load_lifter
-from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, schemes
+from hmt_ros.image.keypoint_schemes import AUTO, JOINTS
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.chosen_person import ChosenPerson
 from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, CameraNodeParameters
@@ -118,7 +118,7 @@ class KeypointReader:
             if stamp == 0:
                 raise MessageError('it comes before a camera_info, which tells its stamp')
             read = people_of_yolo if self._source == 'yolo' else people_of_floats
-            people = read(message, schemes()[p.scheme])
+            people = read(message, p.order)
         except MessageError as error:
             raise MessageError(f'detection of {stamp} ns: {error}') from error
         if p.person_id:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body
-from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.sessions.people_parameters import PeopleParameters
@@ -50,12 +49,12 @@ class PeopleReader:
     """Reads the detections.
 
     Args:
-        parameters: `source` and `scheme` say how.
+        parameters: `source` and `keypoint_scheme` say how.
         log: takes faults.
     """
 
     def __init__(self, parameters: PeopleParameters, log: HandlingLog) -> None:
-        self._source, self._scheme = parameters.source, schemes()[parameters.scheme]
+        self._source, self._scheme = parameters.source, parameters.order
         self._log = log
         self._unknown: set[frozenset[str]] = set()
 

@@ -82,8 +82,6 @@ class SmootherParameters(NodeParameters):
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
         max_trajectories: Maximum number of components of a mixture over trajectories.
         max_hypotheses: Maximum number of components of smoothed_pose_mixture.
-        merge_distance: Distance, in standard deviations of what an image counts for, below which
-            two modes of it are merged.
         resting_feet: If true, feet that rest do not slide between images. The frame of the mixtures
             must then stand still (a still camera, or publish_in_fixed_frame of the filter).
         random_seed: Seed of all random numbers; the same mixtures give the same results.
@@ -106,7 +104,6 @@ class SmootherParameters(NodeParameters):
     window_length: int = parameter_field(47, AT_ONCE, (1, 10_000))
     max_trajectories: int = parameter_field(16, NEXT_WINDOW, (1, 1024))
     max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))
-    merge_distance: float = parameter_field(1.75, NEXT_WINDOW, (0.0, 100.0))
     resting_feet: bool = parameter_field(True, NEXT_WINDOW)
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
     longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))

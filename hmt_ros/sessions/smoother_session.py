@@ -75,6 +75,9 @@ from msg_tools.messages.pose_mixtures import (
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
 MIXTURE = 'likelihood_mixture'
+# Distance of two modes of an image below which they are merged, in standard deviations of what the
+# image counts for.
+MERGED = 1.75
 NOBODY = 'nobody'  # status while nobody is in view
 # Change of a length from one mixture to the next above which it is another person's, m.
 SAME_PERSON = 0.02
@@ -243,7 +246,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._publish_final(pose, of)
 
     def _counted(self, one: Evidence, before: int | None, of: SmoothedBody) -> GaussianMixture:
-        return one.since(before, of.body.rates, self.parameters.merge_distance)
+        return one.since(before, of.body.rates, MERGED)
 
     def _without_turns(self, evidence: Evidence, body: Body) -> Evidence:
         """The evidence with angles that go on from those of the mixture before."""

@@ -53,12 +53,12 @@ def stamped(one, message, camera, index):
 
 
 def test_floats(world, small_camera, stub_tracker):
-    one, kind = world(small_camera, 'floats', scheme='coco17')
+    one, kind = world(small_camera, 'floats', keypoint_scheme='coco17')
     message = kind(data=np.ones(51, np.float32).tolist())
     keypoints = tracked(one, message, small_camera, 0, stub_tracker)
     assert 'head' in keypoints.names
     np.testing.assert_array_equal(keypoints.pixels, np.ones((len(keypoints.names), 2)))
-    one.assert_refused(({'scheme': 'coco'}, "saw 'coco'"), ({'source': 'x'}, "saw 'x'"))
+    one.assert_refused(({'keypoint_scheme': 'coco'}, "saw 'coco'"), ({'source': 'x'}, "saw 'x'"))
     assert one.other.count_subscribers('keypoints') == 0
 
 

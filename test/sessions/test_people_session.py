@@ -351,7 +351,7 @@ def test_the_end_of_a_bag_waits_for_nothing(session, small_camera):
     ('values', 'text'),
     [
         ({'source': 'openpose'}, "source must be one of ('people', 'yolo', 'boxes', 'floats')"),
-        ({'scheme': 'coco'}, "saw 'coco'"),
+        ({'keypoint_scheme': 'coco'}, "saw 'coco'"),
         ({'use_predictions': True}, 'people_node takes no input of one person'),
         ({'subject_file': 'x.yaml'}, "subject_file is 'x.yaml'"),
     ],

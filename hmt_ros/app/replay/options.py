@@ -238,7 +238,6 @@ def _bme_parameters(
         'background_file': tracking.background_file,
         'use_mask': tracking.use_mask,
         'source': tracking.source,
-        'scheme': tracking.scheme,
         'person_id': tracking.person_id,
         'keypoint_scheme': tracking.keypoint_scheme,
         'input_timeout': tracking.input_timeout,
