@@ -39,7 +39,10 @@ from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Status
+from msg_tools import RosbagsMessages
 from msg_tools.files.plain_yaml import read_plain_yaml
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -381,7 +384,8 @@ def test_live_tells_of_a_camera_that_does_not_wait():
         for topic in ('pose_mixture', 'smoothed_pose_mixture')
     }
     found = {
-        'images': 480, 'lost': 2, 'answered': 120, 'latency_ms': {'median': 151.2, '95 %': 190.0},
+        'images': 480, 'lost': 2, 'answered': 120,
+        'latency_ms': {'median': 151.2, '95 %': 190.0, '99 %': 201.0},
         'age_s': {'median': 0.75, '95 %': 0.9}, 'cpu_ms_per_pose': 210.0, 'nobody': 0,
         'memory_mb': 417.2, **errors,
     }  # fmt: skip
@@ -391,10 +395,41 @@ def test_live_tells_of_a_camera_that_does_not_wait():
     offline, newest, queue = (' '.join(line.split()) for line in text.splitlines()[-3:])
     assert offline == 'offline, every image 480 0 100 % 80 mm 61 mm 80 mm'
     assert newest == (
-        'processes apart: newest complete image 480 2 25 % 0 151 ms 190 ms 210 ms 417 MB '
-        '0.75 s 0.90 s 80 mm 61 mm 80 mm'
+        'processes apart: newest complete image 480 2 25 % 151 ms 190 ms 201 ms 210 ms 417 MB '
+        '0 0.75 s 0.90 s 80 mm 61 mm 80 mm'
     )
     assert queue == 'queue_size 5 skipped: no ROS'
+    seen = {'in_view': 40, 'in_view_tracked': 38, 'away': 90, 'away_not_nobody': 1}
+    text = live.as_text({'visit': found | seen, 'people 2': found | {'people': 1.875}})
+    lines = [' '.join(line.split()) for line in text.splitlines()]
+    assert any(line.endswith('417 MB 0 38 of 40 1 of 90') for line in lines)
+    assert lines[-1].endswith('417 MB 1.88')
+
+
+def test_medians_of_runs():
+    runs = [{'a': x, 'b': {'c': [2.0 * x, 1]}, 'd': x > 1, 'e': 'text'} for x in (3, 1, 2)]
+    assert live.median_of(runs) == {'a': 2, 'b': {'c': [4.0, 1]}, 'd': True, 'e': 'text'}
+
+
+def test_states_of_a_visit_are_counted_a_second_late(tmp_path, monkeypatch):
+    """Somebody comes at image 20 and leaves at 50, of ten images a second."""
+    monkeypatch.setattr(
+        live, 'shares_in_view', lambda clip: {k: float(20 <= k < 50) for k in range(80)}
+    )
+    states = [KeepOutState.UNKNOWN] * 22 + [KeepOutState.TRACKING] * 30 + [KeepOutState.NOBODY] * 28
+    none = np.empty((0, 3))
+    messages = {
+        k: serialise(
+            keep_out_message(RosbagsMessages(), KeepOut(k, 'eye', state, none, none, np.empty(0)))
+        )
+        for k, state in enumerate(states)
+    }
+    found = live._told_of_a_visit(messages, tmp_path, 10.0)
+    assert found == {
+        'nobody': 0, 'in_view': 20, 'in_view_tracked': 20, 'away': 20, 'away_not_nobody': 0,
+    }  # fmt: skip
+    messages[30] = messages[79]
+    assert live._told_of_a_visit(messages, tmp_path, 10.0)['nobody'] == 1
 
 
 def test_depth_brings_tracks_nearer():

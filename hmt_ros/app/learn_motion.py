@@ -14,6 +14,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
 
@@ -126,7 +127,9 @@ def read_motions(
         ValueError: there are motions, and none can be used.
     """
     found = []
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+    # Not by a fork: threads of other libraries may run in this process.
+    context = get_context('spawn')
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, 8), context) as pool:
         reading = pool.map(partial(_read_one, read=read, body=body), paths, chunksize=2)
         shown = with_progress(reading, 'reading', 'motions', len(paths), quiet=quiet)
         for path, (one, why) in zip(paths, shown, strict=True):

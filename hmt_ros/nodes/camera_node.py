@@ -45,7 +45,7 @@ USUAL_FOV = 60.0
 _USUAL_RATE = 30.0
 # A device that gives no image for so long has gone, s.
 _PATIENCE = 5.0
-_GLANCE = 0.05
+_GLANCE, _CONNECTING = 0.05, 0.5
 
 
 class CameraError(ValueError):
@@ -165,6 +165,9 @@ def _show(node: Any, video: Video, given: argparse.Namespace, stopped: threading
         node.get_logger().info(f'{given.video} starts when somebody subscribes to {images.topic}')
     while video.is_file and not images.get_subscription_count() and not stopped.is_set():
         stopped.wait(_GLANCE)
+    if video.is_file:
+        # The other side may not know yet that it is connected.
+        stopped.wait(_CONNECTING)
     camera, messages, count, first = None, RosbagsMessages(), 0, 0
     for image, due in video.images(stopped):
         if due is None or camera is None:

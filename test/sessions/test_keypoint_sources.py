@@ -126,7 +126,7 @@ def test_a_person_by_identity(session, seen, small_camera):
 
 
 def test_floats_have_the_stamp_of_the_image(session, seen, small_camera):
-    one = session('floats', scheme='coco17')
+    one = session('floats', keypoint_scheme='coco17')
     rows = np.ones((17, 3))
     (fault,) = one.take(DETECTIONS, floats(small_camera, rows)).faults
     assert 'it comes before a camera_info, which tells its stamp' in fault
@@ -139,7 +139,7 @@ def test_floats_have_the_stamp_of_the_image(session, seen, small_camera):
 
 
 def test_detections_that_can_not_be_used_are_told(session, small_camera):
-    one = session('floats', scheme='halpe26')
+    one = session('floats', keypoint_scheme='halpe26')
     one.take(CAMERA_INFO, small_camera.info(0))
     (fault,) = one.take(DETECTIONS, floats(small_camera, np.ones((17, 3)))).faults
     assert 'wanted 26x2 or 26x3 of the scheme halpe26' in fault
@@ -152,8 +152,8 @@ def test_detections_that_can_not_be_used_are_told(session, small_camera):
 def test_parameters(kind):
     with pytest.raises(ValueError, match=r"source must be one of .* saw 'pigeon'"):
         kind(source='pigeon')
-    with pytest.raises(ValueError, match=r"scheme must be one of .* saw 'coco'"):
-        kind(scheme='coco')
+    with pytest.raises(ValueError, match=r"keypoint_scheme must be one of .* saw 'coco'"):
+        kind(keypoint_scheme='coco')
 
 
 def test_where_time_begins_again_a_person_is_chosen_anew(session, seen, small_camera, stub_tracker):
