@@ -200,9 +200,18 @@ def _not_held(starts, ends, radii, points):  # type: ignore[no-untyped-def]
     """Which of N capsules, the largest first, have points (N, P, 3) outside of those before."""
     n, count = points.shape[0], points.shape[1]
     outside = np.ones((n, count), np.bool_)
+    left = np.full(n, count)
     kept = np.zeros(n, np.bool_)
+    # A ball around each: most pairs are far apart.
+    balls = np.empty((n, 4))
+    for j in range(n):
+        half = 0.0
+        for k in range(3):
+            balls[j, k] = 0.5 * (starts[j, k] + ends[j, k])
+            half += (0.5 * (ends[j, k] - starts[j, k])) ** 2
+        balls[j, 3] = np.sqrt(half) + radii[j]
     for i in range(n):
-        if not outside[i].any():
+        if left[i] == 0:
             continue
         kept[i] = True
         ax, ay, az = starts[i, 0], starts[i, 1], starts[i, 2]
@@ -210,6 +219,14 @@ def _not_held(starts, ends, radii, points):  # type: ignore[no-untyped-def]
         square = max(dx * dx + dy * dy + dz * dz, 1e-18)
         limit = radii[i] * radii[i]
         for j in range(i + 1, n):
+            if left[j] == 0:
+                continue
+            x, y, z = balls[j, 0] - ax, balls[j, 1] - ay, balls[j, 2] - az
+            along = min(max((x * dx + y * dy + z * dz) / square, 0.0), 1.0)
+            x, y, z = x - along * dx, y - along * dy, z - along * dz
+            far = radii[i] + balls[j, 3]
+            if x * x + y * y + z * z > far * far:
+                continue
             for p in range(count):
                 if outside[j, p]:
                     x, y, z = points[j, p, 0] - ax, points[j, p, 1] - ay, points[j, p, 2] - az
@@ -217,4 +234,5 @@ def _not_held(starts, ends, radii, points):  # type: ignore[no-untyped-def]
                     x, y, z = x - along * dx, y - along * dy, z - along * dz
                     if x * x + y * y + z * z <= limit:
                         outside[j, p] = False
+                        left[j] -= 1
     return kept
