@@ -87,7 +87,7 @@ def parameter_table(node: str) -> str:
     """The parameters of a node, as it declares them.
 
     Parameters that filter_node has with the same default, description and effect are named below
-    the table; of people_node, which has nearly all, their number is told.
+    the table, or only counted for people_node, which has nearly all.
     """
     from hmt_ros.sessions.bme_parameters import BmeParameters
     from hmt_ros.sessions.declared_parameters import declared_parameters

@@ -100,8 +100,8 @@ def run_together(
 def _use_one_heap() -> None:
     """Makes all threads allocate from one heap, where the C library has the choice.
 
-    Images go from thread to thread, and heaps of their own break into pieces by it: a process grew
-    by 30 MB in ten minutes. Python's lock leaves threads little to wait for.
+    Image buffers go from thread to thread, and a heap for each thread breaks into pieces by it: the
+    process grows as long as it runs. Python's lock leaves threads little to wait for.
     """
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)

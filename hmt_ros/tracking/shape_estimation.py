@@ -10,8 +10,7 @@ Hessian of the energy of one image over both. A pose gives way to a wrong shape:
 information when it does is the Schur complement S. Of every image only the share tau is believed,
 as its errors are those of its neighbours, and of all images together no more than 1 / c of one
 (`inference.error_model`): clothes, and what else the model lacks, are the same in all of them, and
-would in the end outweigh what is known of people. A person shrank by a tenth in half a minute so,
-seen by a silhouette that does not tell the size from the distance. What is not known of the shape
+would in the end outweigh what is known of people. What is not known of the shape
 is not known of the pose either: J P J' is added to the covariances of modes (a consider covariance,
 [Schmidt 1966]).
 """
