@@ -16,14 +16,12 @@ the clip back and forth for so long.
 from __future__ import annotations
 
 import math
-import os
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,7 +31,6 @@ import numpy as np
 from benchmarks.clips import COMPRESSED, index_back_and_forth, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.live_clips import (
-    LARGE,
     MOTION,
     PEOPLE,
     VISIT,
@@ -43,21 +40,23 @@ from benchmarks.live_clips import (
     run,
     shares_in_view,
 )
+from benchmarks.live_nodes import (
+    CASES,
+    CameraProcess,
+    Case,
+    cpu_seconds,
+    memory,
+    start_nodes,
+)
 from benchmarks.nodes import PROFILE
 from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.replay import command as replay
-from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
-from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER
-from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment, environment
+from hmt_ros.app.replay.live_node import LiveNode
+from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment
 from hmt_ros.app.truth import read_truth
 from hmt_ros.detectors.mediapipe_pose import DetectorError, MediaPipePose
 from hmt_ros.evaluation.track_scores import Truth
-from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader, BagWriter
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.detections import PEOPLE_2D
@@ -72,81 +71,12 @@ TOLD, LISTED = 'keep_out', 'people'
 WITHOUT_GRAVITY = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
 START_SECONDS = 120.0  # until the person is tracked: the first images compile the kernels
 PATIENCE = 3.0  # s, after the last image
-GLANCE = 5.0  # s, between two looks at the memory
 OLDEST = 1.0  # s, of a smoothed pose
 # Of a visit: how long a state may be late, s, and the share of the joints that are somebody.
 LATE, SOMEBODY = 1.0, 0.5
-PERSON, PEOPLE_NODE, DETECTOR = 'person_node', 'people_node', 'keypoints_node'
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
-@dataclass(frozen=True)
-class Case:
-    """How the nodes are run.
-
-    Attributes:
-        what: in words.
-        clip: that is shown, see `benchmarks.live_clips`.
-        transport: of the images.
-        room: whether Fast DDS has room for raw images.
-        keypoints: whether there are any; then there is no BME.
-        detector: whether MediaPipe finds them, on the same machine.
-        together: whether the nodes run in one process.
-        smoothed: whether there is a smoother.
-        filter, bme: parameters that are not the usual ones.
-    """
-
-    what: str
-    clip: str = 'dance'
-    transport: str = 'raw'
-    room: bool = True
-    keypoints: bool = False
-    detector: bool = False
-    together: bool = False
-    smoothed: bool = True
-    filter: Mapping[str, Any] = field(default_factory=dict)
-    bme: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def people(self) -> int:
-        """Number of people, where `people_node` follows them; else 0."""
-        kind, _, number = self.clip.partition(' ')
-        return int(number) if kind == PEOPLE else 0
-
-
-CASES = {
-    'newest': Case('processes apart: newest complete image'),
-    'queue': Case('queue_size 5', filter={'queue_size': 5}, bme={'queue_size': 5}),
-    'predictions': Case('predictions from every image', bme={'tracked_interval': 0.0}),
-    'compressed': Case('JPEG', transport='compressed'),
-    'gravity': Case('gravity given', filter={'gravity': (0.0, 1.0, 0.0)}),
-    'keypoints': Case('images and keypoints', keypoints=True),
-    'together': Case('one process: newest complete image', together=True),
-    'together, filter': Case(
-        'one process: filter and experts alone', together=True, smoothed=False
-    ),
-    'together, keypoints': Case('one process: images and keypoints', keypoints=True, together=True),
-    'together, keypoints, filter': Case(
-        'one process: the same, filter alone', keypoints=True, together=True, smoothed=False
-    ),
-    'together, detector': Case(
-        'one process: images and MediaPipe', keypoints=True, detector=True, together=True
-    ),
-    'large': Case('processes apart: 1280x720, 15 images a second', clip=LARGE),
-    'usual DDS': Case('without fastdds.xml', room=False),
-    'visit': Case('one process: images', clip=VISIT, together=True),
-    'visit, keypoints': Case(
-        'one process: images and MediaPipe',
-        clip=VISIT,
-        keypoints=True,
-        detector=True,
-        together=True,
-    ),
-    **{
-        f'people {count}': Case(f'people_node: {count}', clip=f'{PEOPLE} {count}', keypoints=True)
-        for count in (1, 2, 4)
-    },
-}
 OFFLINE = {'offline': 'offline, every image', 'upright': 'offline, gravity given'}
 STAGES = (*OFFLINE, *CASES)
 
@@ -256,17 +186,17 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
     memories: list[float] = []
     with ExitStack() as opened:
         player = Player(opened)
-        nodes = _nodes(player, opened, clip, case)
+        nodes = start_nodes(player, opened, clip, case)
         for node in nodes:
             node.wait_until_active()
         processes = list({node.process.pid: node for node in nodes}.values())
-        arrived = _listen(player)
+        arrived = _listen(player, case)
         more = []
         if case.people:
             more = [str(clip), DETECTIONS]
         elif case.keypoints and not case.detector:
             more = [str(noisy_keypoints(clip)), KEYPOINTS]
-        camera = _Camera(
+        camera = CameraProcess(
             opened, player.domain, clip, case.transport, len(stamps), more,
             subscribers=1 if case.keypoints or case.together else 2, rate=rate,
         )  # fmt: skip
@@ -274,15 +204,15 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
         topic = _topic_of(case)
         camera.spin(player, lambda: len(arrived[topic]) > 2, START_SECONDS)
         shift, start_ns = camera.begin(player)
-        before = [_cpu_seconds(node) for node in processes]
-        at_first = sum(_memory(node) for node in processes)
+        before = [cpu_seconds(node) for node in processes]
+        at_first = sum(memory(node) for node in processes)
         received = _received(player, nodes[0])
         camera.spin(
             player, camera.ended, len(stamps) / rate + PATIENCE,
-            every=lambda: memories.append(sum(_memory(node) for node in processes)),
+            every=lambda: memories.append(sum(memory(node) for node in processes)),
         )  # fmt: skip
-        spent = [_cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)]
-        memory = sum(_memory(node) for node in processes)
+        spent = [cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)]
+        memory_mb = sum(memory(node) for node in processes)
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             player.executor.spin_once(timeout_sec=0.1)
@@ -315,8 +245,8 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
         'first_and_last_quarter_ms': [
             float(np.median(part)) for part in (latencies[: count // 4], latencies[-count // 4 :])
         ],
-        'memory_mb': memory,
-        'grown_mb': memory - at_first,
+        'memory_mb': memory_mb,
+        'grown_mb': memory_mb - at_first,
         # Of the second half, by when everything has happened once.
         'grown_later_mb': memories[-1] - memories[len(memories) // 2] if memories else 0.0,
         'cpu_s': dict(zip((node.name for node in processes), spent, strict=True)),
@@ -398,50 +328,7 @@ def _told_of_a_visit(messages: Mapping[int, bytes], clip: Path, rate: float) -> 
     }
 
 
-def _nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> list[LiveNode]:
-    """The nodes as the launch file starts them; the one that tracks is the first."""
-    from hmt_ros.nodes.person_node import used_of_each_other
-
-    images = {
-        'image_transport': case.transport,
-        'background_file': str(clip / 'background.png'),
-    }
-    detector = {DETECTOR: KeypointsParameters(image_transport=case.transport)}
-    names = (
-        FILTER,
-        *((SMOOTHER,) if case.smoothed else ()),
-        DETECTOR if case.detector else KEYPOINTS if case.keypoints else BME,
-    )
-    used = used_of_each_other(names)
-    chosen: dict[str, Any]
-    if case.people:
-        chosen = {PEOPLE_NODE: replace(PeopleParameters(), **images)}
-    else:
-        given = {'use_keypoints': True} if case.keypoints else {}
-        chosen = {
-            FILTER: replace(FilterParameters(), **images, **used[FILTER] | given | case.filter)
-        }
-        if case.smoothed:
-            chosen[SMOOTHER] = SmootherParameters()
-        if case.detector:
-            chosen |= detector
-        elif not case.keypoints:
-            chosen[BME] = replace(BmeParameters(), **images | used[BME] | case.bme)
-    process = None
-    if case.together:
-        process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', tuple(chosen))
-    nodes = [
-        LiveNode(
-            player, opened, name, parameters, inputs={}, topics={}, within=process, write=_ignored
-        )
-        for name, parameters in chosen.items()
-    ]
-    if process is not None:
-        process.start()
-    return nodes
-
-
-def _listen(player: Player) -> dict[str, list[tuple[int, bytes, int]]]:
+def _listen(player: Player, case: Case) -> dict[str, list[tuple[int, bytes, int]]]:
     """Lists that fill with stamp, bytes and time of arrival of what arrives, by topic."""
     from hmt_msgs.msg import KeepOut, People2D, PoseMixture
 
@@ -452,6 +339,9 @@ def _listen(player: Player) -> dict[str, list[tuple[int, bytes, int]]]:
         messages.append((stamp_in(data), data, time.monotonic_ns()))
 
     for topic, messages in arrived.items():
+        # What nobody listens to is not made.
+        if topic == TOLD and not case.keep_out:
+            continue
 
         def heard(data: bytes, messages: Any = messages) -> None:
             into(messages, data)
@@ -460,93 +350,9 @@ def _listen(player: Player) -> dict[str, list[tuple[int, bytes, int]]]:
     return arrived
 
 
-class _Camera:
-    """The process that shows the clip."""
-
-    def __init__(
-        self,
-        opened: ExitStack,
-        domain: int,
-        clip: Path,
-        transport: str,
-        images: int,
-        more: Sequence[str] = (),
-        *,
-        subscribers: int,
-        rate: float,
-    ) -> None:
-        command = [sys.executable, '-m', 'benchmarks.camera', str(clip), transport]
-        self._process = subprocess.Popen(
-            [*command, f'{rate:g}', str(images), str(subscribers), *more],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, **environment(domain)},
-            start_new_session=True,
-        )
-        opened.callback(self._process.kill)
-        self.latest_ns = 0
-
-    def begin(self, player: Player) -> tuple[int, int]:
-        """Sets the clip in motion; by how much its stamps are later, and when it begins, ns."""
-        self._say()
-        assert self._process.stdout is not None
-        shift, start = self._process.stdout.readline().split()
-        return int(shift), int(start)
-
-    def ended(self) -> bool:
-        """Whether all images have been published."""
-        import select
-
-        assert self._process.stdout is not None
-        if not select.select([self._process.stdout], [], [], 0)[0]:
-            return False
-        self.latest_ns = int(self._process.stdout.readline())
-        return True
-
-    def spin(
-        self,
-        player: Player,
-        done: Callable[[], bool],
-        seconds: float,
-        every: Callable[[], None] = lambda: None,
-    ) -> None:
-        """Listens until something is done; does something else every few seconds.
-
-        Raises:
-            LiveNodeError: it takes too long, or the camera has ended.
-        """
-        end, then = time.monotonic() + seconds, time.monotonic() + GLANCE
-        while not done():
-            player.executor.spin_once(timeout_sec=0.1)
-            if time.monotonic() > then:
-                then += GLANCE
-                every()
-            if self._process.poll() is not None:
-                raise LiveNodeError(f'the camera ended with code {self._process.returncode}')
-            if time.monotonic() > end:
-                raise LiveNodeError(f'no end of the clip, or no track, within {seconds:.0f} s')
-
-    def _say(self) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(b'\n')
-        self._process.stdin.flush()
-
-
 def _received(player: Player, node: LiveNode) -> int:
     """Images that have reached a node, by its diagnostics, which come once a second."""
     return int(player.diagnostics.get(node.name, {}).get('images received', '0'))
-
-
-def _cpu_seconds(node: LiveNode) -> float:
-    """Time that the process of a node has computed, s."""
-    fields = Path(f'/proc/{node.process.pid}/stat').read_text('utf-8').rpartition(')')[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
-
-
-def _memory(node: LiveNode) -> float:
-    """Memory of the process of a node that no other shares, MB."""
-    text = Path(f'/proc/{node.process.pid}/smaps_rollup').read_text('utf-8')
-    return sum(int(line.split()[1]) for line in text.splitlines() if line.startswith('Pss:')) / 1e3
 
 
 def _shifted(data: bytes, stamp_ns: int) -> bytes:
@@ -555,10 +361,6 @@ def _shifted(data: bytes, stamp_ns: int) -> bytes:
     from msg_tools.messages.cdr import canonical
 
     return canonical(with_stamp(data, stamp_ns), POSE_MIXTURE)
-
-
-def _ignored(topic: str, stamp: int, data: bytes) -> None:
-    """Results are listened to elsewhere."""
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:

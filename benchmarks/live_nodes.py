@@ -1,0 +1,232 @@
+"""The cases of the benchmark `live`, and the nodes and the camera of each as processes."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks.live_clips import LARGE, PEOPLE, VISIT
+from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
+from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER
+from hmt_ros.app.replay.player import LiveNodeError, Player, environment
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.image_inputs import KEYPOINTS
+from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+
+GLANCE = 5.0  # s, between two looks at the memory
+PERSON, PEOPLE_NODE, DETECTOR = 'person_node', 'people_node', 'keypoints_node'
+
+
+@dataclass(frozen=True)
+class Case:
+    """How the nodes are run.
+
+    Attributes:
+        what: in words.
+        clip: that is shown, see `benchmarks.live_clips`.
+        transport: of the images.
+        room: whether Fast DDS has room for raw images.
+        keypoints: whether there are any; then there is no BME.
+        detector: whether MediaPipe finds them, on the same machine.
+        together: whether the nodes run in one process.
+        smoothed: whether there is a smoother.
+        keep_out: whether a robot listens to what it keeps out of.
+        filter, bme: parameters that are not the usual ones.
+    """
+
+    what: str
+    clip: str = 'dance'
+    transport: str = 'raw'
+    room: bool = True
+    keypoints: bool = False
+    detector: bool = False
+    together: bool = False
+    smoothed: bool = True
+    keep_out: bool = False
+    filter: Mapping[str, Any] = field(default_factory=dict)
+    bme: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def people(self) -> int:
+        """Number of people, where `people_node` follows them; else 0."""
+        kind, _, number = self.clip.partition(' ')
+        return int(number) if kind == PEOPLE else 0
+
+
+CASES = {
+    'newest': Case('processes apart: newest complete image'),
+    'queue': Case('queue_size 5', filter={'queue_size': 5}, bme={'queue_size': 5}),
+    'predictions': Case('predictions from every image', bme={'tracked_interval': 0.0}),
+    'compressed': Case('JPEG', transport='compressed'),
+    'gravity': Case('gravity given', filter={'gravity': (0.0, 1.0, 0.0)}),
+    'keypoints': Case('images and keypoints', keypoints=True),
+    'together': Case('one process: newest complete image', together=True),
+    'together, keep_out': Case(
+        'one process: the same, keep_out listened to', together=True, keep_out=True
+    ),
+    'together, filter': Case(
+        'one process: filter and experts alone', together=True, smoothed=False
+    ),
+    'together, keypoints': Case('one process: images and keypoints', keypoints=True, together=True),
+    'together, keypoints, filter': Case(
+        'one process: the same, filter alone', keypoints=True, together=True, smoothed=False
+    ),
+    'together, detector': Case(
+        'one process: images and MediaPipe', keypoints=True, detector=True, together=True
+    ),
+    'large': Case('processes apart: 1280x720, 15 images a second', clip=LARGE),
+    'usual DDS': Case('without fastdds.xml', room=False),
+    'visit': Case('one process: images', clip=VISIT, together=True, keep_out=True),
+    'visit, keypoints': Case(
+        'one process: images and MediaPipe',
+        clip=VISIT,
+        keypoints=True,
+        detector=True,
+        together=True,
+        keep_out=True,
+    ),
+    **{
+        f'people {count}': Case(f'people_node: {count}', clip=f'{PEOPLE} {count}', keypoints=True)
+        for count in (1, 2, 4)
+    },
+}
+
+
+def start_nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> list[LiveNode]:
+    """The nodes as the launch file starts them; the one that tracks is the first."""
+    from hmt_ros.nodes.person_node import used_of_each_other
+
+    images = {
+        'image_transport': case.transport,
+        'background_file': str(clip / 'background.png'),
+    }
+    detector = {DETECTOR: KeypointsParameters(image_transport=case.transport)}
+    names = (
+        FILTER,
+        *((SMOOTHER,) if case.smoothed else ()),
+        DETECTOR if case.detector else KEYPOINTS if case.keypoints else BME,
+    )
+    used = used_of_each_other(names)
+    chosen: dict[str, Any]
+    if case.people:
+        chosen = {PEOPLE_NODE: replace(PeopleParameters(), **images)}
+    else:
+        given = {'use_keypoints': True} if case.keypoints else {}
+        chosen = {
+            FILTER: replace(FilterParameters(), **images, **used[FILTER] | given | case.filter)
+        }
+        if case.smoothed:
+            chosen[SMOOTHER] = SmootherParameters()
+        if case.detector:
+            chosen |= detector
+        elif not case.keypoints:
+            chosen[BME] = replace(BmeParameters(), **images | used[BME] | case.bme)
+    process = None
+    if case.together:
+        process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', tuple(chosen))
+    nodes = [
+        LiveNode(
+            player, opened, name, parameters, inputs={}, topics={}, within=process, write=_ignored
+        )
+        for name, parameters in chosen.items()
+    ]
+    if process is not None:
+        process.start()
+    return nodes
+
+
+class CameraProcess:
+    """The process that shows the clip."""
+
+    def __init__(
+        self,
+        opened: ExitStack,
+        domain: int,
+        clip: Path,
+        transport: str,
+        images: int,
+        more: Sequence[str] = (),
+        *,
+        subscribers: int,
+        rate: float,
+    ) -> None:
+        command = [sys.executable, '-m', 'benchmarks.camera', str(clip), transport]
+        self._process = subprocess.Popen(
+            [*command, f'{rate:g}', str(images), str(subscribers), *more],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, **environment(domain)},
+            start_new_session=True,
+        )
+        opened.callback(self._process.kill)
+        self.latest_ns = 0
+
+    def begin(self, player: Player) -> tuple[int, int]:
+        """Sets the clip in motion; by how much its stamps are later, and when it begins, ns."""
+        self._say()
+        assert self._process.stdout is not None
+        shift, start = self._process.stdout.readline().split()
+        return int(shift), int(start)
+
+    def ended(self) -> bool:
+        """Whether all images have been published."""
+        assert self._process.stdout is not None
+        if not select.select([self._process.stdout], [], [], 0)[0]:
+            return False
+        self.latest_ns = int(self._process.stdout.readline())
+        return True
+
+    def spin(
+        self,
+        player: Player,
+        done: Callable[[], bool],
+        seconds: float,
+        every: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Listens until something is done; does something else every few seconds.
+
+        Raises:
+            LiveNodeError: it takes too long, or the camera has ended.
+        """
+        end, then = time.monotonic() + seconds, time.monotonic() + GLANCE
+        while not done():
+            player.executor.spin_once(timeout_sec=0.1)
+            if time.monotonic() > then:
+                then += GLANCE
+                every()
+            if self._process.poll() is not None:
+                raise LiveNodeError(f'the camera ended with code {self._process.returncode}')
+            if time.monotonic() > end:
+                raise LiveNodeError(f'no end of the clip, or no track, within {seconds:.0f} s')
+
+    def _say(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(b'\n')
+        self._process.stdin.flush()
+
+
+def cpu_seconds(node: LiveNode) -> float:
+    """Time that the process of a node has computed, s."""
+    fields = Path(f'/proc/{node.process.pid}/stat').read_text('utf-8').rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def memory(node: LiveNode) -> float:
+    """Memory of the process of a node that no other shares, MB."""
+    text = Path(f'/proc/{node.process.pid}/smaps_rollup').read_text('utf-8')
+    return sum(int(line.split()[1]) for line in text.splitlines() if line.startswith('Pss:')) / 1e3
+
+
+def _ignored(topic: str, stamp: int, data: bytes) -> None:
+    """Results are listened to elsewhere."""
