@@ -138,7 +138,7 @@ def messages_are_there() -> bool:
 
 setup(
     name=PACKAGE,
-    version='0.1.0',
+    version='1.0.0',
     description='Monocular 3D human motion tracking with mixtures, for ROS 2',
     license='Apache-2.0',
     author='hmt_ros contributors',

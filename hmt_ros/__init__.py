@@ -4,6 +4,6 @@ from pathlib import Path
 
 from hmt_ros.compiled_code import keep_compiled_code_apart
 
-__version__ = '0.1.0'
+__version__ = '1.0.0'
 
 keep_compiled_code_apart(Path(__file__).parent)
