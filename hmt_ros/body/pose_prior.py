@@ -75,7 +75,7 @@ class MixturePrior:
             np.einsum('cij,cj->ci', mixture.whitening, whole.means),
             np.log(whole.weights) - log_det - 0.5 * n * np.log(2.0 * np.pi) - mixture.highest,
             mixture.precisions,
-            np.asarray(mixture.indices, dtype=np.int64),
+            np.array(mixture.indices, dtype=np.int64),
             self.body.prior_mean,
             rest,
             self.weight,

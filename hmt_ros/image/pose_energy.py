@@ -203,7 +203,8 @@ class PoseEnergy:
         if self.point is None:
             return np.arange(self.likelihood.body.dimension)
         assert self.free is not None
-        return np.asarray(self.free, dtype=np.intp)
+        # A copy, which can be written: compiled code is the same for all.
+        return np.array(self.free, dtype=np.intp)
 
     def _checked(self, x: ArrayLike) -> Array:
         result = np.array(x, dtype=np.float64, ndmin=2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hmt_ros.compiled_code import compiled_functions
+from hmt_ros.image.pose_energy_kernel import solve
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.filter_parameters import FilterParameters
@@ -37,6 +38,12 @@ def test_preparing_estimates_and_publishes_nothing(kind, parameters, outputs):
     assert compiled_functions().count == count
     assert session.state == before
     assert outputs == []
+
+
+def test_the_largest_kernel_is_compiled_once():
+    """Arrays of another layout, or that can not be written, would compile it again for 20 s."""
+    warm_up_tracking()
+    assert len(solve.signatures) == 1
 
 
 def test_a_tracker_is_the_same_after_it():

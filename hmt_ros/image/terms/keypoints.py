@@ -378,7 +378,10 @@ NOT_LIFTED = Lifted(
 
 @lru_cache(maxsize=16)
 def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lifted:
-    """A mixture over whole poses as compiled code reads it."""
+    """A mixture over whole poses as compiled code reads it, in arrays of one layout.
+
+    Each layout of an array, and each array that can not be written, is a kernel to compile.
+    """
     known = set(skeleton.joint_names)
     if poses is None or not known.issuperset(HIPS):
         return NOT_LIFTED
@@ -389,9 +392,9 @@ def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lift
     deviations = sigma * np.stack([x.deviations[:, :, 2] for x in both])
     return Lifted(
         skeleton.joint_segments[joints].astype(np.int64), skeleton.joint_offsets[joints],
-        middle_of_hips(skeleton), poses.axes[2],
+        middle_of_hips(skeleton), np.ascontiguousarray(poses.axes[2]),
         poses.log_weights - np.log(deviations[0]).sum(1), np.ascontiguousarray(depths),
-        1.0 / deviations, EXCHANGED.min(1), LIFTED_WEIGHT, LIFTED_SCALE,
+        np.ascontiguousarray(1.0 / deviations), EXCHANGED.min(1), LIFTED_WEIGHT, LIFTED_SCALE,
     )  # fmt: skip
 
 
