@@ -198,7 +198,8 @@ class Space {
     const pitch = (this.pitch * Math.PI) / 180;
     const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
     const distance = DISTANCE * this.radius;
-    const scale = (0.5 * Math.min(width, height) * this.zoom * distance) / this.radius;
+    // People are taller than wide.
+    const scale = (0.5 * Math.min(1.6 * width, height) * this.zoom * distance) / this.radius;
     const root = this.follow ? this.lastRoot() : null;
     const centre = root || this.centre;
     return (x, y, z) => {
@@ -252,6 +253,7 @@ class Space {
     if (shown.trajectories && (!pane || pane.kind === 'smoothed')) this.drawWays(context, project);
     const here = ({ figure }) => [null, figure].includes(pane) || figure === truth || (pane === layers[0] && !besides.includes(figure));
     const segments = [];
+    const finer = Math.min(1, width / 250);
     const root = this.lastRoot() || this.centre;
     const bodies = modesNow().filter(here).map((mode) => {
       const own = this.origin(mode.figure, mode.offset);
@@ -276,7 +278,7 @@ class Space {
     segments.filter(({ depth }) => !Number.isNaN(depth)).sort((a, b) => b.depth - a.depth).forEach(({ from, to, mode, side, ball = 0 }) => {
       context.globalAlpha = mode.strength;
       context.setLineDash(ball ? [] : mode.dash);
-      context.lineWidth = ((ball || 1) * mode.width * DISTANCE * this.radius) / (0.5 * (from[2] + to[2]));
+      context.lineWidth = ((ball || 1) * finer * mode.width * DISTANCE * this.radius) / (0.5 * (from[2] + to[2]));
       context.strokeStyle = colour(mode.ink || `${mode.style}-${side}`);
       context.beginPath();
       context.moveTo(from[0], from[1]);
