@@ -54,8 +54,9 @@ function look(name, id = 'space') {
 }
 const get = (id) => document.getElementById(id);
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
-function pointer(target, kind, x, y) {
-  target.dispatchEvent(new PointerEvent(kind, { clientX: x, clientY: y, bubbles: true }));
+function pointer(target, kind, x, y, pointerId = 1) {
+  const options = { clientX: x, clientY: y, bubbles: true, pointerId };
+  target.dispatchEvent(new PointerEvent(kind, options));
 }
 const pressed = (button) => button.getAttribute('aria-pressed') === 'true';
 function key(target, name) {
@@ -127,15 +128,20 @@ def test_slider_mouse_and_keys_change_the_view(page, tmp_path):
         look('wheel');
         document.querySelector('[data-look="0 0"]').click(); look('from the camera');
         key(space, '0'); look('reset');
+        [[100, 1], [200, 2]].forEach(([x, id]) => pointer(space, 'pointerdown', x, 100, id));
+        pointer(space, 'pointermove', 250, 100, 2);
+        pointer(space, 'pointerup', 250, 100, 2);
+        look('two fingers');
+        key(space, '0'); key(space, '+'); key(space, '-'); look('reset again');
         key(document.body, 'ArrowLeft'); seen['clock after a key'] = get('clock').value;
         """,
         tmp_path,
     )
-    views = ['first', 'later', 'dragged', 'key', 'wheel', 'from the camera']
+    views = ['first', 'later', 'dragged', 'key', 'wheel', 'from the camera', 'two fingers']
     assert len({seen[name] for name in views}) == len(views)
     assert min(seen[f'{name} drawn'] for name in views) > 1000
     assert seen['let go'] == seen['dragged']
-    assert seen['reset'] == seen['later']
+    assert seen['reset'] == seen['reset again'] == seen['later']
     assert seen['first image'] != seen['later image']
     assert seen['first image drawn'] > 100_000
     assert seen['first weights'] != seen['later weights']
