@@ -26,6 +26,13 @@ def body_topics(bag: BagReader) -> list[str]:
     return [topic.name for topic in bag.topics.values() if topic.msgtype == BODY]
 
 
+def topic_beside(bag: BagReader, msgtype: str, topic: str) -> str | None:
+    """The topic of a type in the namespace of another topic, or else the only one of the bag."""
+    names = [x.name for x in bag.topics.values() if x.msgtype == msgtype and x.message_count]
+    chosen = [name for name in names if _namespace(name) == _namespace(topic)] or names
+    return chosen[0] if len(chosen) == 1 else None
+
+
 class RecordedBodies:
     """The bodies of the mixtures that are read from a bag.
 
@@ -87,17 +94,11 @@ def read_grounds(path: Path, topic: str, frame_id: str) -> dict[int, GroundState
         ValueError: a message that can not be understood.
     """
     with BagReader(path) as bag:
-        names = [
-            each.name
-            for each in bag.topics.values()
-            if each.msgtype == GROUND and each.message_count
-        ]
-        beside = [name for name in names if _namespace(name) == _namespace(topic)]
-        chosen = beside or names
-        if len(chosen) != 1:
+        chosen = topic_beside(bag, GROUND, topic)
+        if chosen is None:
             return {}
         found = {}
-        for stored in bag.messages(chosen):
+        for stored in bag.messages([chosen]):
             try:
                 content = ground_of(stored.message)
             except ValueError as error:

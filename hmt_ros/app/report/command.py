@@ -11,6 +11,7 @@ from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.evaluate import chosen_topics, score_bag
 from hmt_ros.app.progress import Progress, show_progress
 from hmt_ros.app.recorded_bodies import body_topics, read_grounds
+from hmt_ros.app.report.detector import read_detector
 from hmt_ros.app.report.images import FilmStrip, ImageSource, film_strip, image_source
 from hmt_ros.app.report.mixtures import RecordedMixtures, read_mixtures
 from hmt_ros.app.report.page import Content, data_size, page_html
@@ -21,9 +22,11 @@ from msg_tools import BagReader
 from msg_tools.files.new_folder import FolderKind
 
 PAGE = 'report.html'
-# Largest page, and largest part of it for data before times are left out, bytes.
+# Largest page, largest part of it for data before times are left out, and largest part for images:
+# this, and as much again for each second. Bytes.
 PAGE_BYTES = 19_500_000
 DATA_BYTES = 12_000_000
+IMAGE_BYTES = 700_000
 # Program and scores, whose size does not grow with time, bytes.
 REST_BYTES = 200_000
 MAX_TIMES = 600
@@ -37,8 +40,8 @@ truth is known, errors and calibration. Beside it are the pictures (PNG) for doc
 written completely or not at all.
 
 The images come from --images, else from OUT itself (replay --with-images), else from its topic
-overlay/compressed, on which the heaviest modes are already drawn. The page never exceeds 20 MB:
-images are scaled down as needed.
+overlay/compressed, on which the heaviest modes are already drawn. Images are scaled down to 0.7 MB
+and as much again for each second, and the page never exceeds 20 MB.
 
 examples:
   report out -o report --images bags/reach
@@ -176,14 +179,20 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
     ]
     images = FilmStrip()
     if source is not None:
-        left = PAGE_BYTES - REST_BYTES - data_size(mixtures)
+        usual = int(IMAGE_BYTES * (1 + (stamps[-1] - stamps[0]) * 1e-9))
+        left = min(PAGE_BYTES - REST_BYTES - data_size(mixtures), usual)
         keep = shown_in_pictures(mixtures.layers[0]) if mixtures.layers else set()
         # Base64 turns three bytes into four.
         images = film_strip(source, stamps, left * 3 // 4, keep=keep, progress=bar.update)
         if len(images.jpegs) < len(stamps):
             notes.append(f'{len(stamps) - len(images.jpegs)} times are shown without an image')
+    detector = None
+    if mixtures.layers:
+        bags = [options.bag] if source is None else [options.bag, source.bag]
+        read = (read_detector(bag, mixtures.layers[0]) for bag in dict.fromkeys(bags))
+        detector = next(filter(None, read), None)
     title = f'{options.bag.resolve().name}: mixtures over poses'
-    return Content(title, stamps, mixtures, images, truth, scores, notes, grounds)
+    return Content(title, stamps, mixtures, images, truth, scores, notes, grounds, detector)
 
 
 def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:

@@ -26,12 +26,13 @@ PROBABILITIES = np.array([0.05, 0.5, 0.95])
 # Above a camera that is level.
 _LEVEL = np.array([0.0, -1.0, 0.0, 0.0])
 _HALVINGS = 22
-
+# Radius of the region of 90 % of a normal distribution in space, in standard deviations.
+_RADIUS = 2.500278
 
 # Joints whose paths are drawn of trajectories, and how many trajectories are kept.
 ENDS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
 KEPT_TRAJECTORIES = 8
-# Kinds whose heights and angles are shown over time.
+# Kinds whose regions, and whose heights and angles over time, are shown.
 BANDED = ('posterior', 'smoothed')
 _TRAJECTORIES = 'trajectories'
 _ORDER = (
@@ -81,6 +82,23 @@ def marginals_of(content: PoseMixture, body: Body | None, ground: GroundState | 
     return np.concatenate(result, axis=-1)
 
 
+def regions_of(content: PoseMixture) -> Array:
+    """Ellipsoids that hold 90 % of where a joint is, relative to the pelvis, by component.
+
+    Returns:
+        (K, J, 6) xx, yy, zz, xy, xz, yz of the matrix R, m, which takes the unit ball to the
+        ellipsoid around the joint; (K, 0, 6) where covariances are not known.
+    """
+    spread = content.joint_covariances_relative
+    if spread is None:
+        return np.empty((len(content.weights), 0, 6))
+    squares, axes = np.linalg.eigh(spread)
+    roots = (axes * _RADIUS * np.sqrt(np.maximum(squares, 0.0))[..., None, :]) @ axes.swapaxes(
+        -1, -2
+    )
+    return np.asarray(roots[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], dtype=np.float64)
+
+
 def intervals(weights: Array, marginals: Array) -> Array:
     """Quantiles (V, 3) of mixtures of normal distributions at `PROBABILITIES`.
 
@@ -110,6 +128,7 @@ class Moment:
         cues: probability that each cue of the images shows the person, by its name; empty: unknown.
         identities: (K,) of the modes; 0: none.
         marginals: (2, K, J + A) of heights and angles, see `marginals_of`; (2, K, 0): unknown.
+        regions: (K, J, 6) of the joints, see `regions_of`; (K, 0, 6): unknown.
     """
 
     stamp_ns: int
@@ -119,6 +138,7 @@ class Moment:
     cues: Mapping[str, float] = field(default_factory=dict)
     identities: Array = field(default_factory=lambda: np.empty(0))
     marginals: Array = field(default_factory=lambda: np.empty((2, 0, 0)))
+    regions: Array = field(default_factory=lambda: np.empty((0, 0, 6)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,9 +320,11 @@ def _pose_layer(
     order = np.argsort(-content.weights, kind='stable')
     stamp, kind = content.stamp_ns, content.kind.name.lower()
     body, marginals = None, np.empty((2, len(order), 0))
+    regions = np.empty((len(order), 0, 6))
     if kind in BANDED:
         body = bodies.of(topic, content)
         marginals = marginals_of(content, body, ground_at(grounds, stamp))
+        regions = regions_of(content)
     moment = Moment(
         stamp,
         content.weights[order],
@@ -311,6 +333,7 @@ def _pose_layer(
         content.cue_probabilities,
         content.identities[order].astype(np.float64),
         marginals[:, order].astype(np.float32),
+        regions[order].astype(np.float32),
     )
     names = content.joint_names
     return Layer(topic, kind, content.frame_id, names, {stamp: moment}, angles_of(body))

@@ -10,7 +10,7 @@ import base64
 import html
 import json
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.app.evaluate import as_json
+from hmt_ros.app.report.detector import Detector
 from hmt_ros.app.report.images import FilmStrip
 from hmt_ros.app.report.mixtures import (
     Layer,
@@ -36,8 +37,8 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.calibration import coverage
 from msg_tools.messages.ground import GroundState
 
-# Least step of positions, m, and step of pixels as a fraction of the width of the image.
-FINEST = 5e-4
+# Least step of positions and step of regions, m; of pixels as a fraction of the width of the image.
+FINEST, _REGION = 5e-4, 1e-4
 _PIXEL = 1 / 8000
 _NOWHERE = -(2**15)  # a pixel of a point that can not be seen
 _LARGEST = 2**15 - 1
@@ -58,6 +59,7 @@ class Content:
         scores: by topic; empty without truth.
         notes: what the page does not show, and why.
         grounds: what is known of the floor and of contacts, by stamp; empty: nothing.
+        detector: skeletons of a detector that lifts; None: there are none.
     """
 
     title: str
@@ -68,6 +70,7 @@ class Content:
     scores: dict[str, TrackScores]
     notes: list[str]
     grounds: dict[int, GroundState] = field(default_factory=dict)
+    detector: Detector | None = None
 
 
 def data_size(mixtures: RecordedMixtures) -> int:
@@ -81,6 +84,8 @@ def data_size(mixtures: RecordedMixtures) -> int:
             size += len(moment.weights) * each + 8 * (1 + len(moment.cues))
             # Intervals of 6 bytes in base64, and identities as text.
             size += 8 * moment.marginals.shape[2] + 8 * len(moment.weights)
+            # Regions of 2 bytes a number in base64.
+            size += 8 * moment.regions.size // 3
     for topic in mixtures.trajectories:
         for window in topic.mixtures.values():
             ways = 0 if window.ways is None else window.ways[..., 0].size
@@ -135,7 +140,8 @@ def page_data(content: Content) -> dict[str, Any]:
 
     Positions are `origin + step * int16`, m, in the camera optical frame: of each layer (modes of
     all times in turn, joints, 3), of trajectories (component, time, end, 3). Pixels are `int16`
-    times 1/8000 of the width of the image, from the centre of the first pixel. The middle of the
+    times 1/8000 of the width of the image, from the centre of the first pixel; regions of
+    `regions_of` are `region * int16`, m. -32768 is no number. The middle of the
     joints `roots` of a skeleton is aligned with that of the others on demand.
     """
     grid = _Grid.around(content)
@@ -149,12 +155,16 @@ def page_data(content: Content) -> dict[str, Any]:
         'origin': [_rounded(x, 6) for x in grid.origin],
         'step': grid.step,
         'pixel': _PIXEL,
+        'region': _REGION,
         'lost_mm': 1e3 * LOST,
         'layers': [_layer(layer, content, grid) for layer in content.mixtures.layers],
         'trajectories': [
             _trajectories(topic, start, grid) for topic in content.mixtures.trajectories
         ],
         'truth': None if truth is None else _truth(truth, content, grid),
+        'detector': None
+        if content.detector is None
+        else _detector(content.detector, content, grid),
         'ground': ground_data(content.grounds, stamps),
         'images': _images(content),
         'scores': _scores(content),
@@ -180,13 +190,15 @@ class _Grid:
         ]
         if truth is not None:
             parts += [truth.joints[t] for t in content.stamps if t in truth.joints]
+        if content.detector is not None:
+            parts += content.detector.joints.values()
         points = np.concatenate([part.reshape(-1, 3) for part in parts or [np.zeros((1, 3))]])
-        low, high = points.min(0), points.max(0)
+        low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
         step = max(FINEST, float((high - low).max()) / (2 * _LARGEST))
         return _Grid(np.round(0.5 * (low + high), 6), step)
 
     def encoded(self, positions: Array) -> str:
-        return _base64(np.rint((positions - self.origin) / self.step))
+        return _base64(_whole((positions - self.origin) / self.step))
 
 
 def _layer(layer: Layer[Moment], content: Content, grid: _Grid) -> dict[str, Any]:
@@ -215,7 +227,15 @@ def _layer(layer: Layer[Moment], content: Content, grid: _Grid) -> dict[str, Any
         'bands': _bands(layer, content.stamps),
         'positions': grid.encoded(everything),
         'pixels': _pixels(content.images, everything),
+        'regions': _regions([moments[stamp] for stamp in content.stamps if stamp in moments]),
     }
+
+
+def _regions(moments: Sequence[Moment]) -> str | None:
+    """Regions of the joints of all modes; None: those of some are not known."""
+    known = moments and all(moment.regions.size for moment in moments)
+    every = [moment.regions.ravel() / _REGION for moment in moments]
+    return _base64(_whole(np.concatenate(every))) if known else None
 
 
 def _beliefs(moments: Sequence[Moment | None]) -> dict[str, Any]:
@@ -313,16 +333,36 @@ def _trajectories(layer: Layer[Window], start: int, grid: _Grid) -> dict[str, An
 
 
 def _truth(truth: Truth, content: Content, grid: _Grid) -> dict[str, Any]:
-    known = [stamp for stamp in content.stamps if stamp in truth.joints]
-    joints = [truth.joints[stamp][None] for stamp in known]
-    positions = np.concatenate([np.zeros((0, len(truth.joint_names), 3)), *joints])
+    names = truth.joint_names
+    known = [truth.joints[stamp][None] for stamp in content.stamps if stamp in truth.joints]
     return {
         'source': truth.source,
-        **_skeleton(truth.joint_names, content),
-        'known': [stamp in truth.joints for stamp in content.stamps],
-        'positions': grid.encoded(positions),
-        'pixels': _pixels(content.images, positions),
+        **_one_each(names, truth.joints, content, grid),
+        'pixels': _pixels(content.images, np.concatenate([np.zeros((0, len(names), 3)), *known])),
         'heights': _base64(_whole(1e3 * _true_heights(truth, content))),
+    }
+
+
+def _detector(detector: Detector, content: Content, grid: _Grid) -> dict[str, Any]:
+    return {
+        'topic': detector.topic,
+        **_one_each(detector.joint_names, detector.joints, content, grid),
+        'confidences': [
+            _probability(detector.confidences.get(stamp, math.nan)) for stamp in content.stamps
+        ],
+    }
+
+
+def _one_each(
+    names: tuple[str, ...], joints: Mapping[int, Array], content: Content, grid: _Grid
+) -> dict[str, Any]:
+    """One skeleton at each time for which it is known."""
+    known = [joints[stamp][None] for stamp in content.stamps if stamp in joints]
+    positions = np.concatenate([np.zeros((0, len(names), 3)), *known])
+    return {
+        **_skeleton(names, content),
+        'known': [stamp in joints for stamp in content.stamps],
+        'positions': grid.encoded(positions),
     }
 
 

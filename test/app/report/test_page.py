@@ -11,6 +11,7 @@ import pytest
 
 from test.app.conftest import FRAMES, TRAJECTORIES, make, write_out
 from test.app.report.test_command import with_beliefs, with_ground
+from test.app.report.test_detector import with_detector
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable', 'chrome')
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -31,14 +32,17 @@ const complain = (...words) => complaints.push(words.join(' '));
 # After everything else: what a person does, and what is seen then.
 VISIT = """<script>
 const seen = {};
-function look(name, id = 'space') {
+function pixelsOf(id) {
   const canvas = document.getElementById(id);
   const { width, height } = canvas;
   // A copy: reading a canvas often would change how it is kept.
   const copy = new OffscreenCanvas(width, height);
   const context = copy.getContext('2d', { willReadFrequently: true });
   context.drawImage(canvas, 0, 0);
-  const pixels = context.getImageData(0, 0, width, height).data;
+  return context.getImageData(0, 0, width, height).data;
+}
+function look(name, id = 'space') {
+  const pixels = pixelsOf(id);
   let hash = 0;
   let drawn = 0;
   for (let i = 0; i < pixels.length; i += 4) {
@@ -50,9 +54,11 @@ function look(name, id = 'space') {
 }
 const get = (id) => document.getElementById(id);
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
-function pointer(target, kind, x, y) {
-  target.dispatchEvent(new PointerEvent(kind, { clientX: x, clientY: y, bubbles: true }));
+function pointer(target, kind, x, y, pointerId = 1) {
+  const options = { clientX: x, clientY: y, bubbles: true, pointerId };
+  target.dispatchEvent(new PointerEvent(kind, options));
 }
+const pressed = (button) => button.getAttribute('aria-pressed') === 'true';
 function key(target, name) {
   const options = { key: name, bubbles: true, cancelable: true };
   target.dispatchEvent(new KeyboardEvent('keydown', options));
@@ -122,15 +128,20 @@ def test_slider_mouse_and_keys_change_the_view(page, tmp_path):
         look('wheel');
         document.querySelector('[data-look="0 0"]').click(); look('from the camera');
         key(space, '0'); look('reset');
+        [[100, 1], [200, 2]].forEach(([x, id]) => pointer(space, 'pointerdown', x, 100, id));
+        pointer(space, 'pointermove', 250, 100, 2);
+        pointer(space, 'pointerup', 250, 100, 2);
+        look('two fingers');
+        key(space, '0'); key(space, '+'); key(space, '-'); look('reset again');
         key(document.body, 'ArrowLeft'); seen['clock after a key'] = get('clock').value;
         """,
         tmp_path,
     )
-    views = ['first', 'later', 'dragged', 'key', 'wheel', 'from the camera']
+    views = ['first', 'later', 'dragged', 'key', 'wheel', 'from the camera', 'two fingers']
     assert len({seen[name] for name in views}) == len(views)
     assert min(seen[f'{name} drawn'] for name in views) > 1000
     assert seen['let go'] == seen['dragged']
-    assert seen['reset'] == seen['later']
+    assert seen['reset'] == seen['reset again'] == seen['later']
     assert seen['first image'] != seen['later image']
     assert seen['first image drawn'] > 100_000
     assert seen['first weights'] != seen['later weights']
@@ -242,7 +253,7 @@ def test_beliefs_are_drawn_where_a_topic_has_them(page, body, poses, tmp_path):
     seen = visit(known, steps, tmp_path)
     assert ' '.join(seen['first'].split()) == (
         'person in view silhouette track depth '
-        'How far each cue of the images is believed in posterior (/pose_mixture): the probability '
+        'How far each cue of the images is believed in filter (/pose_mixture): the probability '
         'that it shows the person; of the track, that some mode is about where the person is.'
     )
     assert seen['beliefs drawn'] > 1000
@@ -253,7 +264,7 @@ def test_beliefs_are_drawn_where_a_topic_has_them(page, body, poses, tmp_path):
 
 @in_a_browser
 def test_the_address_tells_what_is_shown(page, tmp_path):
-    steps = "look('space'); seen.clock = get('clock').value; seen.second = get('layer-1').checked;"
+    steps = "look('space'); seen.clock = get('clock').value; seen.second = pressed(get('layer-1'));"
     plain = visit(page, steps, tmp_path)
     given = visit(page, steps, tmp_path, '#frame=4&yaw=90&pitch=10&show=0,1')
     assert given['clock'] == f'0.40 s, 5 of {FRAMES}'
@@ -275,6 +286,114 @@ def test_floor_and_contacts_are_drawn(body, poses, tmp_path):
     assert abs(seen[1]['floor'] + (1.5 - 0.6 * 2) / 0.8) < 1e-6
 
 
+@in_a_browser
+def test_keys_buttons_detector_regions_and_shadow(made, body, poses, tmp_path):
+    steps = """
+        const toggles = [...get('layers').children];
+        seen.keys = toggles.map((button) => button.getAttribute('aria-keyshortcuts'));
+        seen.names = toggles.map((button) => button.lastChild.textContent);
+        seen.on = toggles.map(pressed);
+        look('all');
+        key(document.body, '4'); seen.pressed = pressed(get('show-regions')); look('regions');
+        key(document.body, '4'); look('no regions');
+        key(toggles[0], '3'); seen.detector = pressed(get('show-detector')); look('no detector');
+        get('show-detector').click(); look('detector again');
+        toggles[0].focus(); key(toggles[0], 'ArrowRight'); seen.clock = get('clock').value;
+        key(toggles[0], ' '); seen.left = get('play').textContent;
+        key(document.body, ' '); seen.playing = get('play').textContent;
+        key(document.body, ' ');
+        get('beside').click(); look('beside');
+        seen.both = pressed(get('layer-1'));
+        get('beside').click(); get('layer-1').click();
+        // The shadow alone is of pure black that is not opaque.
+        const dark = () => {
+          const data = pixelsOf('space');
+          let count = 0;
+          for (let i = 0; i < data.length; i += 4) {
+            const black = !(data[i] + data[i + 1] + data[i + 2]);
+            if (black && data[i + 3] > 8 && data[i + 3] < 128) count += 1;
+          }
+          return count;
+        };
+        get('show-detector').click();
+        seen.shadow = dark();
+        get('layer-0').click(); seen['no shadow'] = dark(); get('layer-0').click();
+        // Ellipses against points of the ellipsoids.
+        const [layer] = layers;
+        const offset = layer.starts[shown.time];
+        const places = layer.joints.map((_, joint) => space.joint(layer, offset, joint));
+        const project = space.projection(600, 400);
+        const ellipses = [];
+        const pen = { beginPath() {}, fill() {}, stroke() {} };
+        pen.ellipse = (...drawn) => ellipses.push(drawn);
+        const mode = { figure: layer, offset, places, style: 'posterior', strength: 1 };
+        space.drawRegions(pen, project, mode);
+        seen.reached = places.map((place, joint) => {
+          const i = (offset * places.length + joint) * 6;
+          const root = Array.from(layer.regions.slice(i, i + 6), (x) => x * report.region);
+          const [xx, yy, zz, xy, xz, yz] = root;
+          const [u, v, long, short, turn] = ellipses[joint];
+          let most = 0;
+          for (let k = 0; k < 2000; k += 1) {
+            const c = 1 - (2 * k + 1) / 2000;
+            const radius = Math.sqrt(1 - c * c);
+            const [a, b] = [radius * Math.cos(2.4 * k), radius * Math.sin(2.4 * k)];
+            const rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+            const [x, y, z] = rows.map((row) => row[0] * a + row[1] * b + row[2] * c);
+            const at = project(place[0] + x, place[1] - y, place[2] - z);
+            const [p, q] = [at[0] - u, at[1] - v];
+            const along = p * Math.cos(turn) + q * Math.sin(turn);
+            const across = q * Math.cos(turn) - p * Math.sin(turn);
+            most = Math.max(most, Math.hypot(along / long, across / short));
+          }
+          return most;
+        });
+    """
+    bag = with_detector(tmp_path / 'bag', made.out, body, poses)
+    page = make(bag, tmp_path / 'report', '--images', made.images)
+    seen = visit(page, steps, tmp_path, '#frame=3')
+    assert seen['names'] == ['filter', 'smoothed', 'detector', '90 % regions', 'paths']
+    assert seen['keys'] == ['1', '2', '3', '4', '5']
+    assert seen['on'] == [True, False, True, False, False]
+    assert (seen['pressed'], seen['detector']) == (True, False)
+    assert len({seen[name] for name in ('all', 'regions', 'no detector', 'beside')}) == 4
+    assert seen['no regions'] == seen['detector again'] == seen['all']
+    assert seen['clock'] == f'0.40 s, 5 of {FRAMES}'
+    # The space bar on a button presses the button.
+    assert (seen['left'], seen['playing']) == ('Play', 'Pause')
+    assert seen['both'] is True
+    assert seen['shadow'] > 500
+    assert seen['no shadow'] == 0
+    assert len(seen['reached']) == len(body.joint_names)
+    # Of the pelvis relative to itself all is known; perspective bends an ellipse a little.
+    assert seen['reached'][0] is None
+    assert all(0.97 < most < 1.03 for most in seen['reached'][1:])
+
+
+@in_a_browser
+def test_a_phone_shows_all_of_it(page, tmp_path):
+    inner = tmp_path / 'inner.html'
+    told = """<script>addEventListener('load', () => setTimeout(() => {
+        const { scrollWidth, clientWidth } = document.documentElement;
+        const play = document.getElementById('play').getBoundingClientRect();
+        parent.postMessage([scrollWidth, clientWidth, play.bottom, innerHeight], '*');
+    }, 500));</script></body>"""
+    inner.write_text(page.replace('</body>', told, 1), 'utf-8')
+    outer = '<head>\n</head><body></body>'
+    steps = """
+        const phone = document.createElement('iframe');
+        phone.style = 'width: 360px; height: 740px; border: 0';
+        phone.src = 'inner.html';
+        const told = new Promise((done) => addEventListener('message', ({ data }) => done(data)));
+        document.body.append(phone);
+        seen.told = await told;
+    """
+    width, room, bottom, height = visit(outer, steps, tmp_path)['told']
+    assert width == room <= 360
+    # Where time is chosen stays in view.
+    assert 0 < bottom < height == 740
+
+
 def with_identities(message):
     """Modes of two motions, which change places in every other image."""
     swapped = message.header.stamp.nanosec // 100_000_000 % 2
@@ -286,30 +405,20 @@ def with_identities(message):
 @in_a_browser
 def test_filter_and_smoother_are_drawn_side_by_side(page, made, tmp_path):
     steps = """
-        function half(side) {
-          const canvas = get('space');
-          const copy = new OffscreenCanvas(canvas.width / 2 - 4, canvas.height);
-          const context = copy.getContext('2d');
-          context.drawImage(canvas, side ? -canvas.width / 2 - 4 : 0, 0);
-          const { data } = context.getImageData(0, 0, copy.width, copy.height);
-          return data.reduce((hash, x) => (Math.imul(hash, 31) + x) | 0, 0);
-        }
         look('first');
         get('beside').click(); look('beside');
-        seen.smoother = get('layer-1').checked;
-        const both = [half(0), half(1)];
+        seen.smoother = pressed(get('layer-1'));
         get('layer-1').click(); look('filter alone');
-        seen.sides = [half(0) === both[0], half(1) === both[1]];
         get('layer-1').click(); look('both again');
         get('beside').click(); look('over each other');
     """
     seen = visit(page, steps, tmp_path)
     assert seen['smoother'] is True
-    views = ['first', 'beside', 'filter alone', 'over each other']
+    views = ['first', 'beside', 'over each other']
     assert len({seen[name] for name in views}) == len(views)
     assert seen['both again'] == seen['beside']
-    # Without the smoother the side of the filter stays as it is.
-    assert seen['sides'] == [True, False]
+    # Without the smoother there is nothing beside the filter.
+    assert seen['filter alone'] == seen['first']
     given = visit(page, "look('beside');", tmp_path, '#show=0,1,truth,beside')
     assert given['beside'] == seen['beside']
     alone = make(made.out, tmp_path / 'alone', '--topic', 'pose_mixture')
@@ -325,15 +434,14 @@ def test_motions_are_switched_on_and_off(page, body, poses, tmp_path):
         seen.names = [...get('motions-boxes').children].map((label) => label.textContent);
         const rows = [...document.querySelectorAll('#modes tbody tr')];
         seen.motions = rows.map((row) => row.children[3].textContent);
-        const boxes = () => [...document.querySelectorAll('#motions-boxes input')];
-        const ticked = () => boxes().map((box) => box.checked);
+        const on = () => [...get('motions-boxes').children].map(pressed);
         look('all'); look('weights of all', 'motions');
         get('motion-0').click(); look('without the first'); look('weights without', 'motions');
         get('motion-1').click(); look('without both');
         get('chosen').value = 1; get('chosen').dispatchEvent(new Event('change'));
-        seen.others = ticked();
+        seen.others = on();
         get('chosen').value = 0; get('chosen').dispatchEvent(new Event('change'));
-        seen.kept = ticked();
+        seen.kept = on();
         get('motion-0').click(); get('motion-1').click(); look('all again');
     """
     seen = visit(make(out, tmp_path / 'report'), steps, tmp_path)

@@ -131,12 +131,18 @@ function rankColour(rank, count) {
   return `rgb(${from.map((x, c) => Math.round(x + share * (to[c] - x))).join(',')})`;
 }
 
+/** How sure a layer is that a person is in view, and the detector of its keypoints. */
+const confidenceCurves = (layer) => [
+  { name: 'person in view', series: 'ink', dash: [5, 3], values: layer && layer.existence },
+  { name: 'confidence of the detector', series: 'detector-left', dash: [], values: detector && detector.confidences },
+].filter(({ values }) => values && values.some((x) => x !== null));
+
 /** Weights of the chosen mixtures over time, one column per time, the heaviest at the bottom. */
-function weightsChart(weightsAt) {
+function weightsChart({ weightsAt, layer }) {
   const x = timeRange();
   const y = [0, 1];
   return {
-    x, y, labels: ['time, s', 'weight'],
+    x, y, labels: ['time, s', 'weight, confidence'],
     draw(context, u, v) {
       let most = 1;
       TIMES.forEach((_, t) => { most = Math.max(most, weightsAt(t).length); });
@@ -155,6 +161,10 @@ function weightsChart(weightsAt) {
           context.fillRect(from, v(sum + weight), Math.max(to - from, 1), 0.6);
           sum += weight;
         });
+      });
+      confidenceCurves(layer).forEach(({ series, dash, values }) => {
+        curve(context, u, v, TIMES, values, { colour: colour('panel'), width: 4 });
+        curve(context, u, v, TIMES, values, { colour: colour(series), dash });
       });
       drawNow(context, u, v, y);
     },

@@ -15,19 +15,19 @@ function integers(text) {
   return result;
 }
 
-/** Positions in metres: x to the right, y up, z towards the camera. */
+const NOWHERE = -32768;
+
+/** Positions in metres: x to the right, y up, z towards the camera; NaN where a joint was not seen. */
 function metres(text) {
   const raw = integers(text);
   const result = new Float32Array(raw.length);
   for (let i = 0; i < raw.length; i += 1) {
     const axis = i % 3;
-    const value = report.origin[axis] + report.step * raw[i];
+    const value = raw[i] === NOWHERE ? NaN : report.origin[axis] + report.step * raw[i];
     result[i] = axis === 0 ? value : -value;
   }
   return result;
 }
-
-const NOWHERE = -32768;
 
 /** Pixels as fractions of the width of the image; NaN where a point can not be seen. */
 function shares(text) {
@@ -53,9 +53,13 @@ const layers = report.layers.map((layer) => {
     style: KINDS.includes(layer.kind) ? layer.kind : 'prediction',
     positions: metres(layer.positions),
     pixels: shares(layer.pixels),
+    regions: layer.regions && integers(layer.regions),
     bands: layer.bands && { ...layer.bands, values: numbers(layer.bands.values) },
   };
 });
+
+/** What a topic is called on the page. */
+const nameOf = (layer) => (layer.kind === 'posterior' ? 'filter' : layer.kind);
 
 /** Layers that are compared: the filter's and the smoother's, as far as they are there. */
 const compared = ['posterior', 'smoothed'].map((kind) => layers.find((layer) => layer.kind === kind)).filter(Boolean);
@@ -73,18 +77,19 @@ function motionsOf(layer) {
 }
 layers.forEach((layer) => { layer.motions = motionsOf(layer); });
 
-const truth = report.truth && (() => {
-  const starts = [];
+/** One skeleton at each time for which it is known, with its number or -1. */
+function single(figure) {
+  if (!figure) return null;
   let count = 0;
-  report.truth.known.forEach((known) => {
-    starts.push(known ? count : -1);
-    count += known ? 1 : 0;
-  });
-  return {
-    ...report.truth, starts, positions: metres(report.truth.positions), pixels: shares(report.truth.pixels),
-    heights: numbers(report.truth.heights),
-  };
-})();
+  const starts = figure.known.map((known) => { count += known ? 1 : 0; return known ? count - 1 : -1; });
+  return { ...figure, starts, positions: metres(figure.positions) };
+}
+const detector = single(report.detector);
+const truth = single(report.truth);
+if (truth) {
+  truth.pixels = shares(report.truth.pixels);
+  truth.heights = numbers(report.truth.heights);
+}
 
 const trajectories = report.trajectories.map((topic) => ({
   ...topic,

@@ -19,7 +19,7 @@ const film = report.images ? new Film(element('image')) : null;
 /** Mixtures whose weights can be shown: layers, then mixtures over trajectories. */
 const choices = [
   ...layers.map((layer, index) => ({
-    name: `${layer.kind} (${layer.topic})`, layer, index, weightsAt: (t) => layer.weights[t], what: 'modes',
+    name: `${nameOf(layer)} (${layer.topic})`, layer, index, weightsAt: (t) => layer.weights[t], what: 'modes',
   })),
   ...trajectories.map((topic, index) => ({
     name: `trajectories (${topic.topic})`, layer: null, index: layers.length + index,
@@ -44,7 +44,7 @@ function banded() {
 
 const seek = (seconds) => goTo(nearest(seconds));
 const charts = {
-  weights: new Chart(element('weights'), () => weightsChart(chosen().weightsAt), seek),
+  weights: new Chart(element('weights'), () => weightsChart(chosen()), seek),
   errors: new Chart(element('errors'), () => errorsChart(chosen().layer), seek),
   beliefs: new Chart(element('beliefs'), () => beliefsChart(chosen().layer), seek),
   motions: new Chart(element('motions'), () => motionsChart(shown.chosen), seek),
@@ -136,7 +136,9 @@ function choose(index) {
   shown.alone = null;
   const { name, what } = chosen();
   element('weights').setAttribute('aria-label', `Weights of ${name} over time`);
-  element('weights-caption').textContent = `Weights of the ${what}, heaviest at the bottom. Click to select a time.`;
+  element('weights-caption').replaceChildren(
+    swatch('accent'), ` weights of the ${what}, heaviest at the bottom `, ...keys(confidenceCurves(chosen().layer)),
+  );
   element('errors-figure').hidden = !errorsKnown();
   if (errorsKnown()) {
     element('errors-caption').replaceChildren(
@@ -169,15 +171,15 @@ function tellMotions() {
     const some = layer.motions.slice(i, i < TOLD_MOTIONS ? i + 1 : undefined);
     const what = i < TOLD_MOTIONS ? `motion ${some[0].identity || 'none'}` : `${some.length} others`;
     const share = some.reduce((total, motion) => total + motion.total, 0) / sum;
-    boxes.push(box(
+    boxes.push(toggle(
       `motion-${i}`, `${what}, ${percent(share)}`, !some.every(({ identity }) => hidden.has(identity)),
       [i < TOLD_MOTIONS ? `series-${i}` : 'grid'],
-      (ticked) => some.forEach(({ identity }) => { if (ticked) hidden.delete(identity); else hidden.add(identity); }),
+      (on) => some.forEach(({ identity }) => { if (on) hidden.delete(identity); else hidden.add(identity); }),
     ));
   }
   element('motions-boxes').replaceChildren(...boxes);
   element('motions-caption').textContent = `Weights of the motions of ${name}, which modes keep from image to image; `
-    + 'the share is of all weights. A motion without its tick is not drawn.';
+    + 'the share is of all weights. A motion that is switched off is not drawn.';
 }
 
 /** The heights and angles that can be shown over time. */
@@ -196,7 +198,7 @@ function buildBands() {
   element('banded').addEventListener('change', () => charts.bands.draw());
   const from = floors.some(Boolean) ? 'the floor' : 'the origin, the camera as a rule, which is taken to be level';
   element('bands-caption').replaceChildren(
-    ...keys(compared.filter((layer) => layer.bands).map((layer) => ({ name: `${layer.kind} (${layer.topic})`, series: comparedColour(layer) }))),
+    ...keys(compared.filter((layer) => layer.bands).map((layer) => ({ name: `${nameOf(layer)} (${layer.topic})`, series: comparedColour(layer) }))),
     ...(truth ? keys([{ name: 'truth (heights)', series: 'ink' }]) : []),
     made('div', `Median, and the interval between the 5th and the 95th percentile, of the whole mixture. Heights are above ${from}.`),
   );
@@ -221,38 +223,46 @@ function swatch(...names) {
   return result;
 }
 
-/** A check box. */
-function box(id, text, ticked, colours_, change) {
-  const label = made('label');
-  const input = made('input', '', { type: 'checkbox', id });
-  input.checked = ticked;
-  input.addEventListener('change', () => { change(input.checked); drawAll(); });
-  label.append(input, swatch(...colours_), text);
-  return label;
+const isOn = (button) => button.getAttribute('aria-pressed') === 'true';
+
+/** A button that switches something on and off. */
+function toggle(id, text, on, colours_, change) {
+  const button = made('button', '', { type: 'button', id, class: 'toggle', 'aria-pressed': on });
+  button.addEventListener('click', () => {
+    button.setAttribute('aria-pressed', !isOn(button));
+    change(isOn(button));
+    drawAll();
+  });
+  button.append(swatch(...colours_), text);
+  return button;
 }
 
+/** A button for each thing that can be drawn; number keys press them. */
 function buildLayers() {
   const place = element('layers');
+  const sides = (style) => [`${style}-left`, `${style}-right`];
+  const kinds = layers.map(nameOf);
   layers.forEach((layer, index) => {
     if (index === 0) shown.layers.add(index);
-    place.append(box(
-      `layer-${index}`, `${layer.kind} (${layer.topic})`, index === 0,
-      [`${layer.style}-left`, `${layer.style}-right`],
-      (ticked) => { if (ticked) shown.layers.add(index); else shown.layers.delete(index); },
+    const alone = kinds.filter((kind) => kind === kinds[index]).length === 1;
+    place.append(toggle(
+      `layer-${index}`, alone ? kinds[index] : `${kinds[index]} (${layer.topic})`, index === 0, sides(layer.style),
+      (on) => { if (on) shown.layers.add(index); else shown.layers.delete(index); },
     ));
+    place.lastChild.title = layer.topic;
   });
-  if (trajectories.some((topic) => topic.windows.some((w) => w.ways))) {
-    shown.trajectories = !layers.length;
-    place.append(box(
-      'show-trajectories', 'paths of the trajectories', shown.trajectories, ['trajectories'],
-      (ticked) => { shown.trajectories = ticked; },
-    ));
-  }
-  if (truth) {
-    shown.truth = true;
-    place.append(box('show-truth', 'truth', true, ['ink'], (ticked) => { shown.truth = ticked; }));
-  }
-  place.append(made('span', 'First colour: left limbs, second colour: right limbs. The fainter a mode, the smaller its weight.', { class: 'muted' }));
+  const show = (name, text, colours_, on = true) => {
+    shown[name] = on;
+    place.append(toggle(`show-${name}`, text, on, colours_, (now) => { shown[name] = now; }));
+  };
+  if (truth) show('truth', 'truth', ['ink']);
+  if (detector) show('detector', 'detector', sides('detector'));
+  if (layers.some((layer) => layer.regions)) show('regions', '90 % regions', ['accent'], false);
+  if (trajectories.some((topic) => topic.windows.some((w) => w.ways))) show('trajectories', 'paths', ['trajectories'], !layers.length);
+  [...place.children].slice(0, 9).forEach((button, i) => {
+    button.setAttribute('aria-keyshortcuts', i + 1);
+    button.prepend(made('kbd', i + 1, { 'aria-hidden': 'true' }));
+  });
 }
 
 function tell() {
@@ -263,6 +273,7 @@ function tell() {
   parts.push(`first stamp ${report.start_ns} ns`);
   element('facts').textContent = `${parts.join('; ')}.`;
   if (report.images) {
+    element('stage').style.setProperty('--aspect', report.images.width / report.images.height);
     element('with-modes').closest('div').hidden = report.images.drawn_on;
     element('image-caption').textContent = report.images.drawn_on
       ? 'Overlay of the tracker: the heaviest modes on the image.'
@@ -274,6 +285,8 @@ function tell() {
   element('space-caption').textContent += floors.some(Boolean)
     ? ' The grid is the floor, as the bag has it; rings mark feet that stand on it.'
     : ' The grid lies under the lowest joints: the bag does not tell the floor.';
+  if (layers.some((layer) => layer.regions)) element('space-caption').textContent += ' Ellipsoids hold a joint, relative to the pelvis, with 90 %.';
+  if (detector) element('space-caption').textContent += ` The detector's own skeleton (${detector.topic}) has its hips at ours.`;
   element('notes-section').hidden = !report.notes.length;
   element('notes').append(...report.notes.map((note) => made('li', note)));
 }
@@ -365,7 +378,7 @@ function step() {
   timer = setTimeout(step, due - performance.now());
 }
 
-/** Applies the part of the address behind #: frame=10&yaw=30&pitch=5&zoom=1.5&show=0,1,truth,trajectories,beside. */
+/** Applies the part of the address behind #: frame=10&yaw=30&pitch=5&zoom=1.5&show=0,1,truth,detector,regions,trajectories,beside. */
 function readAddress() {
   const given = new URLSearchParams(window.location.hash.slice(1));
   const number = (name, otherwise) => {
@@ -377,9 +390,9 @@ function readAddress() {
   space.zoom = Math.max(0.3, Math.min(8, number('zoom', space.zoom)));
   if (given.has('show')) {
     const names = given.get('show').split(',');
-    document.querySelectorAll('#layers input, #beside').forEach((input) => {
-      const wanted = names.includes(input.id.replace(/^(layer|show)-/, ''));
-      if (input.checked !== wanted) input.click();
+    document.querySelectorAll('#layers button, #beside').forEach((control) => {
+      const wanted = names.includes(control.id.replace(/^(layer|show)-/, ''));
+      if ((control.id === 'beside' ? control.checked : isOn(control)) !== wanted) control.click();
     });
   }
   goTo(Math.round(number('frame', shown.time)));
@@ -395,10 +408,13 @@ element('with-modes').addEventListener('change', () => {
 element('follow').checked = space.follow;
 element('follow').addEventListener('change', () => { space.follow = element('follow').checked; space.draw(); });
 element('align').addEventListener('change', () => { space.together = element('align').checked; space.draw(); });
-element('beside-label').hidden = compared.length < 2;
+element('beside-label').hidden = besides.length < 2;
 element('beside').addEventListener('change', () => {
-  shown.beside = element('beside').checked && compared.length === 2;
-  if (shown.beside) compared.map((layer) => element(`layer-${layers.indexOf(layer)}`)).forEach((input) => { if (!input.checked) input.click(); });
+  shown.beside = element('beside').checked;
+  if (shown.beside) {
+    besides.map((figure) => element(figure === detector ? 'show-detector' : `layer-${layers.indexOf(figure)}`))
+      .forEach((button) => { if (!isOn(button)) button.click(); });
+  }
   space.draw();
 });
 document.querySelectorAll('[data-look]').forEach((button) => button.addEventListener('click', () => {
@@ -408,12 +424,16 @@ document.querySelectorAll('[data-look]').forEach((button) => button.addEventList
 element('chosen').append(...choices.map(({ name, index }) => made('option', name, { value: index })));
 element('chosen').addEventListener('change', () => choose(Number(element('chosen').value)));
 document.addEventListener('keydown', (event) => {
-  const free = !['INPUT', 'BUTTON', 'SELECT', 'CANVAS'].includes(event.target.tagName);
-  if (!free || event.ctrlKey || event.metaKey || event.altKey) return;
-  const keys = {
+  const { target, key } = event;
+  // What a control does with a key itself, it does.
+  const own = { BUTTON: [' '], INPUT: target.type === 'range' ? ['ArrowLeft', 'ArrowRight'] : [' '], SELECT: [key] };
+  if (event.defaultPrevented || event.ctrlKey || event.metaKey || event.altKey || (own[target.tagName] || []).includes(key)) return;
+  const button = document.querySelector(`#layers [aria-keyshortcuts="${CSS.escape(key)}"]`);
+  const keys_ = {
     ' ': () => play(timer === null), ArrowLeft: () => goTo(shown.time - 1), ArrowRight: () => goTo(shown.time + 1),
   };
-  if (keys[event.key]) { event.preventDefault(); keys[event.key](); }
+  const act = keys_[key] || (button && (() => button.click()));
+  if (act) { event.preventDefault(); act(); }
 });
 window.addEventListener('hashchange', readAddress);
 

@@ -3,14 +3,17 @@
 const FAINTEST = 0.12;
 // Distance of the viewer, in radii of the visible room.
 const DISTANCE = 5;
+// Radii of the parts of a shadow, m: the more lie over each other, the darker.
+const SHADOW = [0.18, 0.16, 0.14, 0.12, 0.1, 0.08, 0.06, 0.04];
 const DASHES = { likelihood: [5, 3], prediction: [2, 3] };
 
 /**
- * What is shown: indices of layers, truth, trajectories; of one layer a single mode, or all; by layer
- * the identities of motions that are hidden; whether filter and smoother are side by side.
+ * What is shown: indices of layers, truth, detector, trajectories, regions of the joints; of one layer
+ * a single mode, or all; by layer the identities of motions that are hidden; whether filter, smoother
+ * and detector are side by side.
  */
 const shown = {
-  time: 0, layers: new Set(), truth: false, trajectories: false, chosen: 0, alone: null,
+  time: 0, layers: new Set(), truth: false, detector: false, trajectories: false, regions: false, chosen: 0, alone: null,
   hidden: layers.map(() => new Set()), beside: false,
 };
 
@@ -21,6 +24,9 @@ function strength(index, rank, weights) {
   if (shown.alone !== null && index === shown.chosen) return rank === shown.alone ? 1 : null;
   return FAINTEST + (1 - FAINTEST) * (weights[0] > 0 ? weights[rank] / weights[0] : 1);
 }
+
+/** What is drawn side by side. */
+const besides = [...compared, detector].filter(Boolean);
 
 /** Modes to be drawn at the present time, the faintest first: {layer, offset, strength, rank}. */
 function modesNow() {
@@ -33,17 +39,15 @@ function modesNow() {
       if (own !== null) {
         result.push({
           figure: layer, style: layer.style, offset: layer.starts[shown.time] + rank, strength: own,
-          dash: DASHES[layer.style] || [], width: rank === 0 || shown.alone === rank ? 3 : 2, ink: null,
+          dash: DASHES[layer.style] || [], width: rank === 0 || shown.alone === rank ? 4 : 2, ink: null,
         });
       }
     }
   });
-  if (truth && shown.truth && truth.starts[shown.time] >= 0) {
-    result.push({
-      figure: truth, style: '', offset: truth.starts[shown.time], strength: 1, dash: [5, 4], width: 1.5,
-      ink: 'ink',
-    });
-  }
+  [[detector, shown.detector, [9, 3], 2.5, null], [truth, shown.truth, [5, 4], 1.5, 'ink']].forEach(([figure, on, dash, width, ink]) => {
+    if (!figure || !on || figure.starts[shown.time] < 0) return;
+    result.push({ figure, style: 'detector', offset: figure.starts[shown.time], strength: 1, dash, width, ink });
+  });
   return result;
 }
 
@@ -121,7 +125,7 @@ class Space {
 
   heaviest(figure, t) {
     if (!figure) return -1;
-    if (figure === truth) return truth.starts[t];
+    if (!figure.weights) return figure.starts[t];
     return figure.weights[t].length ? figure.starts[t] : -1;
   }
 
@@ -149,17 +153,23 @@ class Space {
 
   listen() {
     const { canvas } = this;
+    const fingers = new Map();
     let from = null;
     canvas.addEventListener('pointerdown', (event) => {
+      fingers.set(event.pointerId, event);
       from = { x: event.clientX, y: event.clientY, yaw: this.yaw, pitch: this.pitch };
       // A pointer that a program made up can not be captured, and need not.
       if (event.isTrusted) canvas.setPointerCapture(event.pointerId);
     });
     canvas.addEventListener('pointermove', (event) => {
       if (!from) return;
-      this.turn(from.yaw + 0.5 * (event.clientX - from.x), from.pitch + 0.4 * (event.clientY - from.y));
+      const apart = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY); };
+      const before = fingers.size > 1 ? apart() : 0;
+      fingers.set(event.pointerId, event);
+      if (before) this.magnify(apart() / before);
+      else this.turn(from.yaw + 0.5 * (event.clientX - from.x), from.pitch + 0.4 * (event.clientY - from.y));
     });
-    ['pointerup', 'pointercancel'].forEach((kind) => canvas.addEventListener(kind, () => { from = null; }));
+    ['pointerup', 'pointercancel'].forEach((kind) => canvas.addEventListener(kind, () => { from = null; fingers.clear(); }));
     canvas.addEventListener('wheel', (event) => {
       event.preventDefault();
       this.magnify(Math.exp(-0.0015 * event.deltaY));
@@ -188,7 +198,8 @@ class Space {
     const pitch = (this.pitch * Math.PI) / 180;
     const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
     const distance = DISTANCE * this.radius;
-    const scale = (0.5 * Math.min(width, height) * this.zoom * distance) / this.radius;
+    // People are taller than wide.
+    const scale = (0.5 * Math.min(1.6 * width, height) * this.zoom * distance) / this.radius;
     const root = this.follow ? this.lastRoot() : null;
     const centre = root || this.centre;
     return (x, y, z) => {
@@ -208,12 +219,13 @@ class Space {
     return this.roots.find(Boolean) || null;
   }
 
-  /** All in one view; or filter and truth on the left, smoother and truth on the right. */
+  /** All in one view; or those of filter, smoother and detector that are on from left to right, each with the truth. */
   draw() {
     const { context, width, height } = prepared(this.canvas);
     context.lineCap = 'round';
     context.lineJoin = 'round';
-    const panes = shown.beside ? ['filter', 'smoother'] : [''];
+    const on = besides.filter((figure) => (figure === detector ? shown.detector : shown.layers.has(layers.indexOf(figure))));
+    const panes = shown.beside && on.length > 1 ? on : [null];
     const each = width / panes.length;
     panes.forEach((pane, i) => {
       context.save();
@@ -229,7 +241,7 @@ class Space {
         context.font = '600 13px system-ui, sans-serif';
         context.textAlign = 'left';
         context.textBaseline = 'top';
-        context.fillText(`${pane}: ${compared[i].topic}`, 10, 8);
+        context.fillText(pane === detector ? 'detector' : nameOf(pane), 10, 8);
       }
       context.restore();
     });
@@ -238,33 +250,35 @@ class Space {
   drawPane(context, width, height, pane) {
     const project = this.projection(width, height);
     this.drawFloor(context, project, width, height);
-    if (shown.trajectories && pane !== 'filter') this.drawWays(context, project);
-    const here = ({ figure, style }) => !pane || figure === truth || (style === 'smoothed') === (pane === 'smoother');
+    if (shown.trajectories && (!pane || pane.kind === 'smoothed')) this.drawWays(context, project);
+    const here = ({ figure }) => [null, figure].includes(pane) || figure === truth || (pane === layers[0] && !besides.includes(figure));
     const segments = [];
+    const finer = Math.min(1, width / 250);
     const root = this.lastRoot() || this.centre;
-    modesNow().filter(here).forEach((mode) => {
-      const { figure, offset } = mode;
-      const joints = figure.joints.length;
-      const points = [];
-      const own = this.origin(figure, offset);
-      const shift = root.map((x, axis) => (this.together ? x - own[axis] : 0));
-      for (let joint = 0; joint < joints; joint += 1) {
-        const i = (offset * joints + joint) * 3;
-        points.push(project(...shift.map((x, axis) => x + figure.positions[i + axis])));
-      }
+    const bodies = modesNow().filter(here).map((mode) => {
+      const own = this.origin(mode.figure, mode.offset);
+      const place = (x, axis) => (this.together ? x + root[axis] - own[axis] : x);
+      return { ...mode, places: mode.figure.joints.map((_, joint) => this.joint(mode.figure, mode.offset, joint).map(place)) };
+    });
+    bodies.forEach((body) => this.drawShadow(context, project, body));
+    if (shown.regions) bodies.forEach((body) => this.drawRegions(context, project, body));
+    bodies.forEach((mode) => {
+      const { figure } = mode;
+      const points = mode.places.map((place) => project(...place));
       figure.bones.forEach(([a, b, side]) => segments.push({
         from: points[a], to: points[b], depth: 0.5 * (points[a][2] + points[b][2]), mode, side,
       }));
+      const head = points[figure.joints.indexOf('head')];
+      if (head && figure.bones.length) segments.push({ from: head, to: head, depth: head[2], mode, side: 'trunk', ball: 4 });
       if (!figure.bones.length) {
         points.forEach((point) => segments.push({ from: point, to: point, depth: point[2], mode, side: 'trunk' }));
       }
     });
-    if (pane !== 'smoother') this.drawContacts(context, project, root);
-    segments.sort((a, b) => b.depth - a.depth);
-    segments.forEach(({ from, to, mode, side }) => {
+    if ([null, layers[0]].includes(pane)) this.drawContacts(context, project, root);
+    segments.filter(({ depth }) => !Number.isNaN(depth)).sort((a, b) => b.depth - a.depth).forEach(({ from, to, mode, side, ball = 0 }) => {
       context.globalAlpha = mode.strength;
-      context.setLineDash(mode.dash);
-      context.lineWidth = (mode.width * DISTANCE * this.radius) / (0.5 * (from[2] + to[2]));
+      context.setLineDash(ball ? [] : mode.dash);
+      context.lineWidth = ((ball || 1) * finer * mode.width * DISTANCE * this.radius) / (0.5 * (from[2] + to[2]));
       context.strokeStyle = colour(mode.ink || `${mode.style}-${side}`);
       context.beginPath();
       context.moveTo(from[0], from[1]);
@@ -285,6 +299,55 @@ class Space {
 
   onFloor(project, x, z) {
     return project(x, this.floorAt(x, z), z);
+  }
+
+  /** A soft shadow on the floor, of light from above, of a skeleton that is drawn in full. */
+  drawShadow(context, project, { figure, places, strength: own, ink }) {
+    if (own < 1 || ink) return;
+    context.fillStyle = colour('shadow');
+    SHADOW.forEach((radius) => {
+      context.beginPath();
+      figure.bones.forEach(([a, b]) => {
+        const [[x, , z], [toX, , toZ]] = [places[a], places[b]];
+        const start = Math.atan2(toZ - z, toX - x) - Math.PI / 2;
+        for (let i = 0; i < 16; i += 1) { // half a circle around either end
+          const angle = start + ((i < 8 ? i : i - 1) * Math.PI) / 7;
+          const [u, v] = this.onFloor(project, (i < 8 ? toX : x) + radius * Math.cos(angle), (i < 8 ? toZ : z) + radius * Math.sin(angle));
+          if (i) context.lineTo(u, v); else context.moveTo(u, v);
+        }
+        context.closePath();
+      });
+      context.fill();
+    });
+  }
+
+  /** Ellipsoids that hold 90 % of where each joint of a mode is, as the view's plane shows them. */
+  drawRegions(context, project, { figure, offset, places, style, strength: own }) {
+    if (!figure.regions) return;
+    places.forEach((place, joint) => {
+      const i = (offset * places.length + joint) * 6;
+      const [xx, yy, zz, xy, xz, yz] = figure.regions.slice(i, i + 6);
+      const [u, v] = project(...place);
+      // Columns of the matrix with y up and z towards the camera, on the screen.
+      const columns = [[xx, -xy, -xz], [-xy, yy, yz], [-xz, yz, zz]].map((column) => {
+        const [right, below] = project(...place.map((x, axis) => x + report.region * column[axis]));
+        return [right - u, below - v];
+      });
+      const sum = (a, b) => columns.reduce((total, column) => total + column[a] * column[b], 0);
+      const [half, apart] = [0.5 * (sum(0, 0) + sum(1, 1)), Math.hypot(0.5 * (sum(0, 0) - sum(1, 1)), sum(0, 1))];
+      const turn = 0.5 * Math.atan2(2 * sum(0, 1), sum(0, 0) - sum(1, 1));
+      const [side] = figure.joints[joint].match(/^(left|right)/) || ['trunk'];
+      context.fillStyle = colour(`${style}-${side}`);
+      context.strokeStyle = context.fillStyle;
+      context.lineWidth = 1;
+      context.beginPath();
+      context.ellipse(u, v, Math.sqrt(half + apart), Math.sqrt(Math.max(half - apart, 0)), turn, 0, 2 * Math.PI);
+      context.globalAlpha = 0.16 * own;
+      context.fill();
+      context.globalAlpha = 0.6 * own;
+      context.stroke();
+    });
+    context.globalAlpha = 1;
   }
 
   /** A ring around each foot of the heaviest mode, the stronger the more probably it stands. */
