@@ -1,7 +1,7 @@
 # make demo   tracks the person of a bag in bags/      make lint   ruff and mypy
 # make test   all tests                                make bench  the benchmarks
 # make setup  the workspace alone                      make soak   nodes under load and faults
-# make clean  restores the state of a clone            make mediapipe  MediaPipe in .mediapipe
+# make clean  restores the state of a clone            make detector  MediaPipe Pose
 # make learn  learns everything again from DATA=...
 #
 # Each works as the first command after a clone: it installs its requirements into .venv and builds
@@ -10,7 +10,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -e -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup mediapipe demo test lint bench soak learn clean lock
+.PHONY: help setup detector demo test lint bench soak learn clean lock
 
 # Small matrices: a second BLAS thread costs more than it saves.
 export OMP_NUM_THREADS := 1
@@ -30,9 +30,8 @@ help:
 setup:
 	@$(WORKSPACE) ros test lint build kernels
 
-# An environment of its own: MediaPipe needs numpy below 2.
-mediapipe:
-	@tools/mediapipe.sh
+detector:
+	@$(WORKSPACE) ros detector
 
 demo:
 	@$(WORKSPACE) ros build kernels
@@ -40,7 +39,7 @@ demo:
 	@$(SOURCED) python -m hmt_ros.app.demo $(DEMO_BAG) -o build/demo --live
 
 test:
-	@$(WORKSPACE) ros test build
+	@$(WORKSPACE) ros test detector build
 	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadfile --cov --cov-report term $(ARGS)
 
 lint:
@@ -62,7 +61,7 @@ learn:
 	@$(SOURCED) tools/learn.sh $(DATA) build/learned
 
 clean:
-	rm -rf .venv .mediapipe build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The newest versions that fit together on every supported Python. Only this target changes them.
@@ -71,5 +70,5 @@ lock:
 	@$(PYTHON_IN_VENV) -m pip install -qq uv
 	@: >requirements/lock.txt
 	@.venv/bin/uv pip compile --quiet --universal --python-version 3.10 --annotation-style line \
-	  --custom-compile-command 'make lock' requirements/{runtime,ros,test,lint}.txt -o requirements/lock.txt
+	  --custom-compile-command 'make lock' requirements/{runtime,ros,test,lint,detector}.txt -o requirements/lock.txt
 	@sed -i "/sys_platform == 'win32'/d" requirements/lock.txt

@@ -54,7 +54,8 @@ from hmt_ros.app.replay import command as replay
 from hmt_ros.app.replay.live_node import LiveNode
 from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment
 from hmt_ros.app.truth import read_truth
-from hmt_ros.detectors.mediapipe_pose import DetectorError, MediaPipePose
+from hmt_ros.detectors.blazepose import BlazePose
+from hmt_ros.detectors.blazepose_models import DetectorError
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS
 from msg_tools import BagReader, BagWriter
@@ -148,7 +149,7 @@ def _tried(
     clip = make_clip(folder, case.clip, seconds)
     try:
         if case.detector:
-            MediaPipePose().close()
+            BlazePose()
         with changed_environment(environ):
             found = [live(clip, folder / f'{stage} {k}', case, minutes) for k in range(runs)]
     except (LiveNodeError, DetectorError) as error:

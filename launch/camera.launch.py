@@ -10,8 +10,6 @@ What else hmt.launch.py takes can be given, too, but for image and nodes.
 
 from __future__ import annotations
 
-import importlib.util
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,10 +21,10 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from hmt_ros.detectors.blazepose_models import has_networks, has_runtime
+
 PACKAGE = 'hmt_ros'
 CAMERA = 'camera'
-# Environment variable that names the interpreter with MediaPipe.
-DETECTOR_PYTHON = 'HMT_ROS_DETECTOR_PYTHON'
 WITH_DETECTOR = 'filter_node smoother_node keypoints_node'
 WITHOUT_DETECTOR = 'filter_node smoother_node bme_node'
 
@@ -45,7 +43,7 @@ ARGUMENTS = (
         'detector',
         'auto',
         "'true': keypoints of MediaPipe; 'false': none, silhouettes start the track, which needs "
-        "background_file or an empty scene at first; 'auto': where MediaPipe can be imported",
+        "background_file or an empty scene at first; 'auto': where MediaPipe Pose is installed",
     ),
 )
 
@@ -104,4 +102,4 @@ def _has_detector(wanted: str) -> bool:
         raise ValueError(f"detector: wanted 'auto', 'true' or 'false', saw {wanted!r}")
     if wanted != 'auto':
         return wanted == 'true'
-    return bool(os.environ.get(DETECTOR_PYTHON)) or bool(importlib.util.find_spec('mediapipe'))
+    return has_runtime() and has_networks()

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import socket
-import subprocess
-import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +16,7 @@ from hypothesis import settings
 
 from hmt_ros.app import make_bag, progress
 from hmt_ros.body import Body, load_body
+from hmt_ros.detectors.blazepose_models import has_networks, has_runtime
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools import BagReader
 from msg_tools.messages.images import decode_image
@@ -70,15 +69,10 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope='session')
-def mediapipe() -> str:
-    """An interpreter that imports MediaPipe; tests that want it are skipped where there is none."""
-    python = os.environ.get('HMT_ROS_DETECTOR_PYTHON', sys.executable)
-    environment = {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}
-    command = [python, '-c', 'import mediapipe']
-    done = subprocess.run(command, env=environment, capture_output=True, check=False)
-    if done.returncode != 0:
-        pytest.skip(f'{python} does not import MediaPipe: run "make mediapipe"')
-    return python
+def mediapipe_pose() -> None:
+    """Skips tests that want MediaPipe Pose where it is not installed."""
+    if not (has_runtime() and has_networks()):
+        pytest.skip('MediaPipe Pose is not installed: run "make detector"')
 
 
 @pytest.fixture(scope='session')

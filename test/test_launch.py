@@ -7,6 +7,7 @@ what they are given take their place; what is given is then started as launch_ro
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import re
 import runpy
 import subprocess
@@ -395,8 +396,8 @@ def test_views_are_upright(actions):
     ],
 )
 def test_one_line_from_a_webcam_to_a_person(given, options, nodes, monkeypatch):
-    monkeypatch.delenv('HMT_ROS_DETECTOR_PYTHON', raising=False)
     camera_file = with_stand_ins(CAMERA_FILE)
+    monkeypatch.setitem(camera_file['actions_of'].__globals__, 'has_runtime', lambda: False)
     *declared, function = camera_file['generate_launch_description']().arguments[0]
     context = {one.arguments[0]: one.options['default_value'] for one in declared}
     assert given.keys() <= context.keys()
@@ -424,8 +425,12 @@ def test_arguments_of_the_camera_that_can_not_be_used():
 
 def test_a_detector_is_used_where_there_is_one(monkeypatch):
     has_detector = with_stand_ins(CAMERA_FILE)['_has_detector']
-    monkeypatch.setenv('HMT_ROS_DETECTOR_PYTHON', '/somewhere/python')
-    assert has_detector('auto')
+    for runtime, networks in itertools.product((False, True), repeat=2):
+        monkeypatch.setitem(
+            has_detector.__globals__, 'has_runtime', lambda runtime=runtime: runtime
+        )
+        monkeypatch.setitem(has_detector.__globals__, 'has_networks', lambda found=networks: found)
+        assert has_detector('auto') == (runtime and networks)
 
 
 def test_everything_is_installed(monkeypatch):

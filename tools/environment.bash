@@ -14,8 +14,4 @@ export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3
 source "$_root/install/local_setup.bash"
 # DDS communicates on this machine only, unless the variable is set already.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
-# "make mediapipe" has made an environment for the detector.
-if [ -x "$_root/.mediapipe/bin/python" ]; then
-  export HMT_ROS_DETECTOR_PYTHON=${HMT_ROS_DETECTOR_PYTHON:-$_root/.mediapipe/bin/python}
-fi
 unset _root

@@ -7,6 +7,7 @@
 #     ros      .venv with ROS 2, the build tools and what hmt_ros imports
 #     test     what the tests import in addition
 #     lint     ruff, mypy, pre-commit
+#     detector MediaPipe Pose
 #     build    both packages, in build/ and install/
 #     kernels  what numba compiles, for the sources and for what is installed
 #
@@ -192,6 +193,12 @@ build_tf2_msgs() {
 stage_test() { stage_requirements test; }
 stage_lint() { stage_requirements lint; }
 
+stage_detector() {
+  stage_requirements detector
+  saying_how_long 'fetching MediaPipe Pose' "$venv/bin/python" -m hmt_ros install-detector --quiet ||
+    fail 'MediaPipe Pose could not be installed'
+}
+
 stage_requirements() {
   local key
   key=$(printf '%s\n' "requirements/$1.txt" | checksum "$(cat "$stamps/ros")")
@@ -264,7 +271,7 @@ flock 9
 
 for stage in "$@"; do
   case $stage in
-    ros | test | lint | build | kernels) "stage_$stage" ;;
-    *) fail "no stage '$stage': ros, test, lint, build or kernels" ;;
+    ros | test | lint | detector | build | kernels) "stage_$stage" ;;
+    *) fail "no stage '$stage': ros, test, lint, detector, build or kernels" ;;
   esac
 done

@@ -30,6 +30,10 @@ COMMANDS = {
         'hmt_ros.app.compile_kernels',
         'compile all kernels, so that no first image waits for it',
     ),
+    'install-detector': (
+        'hmt_ros.app.install_detector',
+        'install MediaPipe Pose, a detector of keypoints',
+    ),
     'train': ('hmt_ros.app.train', 'learn a predictor of poses from silhouettes'),
     'learn-prior': (
         'hmt_ros.app.learn_prior',

@@ -1,4 +1,4 @@
-"""person_node: filter, smoother, experts and a detector's client in one process.
+"""person_node: filter, smoother, experts and a detector in one process.
 
 The nodes are the same as in processes of their own: names, parameters, topics, services and bytes.
 What one publishes another gets without the middleware (`hmt_ros.nodes.local_topics`), images come
@@ -32,7 +32,7 @@ TRACKED_INTERVAL = 0.2
 _RENAMED = ('__node:=', '__name:=')
 _USAGE = f"""usage: ros2 run hmt_ros {NAME} [NODE ...] [--ros-args ...]
 
-Filter, smoother, experts and a detector's client in one process.
+Filter, smoother, experts and a detector in one process.
 
 Each NODE is one of {', '.join(NODES)};
 without any these run: {', '.join(USUAL)}. They have the names, parameters, topics and

@@ -35,7 +35,6 @@ class Fault(Enum):
     NO_DETECTIONS = 'no detections'
     LONE_DETECTIONS = 'detections without an image'
     PEOPLE = 'too many people'
-    DETECTOR = 'detector'
     MASK = 'mask'
     NO_MASK = 'no mask'
     LONE_MASK = 'mask without an image'

@@ -23,13 +23,9 @@ class KeypointsParameters(ImageNodeParameters):
     """All parameters of the keypoints node.
 
     Attributes:
-        detector_python: Python interpreter that imports MediaPipe; if empty, the one that the
-            environment variable HMT_ROS_DETECTOR_PYTHON names, else that of the node.
-        publish_mask: If true, the detector also finds the mask of the person, which takes more
-            time, and the node publishes it.
+        publish_mask: If true, the node also publishes the mask of the person.
     """
 
-    detector_python: str = parameter_field('', NEXT_CONFIGURE)
     publish_mask: bool = parameter_field(False, NEXT_CONFIGURE)
 
 

@@ -5,8 +5,7 @@
   was seen.
 - An image that is not younger than the one before is skipped, or is the first of a new sequence
   with `reset_on_time_jump`.
-- What can not be used is skipped, and so is an image at which the detector ends; it is started
-  again. The first fault of each kind is logged; all are counted.
+- What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hmt_ros.detectors.mediapipe_pose import DetectorError, MediaPipePose
+from hmt_ros.detectors.blazepose import BlazePose
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.handled import Fault, Output
@@ -77,9 +76,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
         wanted: Callable[[str], bool] = everything,
     ) -> None:
         super().__init__(parameters, publish, wanted)
-        self._detector = MediaPipePose(
-            parameters.detector_python, with_mask=parameters.publish_mask
-        )
+        self._detector = BlazePose(with_mask=parameters.publish_mask)
         self._newest: int | None = None
         self._landmarks = 0
         self.state = self._present_state()
@@ -100,9 +97,6 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
             found = self._detector.detect(image, stamp)
         except ImageError as error:
             self._log.skip(Fault.IMAGE, str(error))
-            return
-        except DetectorError as error:
-            self._log.skip(Fault.DETECTOR, f'image of {stamp} ns: {error}')
             return
         self._newest = stamp
         self._landmarks = 0 if found is None else len(found.names)

@@ -51,7 +51,7 @@ def stamp_of(message):
 
 
 def test_images_become_keypoints(world, somebody, monkeypatch):
-    monkeypatch.setattr(keypoints_session, 'MediaPipePose', StubDetector)
+    monkeypatch.setattr(keypoints_session, 'BlazePose', StubDetector)
     one = world(publish_mask=True).start()
     found = listening(one)
     for message in (somebody.image(0), somebody.empty(1)):
@@ -70,7 +70,7 @@ def test_images_become_keypoints(world, somebody, monkeypatch):
 
 
 def test_lifecycle(world, somebody, monkeypatch):
-    monkeypatch.setattr(keypoints_session, 'MediaPipePose', StubDetector)
+    monkeypatch.setattr(keypoints_session, 'BlazePose', StubDetector)
     one = world(autostart=False)
     one.node.start()
     assert one.change_state('configure')
@@ -82,32 +82,35 @@ def test_lifecycle(world, somebody, monkeypatch):
     assert one.state == 'unconfigured'
 
 
-def test_without_a_detector_one_line_says_what_to_do(executable):
-    lines = executable('keypoints_node', '-p', 'detector_python:=/bin/false').stop_at(
-        'can not run MediaPipe'
-    )
-    (line,) = (line for line in lines if 'can not run MediaPipe' in line)
+def test_without_a_detector_one_line_says_what_to_do(executable, tmp_path, monkeypatch):
+    hidden = "import sys\nsys.modules['ai_edge_litert'] = None\n"
+    (tmp_path / 'sitecustomize.py').write_text(hidden, 'utf-8')
+    monkeypatch.setenv('PYTHONPATH', f'{tmp_path}:{os.environ.get("PYTHONPATH", "")}')
+    lines = executable('keypoints_node').stop_at('not installed')
+    (line,) = (line for line in lines if 'not installed' in line)
     assert '[ERROR]' in line
-    assert 'run "make mediapipe"' in line
+    assert 'run "ros2 run hmt_ros install-detector"' in line
 
 
-def test_mediapipe_itself(world, mediapipe):
-    """It finds in images of the topic what it found when the clip was made."""
+def test_mediapipe_pose_itself(world, mediapipe_pose):
+    """It finds in images of the topic what MediaPipe found when the clip was made."""
     if not CLIP.is_dir():
         pytest.skip(f'no development clip in {CLIP} (set HMT_SHARED)')
     with np.load(CLIP / 'keypoints_mediapipe.npz') as file:
         pixels, world_positions = file['pixels'], file['world']
-    one = world(image_transport='compressed', detector_python=mediapipe, publish_mask=True).start()
+    one = world(image_transport='compressed', publish_mask=True).start()
     found = listening(one)
     with BagReader(CLIP) as bag:
         for _, stored in zip(range(5), bag.messages(['image/compressed'])):
             assert one.send('image', stored.message, 'image/compressed').faults == ()
     one.spin_until(lambda: all(len(messages) == 5 for messages in found.values()))
     for index, message in enumerate(found['keypoints']):
-        np.testing.assert_allclose(np.stack([message.u, message.v], 1), pixels[index], atol=0.5)
+        plane = np.stack([message.u, message.v], 1)
+        assert np.median(abs(plane - pixels[index])) < 0.3
+        np.testing.assert_allclose(plane, pixels[index], atol=2.0)
         lifted = found['keypoints_3d'][index]
         positions = np.stack([lifted.x, lifted.y, lifted.z], 1)
-        np.testing.assert_allclose(positions, world_positions[index], atol=0.01)
+        np.testing.assert_allclose(positions, world_positions[index], atol=0.02)
     mask = np.array(found['mask'][0].data).reshape(480, 640)
     assert set(np.unique(mask)) == {0, 255}
     _, _, _, height = cv2.boundingRect(mask)
@@ -115,6 +118,8 @@ def test_mediapipe_itself(world, mediapipe):
     assert height == pytest.approx(np.ptp(seen[:, 1]), rel=0.3)
 
 
-def test_ends_cleanly(executable, mediapipe):
+def test_ends_cleanly(executable, mediapipe_pose):
     node = executable('keypoints_node', '--params-file', str(CONFIG))
-    assert len(node.stop_at('images from /image')) == 1
+    *others, _ = node.stop_at('images from /image')
+    # What runs the networks says that it does.
+    assert all(line.startswith('INFO: Created TensorFlow Lite') for line in others)

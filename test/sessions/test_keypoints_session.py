@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from hmt_ros.detectors.mediapipe_pose import DetectorError
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions import keypoints_session
@@ -20,16 +19,12 @@ NAMES = schemes()['mediapipe33'].names
 
 
 class StubDetector:
-    """What `MediaPipePose` shows; somebody is where the image is white."""
+    """What `BlazePose` shows; somebody is where the image is white."""
 
-    def __init__(self, python, with_mask):
-        if python == 'nowhere':
-            raise DetectorError('nowhere can not run MediaPipe')
-        self.with_mask, self.mask, self.fault = with_mask, None, None
+    def __init__(self, *, with_mask):
+        self.with_mask, self.mask = with_mask, None
 
     def detect(self, image, stamp_ns):
-        if self.fault is not None:
-            raise self.fault
         seen = (image == 250).all(2)
         self.mask = seen if self.with_mask else None
         if not seen.any():
@@ -41,7 +36,7 @@ class StubDetector:
 
 @pytest.fixture
 def session(outputs, monkeypatch):
-    monkeypatch.setattr(keypoints_session, 'MediaPipePose', StubDetector)
+    monkeypatch.setattr(keypoints_session, 'BlazePose', StubDetector)
 
     def make(wanted=lambda topic: True, **values):
         parameters = with_values(KeypointsParameters(), values)
@@ -107,14 +102,8 @@ def test_what_goes_wrong_is_told(session, outputs, somebody):
     bad = somebody.image(6)
     bad.encoding = 'morse'
     assert 'morse' in one.take(IMAGE, bad).faults[0]
-    one._detector.fault = DetectorError('MediaPipe has ended: it says nothing')
-    (fault,) = one.take(IMAGE, somebody.image(7)).faults
-    assert fault == f'image of {somebody.stamp(7)} ns: MediaPipe has ended: it says nothing'
-    one._detector.fault = None
-    assert one.take(IMAGE, somebody.image(8)).faults == ()
-    assert one.state.counts['skipped'] == 4
-    with pytest.raises(ValueError, match='nowhere can not run MediaPipe'):
-        session(detector_python='nowhere')
+    assert one.take(IMAGE, somebody.image(7)).faults == ()
+    assert one.state.counts['skipped'] == 3
 
 
 def test_time_that_jumps_back(session, outputs, somebody):

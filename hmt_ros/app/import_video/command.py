@@ -23,7 +23,7 @@ from hmt_ros.app.import_video.persons import Choice, Chooser
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.body import Camera
-from hmt_ros.detectors.mediapipe_pose import MediaPipePose
+from hmt_ros.detectors.blazepose import BlazePose
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_file import camera_of_view, read_camera
@@ -248,7 +248,7 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
     if options.keypoints is not None:
         found = read_keypoints(options.keypoints, source, options.first_stamp)
     with ExitStack() as opened:
-        see = _seer(options, found, masks, opened)
+        see = _seer(options, found, masks)
         writer = opened.enter_context(BagWriter(options.output, overwrite=options.overwrite))
         frames = opened.enter_context(closing(_same_size(source, selection)))
         counted = with_progress(
@@ -283,14 +283,12 @@ def _expected(source: FrameSource, selection: Selection) -> int | None:
 Seer = Callable[[Frame, int], tuple[Keypoints | None, Mask | None]]
 
 
-def _seer(
-    options: ImportOptions, found: FoundPersons | None, masks: Masks | None, opened: ExitStack
-) -> Seer:
+def _seer(options: ImportOptions, found: FoundPersons | None, masks: Masks | None) -> Seer:
     """What is known of a frame with a stamp: keypoints and mask."""
     chooser = Chooser(options.person)
     detector = None
     if options.detector is not None:
-        detector = opened.enter_context(MediaPipePose(with_mask=options.detector_masks))
+        detector = BlazePose(with_mask=options.detector_masks)
 
     def see(frame: Frame, stamp_ns: int) -> tuple[Keypoints | None, Mask | None]:
         mask = None if masks is None else masks.of(frame)

@@ -1,0 +1,325 @@
+"""BlazePose, the detector of MediaPipe Pose: 33 landmarks of one person, in pixels and in metres.
+
+Two networks find them. One looks for a person in the whole image, and tells the middle of the hips
+and a point of a circle about the body. The other sees the square about that circle, turned upright,
+and tells landmarks, positions and a mask. Two of its landmarks are the circle again, so that the
+next image needs the second network alone. One-euro filters smooth landmarks and circle:
+
+    y_t = y_(t-1) + a(f) (x_t - y_(t-1)),    f = f_0 + b |v_t|,    a(f) = 1 / (1 + 1 / (2 pi f dt))
+
+with the smoothed velocity v_t of x_t (Casiez, Roussel, Vogel, CHI 2012). Numbers are those of
+MediaPipe 0.10.21. The networks run in this process, in one thread, without Python's lock.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.detectors import blazepose_models
+from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array, Image, Mask
+
+if TYPE_CHECKING:
+    from ai_edge_litert.interpreter import Interpreter
+
+SCHEME = 'mediapipe33'
+LANDMARKS = 33
+# After such an interval without an image the person is sought anew, ns.
+_LONGEST_INTERVAL = 1_000_000_000
+# Sides of what the networks see, px, and of the heat maps of landmarks.
+_PERSON_SIZE, _LANDMARK_SIZE, _HEAT_SIZE = 224, 256, 64
+# Cells of the first network, px, and predictions of each; the overlap from which two are one.
+_STRIDES, _PREDICTIONS, _SAME = (8, 16, 32), (2, 2, 6), 0.3
+# Probability from which somebody is there, and from which a pixel belongs to them.
+_SEEN = 0.5
+# The square's side over the circle's diameter.
+_MARGIN = 1.25
+# Half the side of the window of a heat map about its landmark; its least peak.
+_HEAT_REACH, _HEAT_PEAK = 4, 0.5
+# Cutoffs of the one-euro filters, Hz, and what velocities add to them.
+_VELOCITY_CUTOFF = 1.0
+_LANDMARK_CUTOFF, _CIRCLE_CUTOFF, _POSITION_CUTOFF = (0.05, 80.0), (0.01, 10.0), (0.1, 40.0)
+# The share of an image in the smoothed visibility.
+_NEW_VISIBILITY = 0.1
+
+_Float = TypeVar('_Float', np.float32, np.float64)
+_Tensor = NDArray[np.float32]
+
+
+class BlazePose:
+    """Follows one person from image to image.
+
+    Args:
+        with_mask: whether `mask` is wanted as well.
+
+    Attributes:
+        mask: (H, W) where the person was seen in the last image; None without `with_mask`.
+
+    Raises:
+        DetectorError: the detector is not installed.
+    """
+
+    def __init__(self, *, with_mask: bool = False) -> None:
+        self.mask: Mask | None = None
+        self._with_mask = with_mask
+        self._names = schemes()[SCHEME].names
+        self._person = _Network(blazepose_models.PERSON)
+        self._landmark = _Network(blazepose_models.LANDMARKS)
+        self._anchors = _anchors()
+        self._size = (0, 0)
+        self._newest = 0
+        self._followed: _Followed | None = None
+
+    def detect(self, image: Image, stamp_ns: int) -> Keypoints | None:
+        """The landmarks of the person in an image, named as in the scheme 'mediapipe33'.
+
+        An image begins a new sequence if it is not younger than the one before, is younger by more
+        than 1 s, or has another size.
+
+        Args:
+            image: (H, W, 3) BGR.
+            stamp_ns: of the image.
+
+        Returns:
+            The keypoints, with unknown covariances, the visibilities as confidences, and positions
+            in m from the middle of the hips along the axes of the camera. None: nobody was seen.
+        """
+        interval = stamp_ns - self._newest
+        if not 0 < interval <= _LONGEST_INTERVAL or image.shape[:2] != self._size:
+            self._followed = None
+        self._newest, self._size = stamp_ns, image.shape[:2]
+        circle = self._circle(image) if self._followed is None else self._followed.circle
+        found = None if circle is None else self._landmarks_in(image, _Square.about(circle))
+        if found is None:
+            self._followed = None
+            if self._with_mask:
+                self.mask = np.zeros(self._size, dtype=np.bool_)
+            return None
+        if self._followed is None:
+            self._followed = _Followed()
+        pixels, confidences, positions = self._followed.smooth(found, interval * 1e-9)
+        if self._with_mask:
+            self.mask = found.square.spread(_sigmoid(found.mask), self._size) >= _SEEN
+        # The network counts from the edge of the first pixel.
+        return Keypoints(
+            self._names, pixels - 0.5, np.full((LANDMARKS, 2, 2), np.nan), confidences, positions
+        )
+
+    def _circle(self, image: Image) -> Array | None:
+        """Centre and a point (2, 2) of the circle about the most certain person."""
+        height, width = image.shape[:2]
+        side = max(height, width)
+        square = _Square((width / 2, height / 2), side, 0.0)
+        seen = square.seen(image, _PERSON_SIZE, cv2.BORDER_CONSTANT)
+        boxes, logits = self._person(seen * np.float32(2 / 255) - np.float32(1))
+        scores = _sigmoid(logits[:, 0].astype(np.float64))
+        chosen = np.flatnonzero(scores >= _SEEN)
+        if not len(chosen):
+            return None
+        scores = scores[chosen]
+        # Middle and size of the face, then points of the body, in parts of the square.
+        points = boxes[chosen].astype(np.float64).reshape(-1, 6, 2) / _PERSON_SIZE
+        points[:, [0, 2, 3]] += self._anchors[chosen, None]
+        lower, upper = points[:, 0] - points[:, 1] / 2, points[:, 0] + points[:, 1] / 2
+        best = int(scores.argmax())
+        common = np.minimum(upper, upper[best]) - np.maximum(lower, lower[best])
+        area = np.prod(common.clip(0.0), axis=1)
+        areas = np.prod(upper - lower, axis=1)
+        same = area > _SAME * (areas + areas[best] - area)
+        middle = np.average(points[same, 2:4], axis=0, weights=scores[same])
+        result: Array = square.corner + middle * side
+        return result
+
+    def _landmarks_in(self, image: Image, square: _Square) -> _Found | None:
+        if square.side < 1.0:
+            return None
+        seen = square.seen(image, _LANDMARK_SIZE, cv2.BORDER_REPLICATE)
+        flat, presence, mask, heat, world = self._landmark(seen * np.float32(1 / 255))
+        if not presence[0] > _SEEN:
+            return None
+        rows = flat.astype(np.float64).reshape(-1, 5)
+        points = _refined(rows[:, :2] / _LANDMARK_SIZE, heat)[: LANDMARKS + 2]
+        positions = world.astype(np.float64).reshape(-1, 3)[:LANDMARKS]
+        positions[:, :2] = positions[:, :2] @ square.axes
+        return _Found(
+            square,
+            square.corner + square.side * points @ square.axes,
+            _sigmoid(rows[:LANDMARKS, 3]),
+            positions,
+            mask[..., 0],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Square:
+    """A square of the image: its centre, px, side, px, and the angle of its turn, radians."""
+
+    centre: tuple[float, float]
+    side: float
+    angle: float
+
+    @classmethod
+    def about(cls, circle: Array) -> _Square:
+        """That about a circle, with the circle's point above the centre."""
+        centre, (along, down) = circle[0], circle[1] - circle[0]
+        side = 2 * _MARGIN * math.hypot(along, down)
+        return cls((centre[0], centre[1]), side, math.atan2(along, -down))
+
+    @property
+    def axes(self) -> Array:
+        """(2, 2) directions to the right and down in the square."""
+        c, s = math.cos(self.angle), math.sin(self.angle)
+        return np.array([[c, s], [-s, c]])
+
+    @property
+    def corner(self) -> Array:
+        """(2,) of the upper left, px."""
+        result: Array = self.centre - self.axes.sum(axis=0) * (self.side / 2)
+        return result
+
+    def seen(self, image: Image, size: int, border: int) -> Image:
+        """What it shows, (size, size, 3) RGB."""
+        matrix = np.column_stack([self.axes.T * (self.side / size), self.corner])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        result = cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=border)
+        return np.asarray(result[..., ::-1], np.uint8)
+
+    def spread(self, values: _Tensor, size: tuple[int, int]) -> _Tensor:
+        """An image of `size`, (H, W), with what the square has, (n, n), in its place."""
+        to_square = self.axes * (len(values) / self.side)
+        matrix = np.column_stack([to_square, -to_square @ self.corner])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return np.asarray(cv2.warpAffine(values, matrix, size[::-1], flags=flags), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What the second network finds in one image.
+
+    Attributes:
+        square: what it saw.
+        points: (35, 2) landmarks, then centre and point of the circle, px.
+        visibilities: (33,) of the landmarks.
+        positions: (33, 3) of the landmarks, m.
+        mask: (256, 256) logits of the person in the square.
+    """
+
+    square: _Square
+    points: Array
+    visibilities: Array
+    positions: Array
+    mask: _Tensor
+
+
+class _Followed:
+    """What is smoothed of a person from image to image.
+
+    Attributes:
+        circle: (2, 2) centre and point where the person is sought in the next image, px.
+    """
+
+    def __init__(self) -> None:
+        self.circle = np.zeros((2, 2))
+        self._visibilities: Array | None = None
+        self._of_landmarks = _OneEuroFilter(*_LANDMARK_CUTOFF)
+        self._of_circle = _OneEuroFilter(*_CIRCLE_CUTOFF)
+        self._of_positions = _OneEuroFilter(*_POSITION_CUTOFF)
+
+    def smooth(self, found: _Found, interval: float) -> tuple[Array, Array, Array]:
+        """Landmarks, px, visibilities and positions, m; `interval` s after the image before."""
+        landmarks, circle = found.points[:LANDMARKS], found.points[LANDMARKS:]
+        diameter = max(2 * math.hypot(*(circle[1] - circle[0])), 1.0)
+        self.circle = self._of_circle(circle, interval, diameter)
+        if self._visibilities is None:
+            self._visibilities = found.visibilities
+        change = found.visibilities - self._visibilities
+        self._visibilities = self._visibilities + _NEW_VISIBILITY * change
+        return (
+            self._of_landmarks(landmarks, interval, diameter),
+            self._visibilities,
+            self._of_positions(found.positions, interval, 1.0),
+        )
+
+
+class _OneEuroFilter:
+    """Smooths an array, the less the faster it changes; see the head of the module."""
+
+    def __init__(self, cutoff: float, gain: float) -> None:
+        self._cutoff, self._gain = cutoff, gain
+        self._last: Array | None = None
+
+    def __call__(self, values: Array, interval: float, scale: float) -> Array:
+        """The smoothed values; `scale` is the length that velocities are measured in."""
+        if self._last is None:
+            self._smoothed, self._velocity = values, np.zeros_like(values)
+        else:
+            velocity = (values - self._last) / (scale * interval)
+            self._velocity += _weight(_VELOCITY_CUTOFF, interval) * (velocity - self._velocity)
+            cutoff = self._cutoff + self._gain * np.abs(self._velocity)
+            change = _weight(cutoff, interval) * (values - self._smoothed)
+            self._smoothed = self._smoothed + change
+        self._last = values
+        return self._smoothed
+
+
+class _Network:
+    """A network of a file, in one thread."""
+
+    def __init__(self, name: str) -> None:
+        content = blazepose_models.require_network(name)
+        from ai_edge_litert.interpreter import Interpreter
+
+        self._interpreter: Interpreter = Interpreter(model_content=content, num_threads=1)
+        self._interpreter.allocate_tensors()
+        self._input = self._interpreter.get_input_details()[0]['index']
+        self._outputs = [each['index'] for each in self._interpreter.get_output_details()]
+
+    def __call__(self, image: _Tensor) -> list[_Tensor]:
+        self._interpreter.set_tensor(self._input, np.ascontiguousarray(image)[None])
+        self._interpreter.invoke()
+        return [self._interpreter.get_tensor(index)[0] for index in self._outputs]
+
+
+def _anchors() -> Array:
+    """(2254, 2) middles of the cells of the first network's predictions, in parts of its image."""
+    result = []
+    for stride, predictions in zip(_STRIDES, _PREDICTIONS):
+        middles = (np.arange(_PERSON_SIZE // stride) + 0.5) * stride / _PERSON_SIZE
+        cells = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
+        result.append(np.repeat(cells, predictions, axis=0))
+    return np.concatenate(result)
+
+
+def _refined(points: Array, heat: _Tensor) -> Array:
+    """Points (n, 2) in parts of the image, moved to the mean of the heat about each.
+
+    Args:
+        heat: (64, 64, n) logits of heat maps.
+    """
+    cells = np.trunc(points * _HEAT_SIZE).astype(int)
+    about = cells[..., None] + np.arange(-_HEAT_REACH, _HEAT_REACH + 1)
+    inside = (about >= 0) & (about < _HEAT_SIZE)
+    column, row = about.clip(0, _HEAT_SIZE - 1).swapaxes(0, 1)
+    window = _sigmoid(heat[row[:, :, None], column[:, None], np.arange(len(points))[:, None, None]])
+    window = window * (inside[:, 1, :, None] & inside[:, 0, None])
+    profiles = np.stack([window.sum(axis=1), window.sum(axis=2)], axis=1)
+    mass = np.maximum(profiles.sum(axis=2), np.finfo(np.float32).tiny)
+    hot = (window.max(axis=(1, 2)) >= _HEAT_PEAK) & inside[..., _HEAT_REACH].all(axis=1)
+    return np.where(hot[:, None], (profiles * about).sum(axis=2) / mass / _HEAT_SIZE, points)
+
+
+def _weight(cutoff: Array | float, interval: float) -> Array | float:
+    return 1 / (1 + 1 / (2 * math.pi * interval * cutoff))
+
+
+def _sigmoid(x: NDArray[_Float]) -> NDArray[_Float]:
+    # Logits are clipped where exp would overflow.
+    result: NDArray[_Float] = 1 / (1 + np.exp(-x.clip(-80, 80)))
+    return result

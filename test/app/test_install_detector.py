@@ -1,0 +1,143 @@
+"""`install-detector`: what it asks pip for, takes from the wheel and writes, without a network."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import types
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from hmt_ros.app import install_detector
+from hmt_ros.detectors import blazepose_models
+from hmt_ros.detectors.blazepose_models import DetectorError, require_network
+
+CONTENT = {name: name.encode() for name in blazepose_models.CHECKSUMS}
+
+
+class Pip:
+    """Stands for pip: notes its arguments, and puts a wheel where a download is wanted."""
+
+    def __init__(self) -> None:
+        self.asked: list[list[str]] = []
+        self.content = dict(CONTENT)
+        self.fault = ''
+
+    def __call__(self, command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        assert command[:3] == [sys.executable, '-m', 'pip']
+        self.asked.append(command[5:])
+        if self.fault:
+            return subprocess.CompletedProcess(command, 1, stderr=self.fault)
+        if command[5] == 'download':
+            (folder,) = (x.partition('=')[2] for x in command if x.startswith('--dest='))
+            with zipfile.ZipFile(Path(folder, 'mediapipe.whl'), 'w') as wheel:
+                for name, data in self.content.items():
+                    wheel.writestr(f'mediapipe/modules/some/{name}', data)
+        return subprocess.CompletedProcess(command, 0, stderr='')
+
+
+@pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """Folder of the environment, and of the user; neither exists."""
+    found = tmp_path / 'environment' / 'share', tmp_path / 'user' / 'share'
+    for module in (install_detector, blazepose_models):
+        monkeypatch.setattr(module, 'folders', lambda: found)
+    checksums = {name: hashlib.sha256(data).hexdigest() for name, data in CONTENT.items()}
+    monkeypatch.setattr(install_detector, 'CHECKSUMS', checksums)
+    monkeypatch.setattr(blazepose_models, 'CHECKSUMS', checksums)
+    return found
+
+
+@pytest.fixture
+def pip(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> Pip:
+    stand_in = Pip()
+    monkeypatch.setattr(subprocess, 'run', stand_in)
+    # No runtime yet.
+    monkeypatch.setitem(sys.modules, 'ai_edge_litert', None)
+    return stand_in
+
+
+def with_runtime(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = types.ModuleType('ai_edge_litert')
+    module.__spec__ = types.SimpleNamespace()  # type: ignore[assignment]
+    monkeypatch.setitem(sys.modules, 'ai_edge_litert', module)
+
+
+def test_runtime_and_networks_are_installed_once(
+    pip: Pip,
+    folders: tuple[Path, Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert install_detector.main([]) == 0
+    assert capsys.readouterr().out == 'MediaPipe Pose is installed\n'
+    (install, download) = pip.asked
+    assert install == ['install', 'ai-edge-litert']
+    assert (download[0], download[-1]) == ('download', 'mediapipe==0.10.21')
+    assert '--no-deps' in download
+    environment, user = folders
+    assert {path.name: path.read_bytes() for path in environment.iterdir()} == CONTENT
+    assert not user.exists()
+    with_runtime(monkeypatch)
+    assert install_detector.main(['--quiet']) == 0
+    assert len(pip.asked) == 2
+    assert require_network('pose_detection.tflite') == b'pose_detection.tflite'
+    assert capsys.readouterr() == ('', '')
+
+
+def test_networks_of_another_release_are_replaced(
+    pip: Pip, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_runtime(monkeypatch)
+    environment, _ = folders
+    environment.mkdir(parents=True)
+    (environment / 'pose_detection.tflite').write_bytes(b'old')
+    assert install_detector.main([]) == 0
+    assert (environment / 'pose_detection.tflite').read_bytes() == b'pose_detection.tflite'
+
+
+def test_the_users_folder_where_the_environments_can_not_be_written(
+    pip: Pip, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment, user = folders
+    monkeypatch.setattr(install_detector.os, 'access', lambda path, _: path != environment)
+    assert install_detector.main([]) == 0
+    assert len(list(user.iterdir())) == len(CONTENT)
+    assert not list(environment.iterdir())
+    monkeypatch.setattr(sys, 'executable', '/usr/bin/python3')
+    with pytest.raises(DetectorError, match=r'/usr/bin/python3 has no ai-edge-litert: run "ros2'):
+        require_network('pose_detection.tflite')
+
+
+def test_without_networks_one_line_says_what_to_do(
+    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_runtime(monkeypatch)
+    with pytest.raises(DetectorError) as caught:
+        require_network('pose_detection.tflite')
+    text = str(caught.value)
+    assert 'no pose_detection.tflite as of mediapipe==0.10.21 in ' in text
+    assert all(str(folder) in text for folder in folders)
+    assert text.endswith('run "ros2 run hmt_ros install-detector", or "make detector" in a clone')
+
+
+def test_what_goes_wrong_is_told_in_a_line(pip: Pip, capsys: pytest.CaptureFixture[str]) -> None:
+    pip.fault = 'ERROR: Ignored it\n\nerror: externally-managed-environment\n'
+    assert install_detector.main([]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith('install ai-edge-litert" failed: error: externally-managed-environment')
+    pip.fault = '/usr/bin/python3: No module named pip\n'
+    assert install_detector.main([]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith('failed: /usr/bin/python3: No module named pip')
+    pip.fault, pip.content['pose_detection.tflite'] = '', b'another'
+    assert install_detector.main([]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'mediapipe.whl: wanted pose_detection.tflite with SHA-256 ' in line
+    assert f'saw one with SHA-256 {hashlib.sha256(b"another").hexdigest()}' in line
+    del pip.content['pose_detection.tflite']
+    assert install_detector.main([]) == 1
+    assert capsys.readouterr().err.splitlines()[0].endswith('saw none')
