@@ -82,26 +82,19 @@ class CommandParser(argparse.ArgumentParser):
             'bag', type=Path, metavar='OUT', help='bag with mixtures: a folder or a file'
         )
         self.add_argument(
-            '--truth',
-            type=Path,
-            metavar='FILE',
+            '--truth', type=Path, metavar='FILE',
             help='true joint positions: a .npz file with stamps, joint_names and joints, or a bag '
             'with ground truth (default: the ground truth in OUT)',
-        )
+        )  # fmt: skip
         self.add_argument(
-            '--topic',
-            action='append',
-            default=[],
-            dest='topics',
-            metavar='NAME',
+            '--topic', action='append', default=[], dest='topics', metavar='NAME',
             help=f'{verb} only this topic; may be repeated (default: all topics with mixtures)',
-        )
+        )  # fmt: skip
         self.add_argument(
-            '--body',
-            metavar='MODEL',
+            '--body', metavar='MODEL',
             help='body model of the poses: a name or a YAML file (default: the model that OUT '
             'names)',
-        )
+        )  # fmt: skip
 
 
 def add_body(parser: argparse._ActionsContainer) -> None:
@@ -122,7 +115,6 @@ def add_sources(parser: argparse._ActionsContainer, said: str = '--acknowledgeme
     """Adds --without, and what a file says of its motions, of a command that learns from them.
 
     Args:
-        parser: to which they are added.
         said: name of the argument for that.
     """
     parser.add_argument(

@@ -37,10 +37,9 @@ def _parser() -> CommandParser:
         'Tracks the person in a bag, prints errors if the truth is known, and writes a report.',
     )
     parser.add_argument(
-        'bag',
-        type=Path,
+        'bag', type=Path,
         help='folder of a bag, with subject.yaml and, if available, background.png in it',
-    )
+    )  # fmt: skip
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='DIR',
         help='folder for the new bag and the report',

@@ -252,10 +252,6 @@ class ConditionalDensity(ABC):
 def stored_model(arrays: Mapping[str, NDArray[Any]], where: str) -> ConditionalDensity:
     """The model that `ConditionalDensity.to_arrays` stored, of the kind that the arrays name.
 
-    Args:
-        arrays: Arrays of the model.
-        where: Name of the file, for messages.
-
     Raises:
         KeyError: no kind is named.
         ValueError: the kind is unknown, or arrays are missing or wrong.

@@ -140,10 +140,8 @@ def keypoint_tracks(
 
     Args:
         body: with the usual lengths.
-        sequences: motions.
         shares: of each motion among the windows, beside the square root of its length.
         variants: number of tracks of each motion; the first is the motion itself.
-        seed: of all random choices.
 
     Raises:
         ValueError: no motion is long enough.
@@ -244,9 +242,7 @@ def training_windows(
     """Random windows and the poses in them.
 
     Args:
-        tracks: of motions.
         count: number of windows, N.
-        rng: source of randomness.
         settings: what windows are drawn from; None: the defaults.
         scheme: row of `SCHEMES`; None: all of them.
 
@@ -358,7 +354,6 @@ def with_errors(
             image.
         distance: (N,) of the person, m.
         times: (N, S) of the images, s; the same order in all windows.
-        rng: source of randomness.
         amount: factor on the deviations.
     """
     e = detector_errors()

@@ -66,7 +66,6 @@ def lift_poses(
     """Mixtures over poses from the keypoints of a sequence, without any image.
 
     Args:
-        lifter: see `load_lifter`.
         body: of the person, with the lengths as far as they are known.
         camera: that saw the keypoints, and stood still.
         stamps: (T,) times of the images, increasing, s.
@@ -224,9 +223,7 @@ class KeypointPredictor:
     """Predicts mixtures over the poses of one person, as images come; see `lift_poses`.
 
     Args:
-        lifter: see `load_lifter`.
         body: of the person, with the lengths as far as they are known.
-        camera: that sees the keypoints.
         size_known: whether the body is as large as the person.
 
     Attributes:

@@ -40,7 +40,7 @@ from hmt_ros.experts.model_file import (
     read_arrays,
     write_arrays,
 )
-from hmt_ros.experts.network_layers import Floats, Layers
+from hmt_ros.experts.network_learning import Floats, Layers
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.image.keypoint_schemes import AUTO, position_deviations
 from hmt_ros.image.lifted_poses import LiftedPoses, bone_lengths, from_positions
@@ -97,10 +97,8 @@ class Lifter:
     """Predicts mixtures over whole poses from windows of keypoints.
 
     Args:
-        network: that has learned.
         joints: (J,) names of the joints of its poses.
         usual: body with the usual lengths, whose joints they are.
-        notes: where it comes from, for its file.
     """
 
     def __init__(
@@ -207,11 +205,7 @@ def _loaded(path: Path, _changed_ns: int) -> Lifter:
 
 
 class KeypointHistory:
-    """The keypoints of one person in the last images, from which a lifter sees a window.
-
-    Args:
-        camera: that sees them.
-    """
+    """The keypoints of one person in the last images, from which a lifter sees a window."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -223,7 +217,6 @@ class KeypointHistory:
         """Takes the keypoints of the next image; returns their `landmark_rays`.
 
         Args:
-            keypoints: of the person.
             stamp: of the image, s; later than those before.
         """
         rays, confidences = landmark_rays(self._camera, keypoints)
@@ -247,7 +240,6 @@ class KeypointHistory:
         """The mixture at the last image; None: nobody is seen.
 
         Args:
-            lifter: that has learned.
             up: (3,) unit vector against gravity, camera frame; None: unknown.
             person: proportions of the person; None: unknown.
         """

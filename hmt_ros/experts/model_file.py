@@ -36,7 +36,6 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
     """The arrays that identify an archive.
 
     Args:
-        kind: Kind of model.
         parameters: Constructor's parameters; JSON must be able to hold them.
     """
     return {
@@ -51,9 +50,7 @@ def check_header(arrays: Mapping[str, NDArray[Any]], kind: str | None, where: st
     """Checks the arrays of `header`.
 
     Args:
-        arrays: Arrays of an archive.
         kind: Kind that is wanted; None accepts any.
-        where: Name of the file, for messages.
 
     Raises:
         ValueError: the format, the version or the kind is another one.

@@ -201,7 +201,6 @@ class LocalExperts(_NeighbourModel):
         n_neighbours: Number of neighbours K, less than the number of samples.
         width_neighbour: The kernel is as wide as the distance of this neighbour.
         scaling: Scaling of inputs before distances are taken; see `Standardisation.of`.
-        seed: Seed for the choice of the samples that are left out.
 
     Attributes:
         inputs_, targets_, sample_weight_: (N, p), (N, D), (N,) of the training set.

@@ -126,7 +126,6 @@ def new_model(
     Args:
         name: Name in `KINDS`.
         experts: Number of experts M; None takes the default. Few samples have fewer.
-        seed: Seed of the model.
         samples: Number of samples that it will learn from.
 
     Raises:
@@ -180,8 +179,6 @@ def described(
     """Descriptors and targets of a training set.
 
     Args:
-        body: Body of the poses.
-        pairs: Silhouettes and poses.
         descriptor: Descriptor that learns; None takes the default.
         progress: Iterates over the silhouettes, given their number.
     """
@@ -211,12 +208,8 @@ def learned_predictor(
     """A predictor that has learned from a training set.
 
     Args:
-        body: Body of the poses.
-        training: Descriptors and targets.
         model: Model that learns p(z | descriptor).
         dynamics: Model that learns p(z | previous z, descriptor), or None.
-        notes: Notes for the file.
-        seed: Seed of the noise of previous states.
 
     Raises:
         ValueError: there are too few samples, or some are not finite.
@@ -285,7 +278,6 @@ def multimodality(inputs: Array, targets: Array, clusters: int, seed: int = 0) -
     Args:
         inputs, targets: (N, p) and (N, D); they are clustered independently.
         clusters: Number of clusters of inputs, and of targets.
-        seed: Seed of the clustering.
 
     Returns:
         (H,) number of clusters of inputs under which 1, 2, ... H clusters of targets fall.

@@ -108,9 +108,7 @@ def seeds_of(samples: MirroredSamples, count: int, rng: np.random.Generator) -> 
     """Samples (K, n) that are far from each other, drawn as k-means++ does.
 
     Args:
-        samples: to draw from.
         count: K.
-        rng: source of randomness.
     """
     scale = np.sqrt(np.maximum(np.diagonal(samples.scatter()[1]), 1e-12))
     chosen: list[Array] = []
@@ -136,10 +134,7 @@ def fitted_mixture(
     """The mixture that EM reaches.
 
     Args:
-        samples: N samples.
         start: component 0, which stays as it is, then K components; weights sum to 1.
-        prior: of the covariances.
-        iterations: maximum number.
         tolerance: gain of an iteration at which the iterations end, nats per sample.
 
     Returns:
@@ -286,10 +281,7 @@ def prior_data(
     """What is kept of motions.
 
     Args:
-        body: of the poses.
-        sequences: motions.
         people: the person of each.
-        settings: of the learning.
     """
     kept = []
     for sequence in sequences:
@@ -331,10 +323,8 @@ def learned_prior(
     """Learns a prior.
 
     Args:
-        data: the poses.
         dofs: (n,) angles that it covers.
         card: what the data are, text by heading.
-        settings: of the learning.
         progress: iterates over the numbers of components, given how many.
 
     Raises:

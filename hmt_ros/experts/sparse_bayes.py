@@ -164,7 +164,6 @@ def maximise_evidence(
 
     Args:
         sums: Sums over the samples.
-        prior: Prior of the noise.
         start: Earlier result, perhaps for other weights of the samples.
         steps: Number of greedy steps between two estimates of the noise.
         rounds: Maximum number of estimates of the noise.

@@ -133,7 +133,6 @@ class ImageLikelihood:
         """-log p(image | pose) - log prior(pose), of one observation.
 
         Args:
-            observation: of the image.
             exchanges: of sides, of each problem; see `KeypointTerm`.
         """
         seen = self.seen(observation, exchanges=exchanges)
@@ -163,7 +162,6 @@ class ImageLikelihood:
         """The term of the keypoints of an observation that has some.
 
         Args:
-            observation: of the image.
             exchanges: of sides, see `KeypointTerm`; None: as usual for detectors.
             share: of the energy that counts, beside what is known of the exchanges.
             lifted_share: the same of the energy of lifted poses.
@@ -202,8 +200,6 @@ class ImageLikelihood:
         """The image terms, one by one, at the frames of N poses.
 
         Args:
-            frames: of the poses.
-            observation: of the image.
             explained: (N, M) or (1, M) what each sample of the outline costs at most, because
                 something else explains it.
             derivatives: whether gradient and Hessian are wanted.

@@ -95,7 +95,6 @@ def observe(
     Args:
         image: (H, W, 3) BGR uint8.
         silhouette: (H, W) foreground; None or empty: the silhouette is not used.
-        keypoints: joints seen in the image.
         window: (left, top, right, bottom) where the person is expected, for images without a
             silhouette; the whole image when None.
         last_image: the image before, of the same size, that the optical flow starts from; None:

@@ -30,7 +30,6 @@ def in_threads(
 
     Args:
         work: on the poses from one number up to another.
-        count: number of poses.
         least: number of poses that are worth a thread.
         threads: their number at most; 0: one a core, up to `MOST_THREADS`, but one core, where a
             camera, a smoother and whoever listens run.

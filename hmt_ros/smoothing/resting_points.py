@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmt_ros.body import Body
-from hmt_ros.body.soles import sole_jacobians, sole_points, soles
+from hmt_ros.body.ground_terms import sole_jacobians, sole_points, soles
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior

@@ -23,7 +23,7 @@ from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     BlockTridiagonal,
 )
-from hmt_ros.smoothing.smoothed_paths import SmoothedPath
+from hmt_ros.smoothing.path_hypotheses import SmoothedPath
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,7 +117,6 @@ def minimise_free_energy(
         adapt: some of 'weights', 'means', 'inflation', 'covariances'.
         low, high: (n,) limits of the means.
         samples: per component, an even number.
-        seed: of the samples.
         max_iterations: of L-BFGS; 0 evaluates only.
         tolerance: ends when an iteration gains less, nats.
 

@@ -232,10 +232,6 @@ def _import(arguments: argparse.Namespace) -> int:
 def import_video(options: ImportOptions, tell: Tell) -> Imported:
     """Writes a video into a new bag, completely or not at all.
 
-    Args:
-        options: of the command.
-        tell: receives lines for the user.
-
     Raises:
         ValueError: bad input.
     """

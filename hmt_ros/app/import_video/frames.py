@@ -85,7 +85,6 @@ class FrameSource(ABC):
     """Frames of a file or a folder.
 
     Args:
-        path: of the source.
         names: of the files of its frames in their order; empty for a video file.
         first_number: number of the first frame for those who number frames.
 
@@ -143,7 +142,6 @@ def open_source(path: Path, fps: float | None, first_number: int = 0) -> FrameSo
     """Opens a video file or a folder of images.
 
     Args:
-        path: of the source.
         fps: frames per second; None: a video file has its own times.
         first_number: number of the first frame for those who number frames.
 
@@ -163,7 +161,6 @@ class VideoFile(FrameSource):
     """A video file. Phones write how they were held: the frames are turned upright.
 
     Args:
-        path: of the file.
         fps: frames per second; None: the times in the file.
         first_number: see `FrameSource`.
     """
@@ -232,7 +229,6 @@ class ImageFolder(FrameSource):
     """A folder of images, in the order of the numbers in their names.
 
     Args:
-        path: of the folder.
         fps: images per second; None: only their order is known.
         first_number: see `FrameSource`.
     """
@@ -311,10 +307,6 @@ class Masks:
 
     In a folder a mask belongs to the frame that its file name means (`FrameSource.number_of`); in a
     video, to the frame of the same number.
-
-    Args:
-        path: folder or video file.
-        source: whose frames they belong to.
 
     Raises:
         ValueError: there are none.

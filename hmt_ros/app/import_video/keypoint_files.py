@@ -106,8 +106,6 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
     """Reads what a detector found in the frames of a source.
 
     Args:
-        path: of the file or folder.
-        source: the frames.
         first_stamp_ns: stamp of the first frame, which stamps in the file refer to.
 
     Raises:

@@ -105,11 +105,7 @@ class Choice:
 
 
 class Chooser:
-    """Chooses a person frame by frame.
-
-    Args:
-        choice: how.
-    """
+    """Chooses a person frame by frame."""
 
     def __init__(self, choice: Choice) -> None:
         self._choice = choice

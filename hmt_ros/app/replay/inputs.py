@@ -99,7 +99,6 @@ def recorded_input(
     `/tf_static`.
 
     Args:
-        bag: an open bag.
         image_topic, camera_info_topic: names that replace the automatic choice.
         topics: the same, by the name of the input.
         namespace: topics in it are preferred to those in the root, '/humans/bodies/p1' for example.

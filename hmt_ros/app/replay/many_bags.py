@@ -100,10 +100,6 @@ def replay_many(
     """Replays all bags.
 
     Args:
-        sources: bags, and folders of bags.
-        output: folder of the new bags.
-        options: options of the command.
-        tell: receives lines for stderr.
         scheduler: address of a Dask scheduler, or `LOCAL`; None: one bag after the other.
 
     Returns:

@@ -64,10 +64,6 @@ def replay_bag(
     """Replays a bag into a new one, which is written completely or not at all.
 
     Args:
-        source: path of the bag.
-        target: folder of the new bag.
-        options: options of the command, for this bag.
-        tell: receives lines for the user.
         shows: whether progress is shown; None: unless `options.quiet`.
 
     Raises:

@@ -108,12 +108,9 @@ class ReplayOptions:
             return None if value is None else Path(rename(str(value)))
 
         return replace(
-            self,
-            subject=path(self.subject),
-            background=path(self.background),
-            bme=self.bme and rename(self.bme),
-            body=self.body and rename(self.body),
-        )
+            self, subject=path(self.subject), background=path(self.background),
+            bme=self.bme and rename(self.bme), body=self.body and rename(self.body),
+        )  # fmt: skip
 
 
 class NodeParameters(NamedTuple):

@@ -52,7 +52,6 @@ class OfflineTrack(PlayedTrack):
     """Without ROS.
 
     Args:
-        parameters: parameters of the nodes.
         write: takes topic, stamp and bytes of each published message.
 
     Raises:
@@ -163,7 +162,6 @@ class LiveTrack(PlayedTrack):
     """The real nodes, over DDS in lock step.
 
     Args:
-        parameters: parameters of the nodes.
         write: takes topic, stamp and bytes of each published message, in the order of the nodes.
         together: whether the nodes run in one process.
 
@@ -205,12 +203,9 @@ class LiveTrack(PlayedTrack):
                     BME, self._parameters.bme, inputs={}, topics=bme_session.TOPICS, sensors=sensors
                 )
             self._filter = live(
-                FILTER,
-                self._parameters.filter,
-                inputs=inputs,
-                topics=track_messages.TOPICS,
+                FILTER, self._parameters.filter, inputs=inputs, topics=track_messages.TOPICS,
                 sensors=sensors,
-            )
+            )  # fmt: skip
             if self._parameters.smoother is not None:
                 self._smoother = live(
                     SMOOTHER, self._parameters.smoother, inputs={}, topics=smoothed_messages.TOPICS
@@ -307,9 +302,6 @@ def _together(one: Handled | None, other: Handled) -> Handled:
     if one is None:
         return other
     return Handled(
-        one.source,
-        one.stamp_ns,
-        one.faults + other.faults,
-        one.warnings + other.warnings,
+        one.source, one.stamp_ns, one.faults + other.faults, one.warnings + other.warnings,
         one.published + other.published,
-    )
+    )  # fmt: skip
