@@ -17,8 +17,8 @@ from scipy.special import logsumexp
 
 from benchmarks.smoothing_clips import Seen
 from hmt_ros.body import Body
+from hmt_ros.body.mirror import free_limits, without_turns
 from hmt_ros.body.motion_prior import motion_prior
-from hmt_ros.body.whole_turns import free_limits, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.sessions.image_evidence import Evidence

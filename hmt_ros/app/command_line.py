@@ -36,9 +36,7 @@ class CommandParser(argparse.ArgumentParser):
         """Adds --output, --overwrite and --quiet of a command that writes a folder.
 
         Args:
-            metavar: name of the folder in the help.
             what: what it is, 'bag' for example.
-            text: help text of --output.
         """
         self.add_argument('-o', '--output', type=Path, required=True, metavar=metavar, help=text)
         self.add_argument('--overwrite', action='store_true', help=f'replace an existing {what}')
@@ -112,11 +110,7 @@ def add_seed(parser: argparse._ActionsContainer) -> None:
 
 
 def add_sources(parser: argparse._ActionsContainer, said: str = '--acknowledgement') -> None:
-    """Adds --without, and what a file says of its motions, of a command that learns from them.
-
-    Args:
-        said: name of the argument for that.
-    """
+    """Adds --without, and what a file says of its motions, of a command that learns from them."""
     parser.add_argument(
         '--without', nargs='+', default=[], metavar='NAME',
         help='motions to leave out, names of files without suffix; * stands for any letters',

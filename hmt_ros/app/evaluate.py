@@ -312,11 +312,7 @@ def _read_trajectories(stored: BagMessage, track: TrackScorer, bodies: RecordedB
 
 
 def _content(read: Callable[[Any], _Content], stored: BagMessage) -> _Content:
-    """The content of a message.
-
-    Raises:
-        ValueError: it can not be understood; one line that names it.
-    """
+    """The content of a message."""
     try:
         return read(stored.message)
     except MessageError as error:

@@ -172,14 +172,10 @@ class LearningSettings:
     """How a lifter learns.
 
     Attributes:
-        experts: Number of experts, K.
         units, layers: Width of the layers that experts share, and number of those that add.
-        steps: Number of steps.
-        batch: Windows a step.
         rate: Of Adam, at its highest.
         distance_weight: Factor a, 1/m.
         sharpness: Exponent b of the densities in q.
-        seed: Of all random choices.
     """
 
     experts: int = 5

@@ -133,8 +133,6 @@ def read_motions(
     """What is read from motions for a body; a line on stderr for each that can not be used.
 
     Args:
-        command: that reads them, for that line.
-        body: name or file of the body.
         read: reads one; errors of input and of arithmetic say that it can not be used.
 
     Raises:
@@ -199,7 +197,6 @@ def learned_motion(
     Args:
         sequences: motions, each poses (T, d), in the frame of a camera at rest.
         rate: poses per second.
-        card: what to say of the motions in the file.
 
     Raises:
         ValueError: there is too little motion.

@@ -143,11 +143,7 @@ def show_progress(
 def with_progress(
     items: Iterable[Item], what: str, unit: str, total: float | None = None, *, quiet: bool = False
 ) -> Generator[Item, None, None]:
-    """The items; shows how many of them are done.
-
-    Args:
-        what, unit, total, quiet: see `show_progress`.
-    """
+    """The items; shows how many of them are done."""
     with show_progress(what, unit, total, quiet=quiet) as bar:
         for item in items:
             yield item

@@ -81,7 +81,6 @@ class Take:
 
     Attributes:
         source: name of the motion or of its file.
-        body: body of the poses.
         poses: (T, d) camera optical frame.
         fps: poses per second.
     """
@@ -111,8 +110,6 @@ def write_bag(
     Args:
         folder: new folder; its name becomes that of the bag.
         scene: surroundings of the person; its seed is also that of the clicks.
-        quality: JPEG quality of the images, 1 to 100.
-        with_depth: whether a depth camera sees the scene as well.
 
     Raises:
         ValueError: the first image does not show the person.

@@ -67,7 +67,6 @@ class PartShape:
         Args:
             lengths: (L,) of the body, m.
             scale: of the part against the model file.
-            growth: (5,) see `GROWTH`.
         """
         width, depth, more_start, more_end, shift = (float(x) for x in growth)
         start, end = scale * self.extend[0] + more_start, scale * self.extend[1] + more_end

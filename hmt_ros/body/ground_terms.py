@@ -201,7 +201,6 @@ def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
 
     Args:
         columns: (S, 3, 3) frames at rest.
-        segment: whose axes.
         along: (3,) its long axis upwards, as the columns.
         lean: how far the long axis leans forwards where the person stands as usual, rad.
     """

@@ -43,7 +43,6 @@ def solve_joint_positions(
         targets: (N, J', 3) camera frame, m; NaN for a joint without a target.
         joint_names: (J',) names of the joints of the targets; None selects all joints.
         sigma: standard deviation of the targets, scalar, (J',) or (N, J'), m.
-        prior_weight: weight of the body's soft prior.
         free_dofs: names of the degrees of freedom that may change; None selects all.
         along_rays: whether only the distance of a joint from the ray of its target counts.
     """

@@ -53,7 +53,6 @@ def origin_joints(names: Sequence[str], source: str = 'truth') -> tuple[str, ...
 
     Args:
         names: of the joints whose true positions are known.
-        source: of the truth, for the message of the error.
 
     Raises:
         ValueError: neither is known.
@@ -281,7 +280,6 @@ def marginal_regions(
     Args:
         mixtures: (T,) of the same joints.
         truth: (T, J, 3) true positions from the same origin, m.
-        samples: number of samples per frame.
 
     Returns:
         Levels (T, J) of the true positions, see `score`; volumes (T, J) of the regions of 90 %,
@@ -316,7 +314,6 @@ def score(
         mixtures: (T,) of the same joints, relative to the origin.
         truth: (T, J, 3) true positions relative to the true origin, m.
         names: (J,) of the joints.
-        samples: number of samples per frame.
 
     Raises:
         ValueError: no frames, or shapes that do not fit.

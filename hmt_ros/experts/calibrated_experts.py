@@ -76,9 +76,6 @@ class CalibratedExperts(ConditionalDensity):
 
     Args:
         folds: Number of parts of the motions; each part is left out once.
-
-    Attributes:
-        calibration_: Calibration learned from the motions left out.
     """
 
     kind = 'calibrated_experts'
@@ -100,7 +97,6 @@ class CalibratedExperts(ConditionalDensity):
         """Learns from inputs (N, p) and targets (N, D).
 
         Args:
-            sample_weight: (N,) or None.
             groups: (N,) number of the group of each sample, such as its motion. Neighbouring
                 numbers are left out together. None takes the order of the samples.
 

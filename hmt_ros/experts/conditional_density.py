@@ -81,7 +81,6 @@ class ConditionalDensity(ABC):
     unchanged, learned attributes end in an underscore, `get_params` and `set_params` exist.
 
     Attributes:
-        kind: Name of the model in files.
         kinds: All models by their names in files.
     """
 

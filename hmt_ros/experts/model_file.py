@@ -49,9 +49,6 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
 def check_header(arrays: Mapping[str, NDArray[Any]], kind: str | None, where: str) -> None:
     """Checks the arrays of `header`.
 
-    Args:
-        kind: Kind that is wanted; None accepts any.
-
     Raises:
         ValueError: the format, the version or the kind is another one.
     """
@@ -88,7 +85,6 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
 
     Args:
         path: File to write; '.npz' is appended where it is missing.
-        arrays: Arrays with those of `header`.
 
     Returns:
         The path written.

@@ -47,7 +47,6 @@ class NetworkExperts(ConditionalDensity):
 
     Args:
         units, layers: Width of the layers, and number of those that add to the first.
-        rate: Of Adam, at its highest.
         jitter: Standard deviation of the noise on inputs while learning, in theirs.
 
     Attributes:

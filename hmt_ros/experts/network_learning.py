@@ -46,7 +46,6 @@ class Descent:
     """How a network learns.
 
     Attributes:
-        steps: Number of steps.
         rate: Of Adam, at its highest.
         distance_weight: Factor a.
         sharpness: Exponent b of the densities in q.
@@ -74,9 +73,7 @@ def learned_network(
     """The parameters that have learned.
 
     Args:
-        parameters: the first ones.
         size: number of numbers in a target, n.
-        drawn: inputs and targets of a step.
 
     Raises:
         ValueError: JAX or Optax is missing, or the file to take up is of another training.

@@ -222,7 +222,6 @@ class PosePredictor:
 
         Args:
             descriptor: (p,).
-            previous, interval, propagation, max_components: see `observe`.
 
         Raises:
             ValueError: the propagation is another one, or its model is missing.

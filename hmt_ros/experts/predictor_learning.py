@@ -62,7 +62,6 @@ class ModelKind:
     Attributes:
         make: Makes the model from a number of experts, a seed and, if known, the number of samples.
             The baselines take the first as the number of neighbours, or ignore it.
-        experts: Default number of experts M.
         components: Number of components of the descriptor that the model sees.
         dynamics_experts: Number of experts of p(x_t | x_t-1, r_t); None takes M.
         few: Whether each expert needs many samples, so that few samples have few experts.
@@ -124,9 +123,7 @@ def new_model(
     """A calibrated model before learning.
 
     Args:
-        name: Name in `KINDS`.
         experts: Number of experts M; None takes the default. Few samples have fewer.
-        samples: Number of samples that it will learn from.
 
     Raises:
         ValueError: there is no such model.
@@ -145,7 +142,6 @@ class Described:
     """Descriptors and targets of a training set.
 
     Attributes:
-        descriptor: Descriptor that has learned from the silhouettes.
         descriptors: (N, p).
         targets, previous: (N, D) encoded poses, and those one step before.
         motions: (N,) number of the motion of each sample.
@@ -179,7 +175,6 @@ def described(
     """Descriptors and targets of a training set.
 
     Args:
-        descriptor: Descriptor that learns; None takes the default.
         progress: Iterates over the silhouettes, given their number.
     """
     descriptor = descriptor or SilhouetteDescriptor()

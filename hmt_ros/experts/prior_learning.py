@@ -105,11 +105,7 @@ def mirrored_log_densities(mixture: GaussianMixture, angles: Array, images: Arra
 
 
 def seeds_of(samples: MirroredSamples, count: int, rng: np.random.Generator) -> Array:
-    """Samples (K, n) that are far from each other, drawn as k-means++ does.
-
-    Args:
-        count: K.
-    """
+    """Samples (K, n) that are far from each other, drawn as k-means++ does."""
     scale = np.sqrt(np.maximum(np.diagonal(samples.scatter()[1]), 1e-12))
     chosen: list[Array] = []
     nearest = np.ones(len(samples.angles))
@@ -177,7 +173,6 @@ class PriorSettings:
         folds: Number of groups of people of which one at a time is left out.
         novelty: Mean distance of the joints from the last pose kept, below which a pose of a motion
             is dropped, m.
-        most_poses: Maximum number of poses of a motion.
         shrinkage: Number of poses for which the covariance of all poses counts in that of a
             component.
         compactness: Factor on that covariance.
@@ -278,11 +273,7 @@ class PriorData:
 def prior_data(
     body: Body, sequences: Sequence[PoseSequence], people: Sequence[str], settings: PriorSettings
 ) -> PriorData:
-    """What is kept of motions.
-
-    Args:
-        people: the person of each.
-    """
+    """What is kept of motions."""
     kept = []
     for sequence in sequences:
         frames = novel_frames(body, sequence.poses, settings.novelty)

@@ -77,7 +77,6 @@ def place_roots(
     """Roots of the postures that were predicted from a silhouette.
 
     Args:
-        encoding: Encoding of the body, which has flesh.
         targets: (M, D) predicted.
         covariances: (M, D, D) of the prediction.
         size_spread: Relative standard deviation of the person's size; 0 if the body has the lengths

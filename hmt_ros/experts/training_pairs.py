@@ -93,7 +93,6 @@ def checked_pairs(
 
     Args:
         sample_weight: (N,) not negative, or None for ones.
-        at_least: Minimum number of samples.
         what: Reason for that minimum, for the message.
 
     Raises:

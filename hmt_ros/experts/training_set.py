@@ -215,7 +215,6 @@ def training_set(
 
     Args:
         body: Body of the poses, with flesh.
-        progress: Iterates over groups of silhouettes, given their number.
         shares: Share of the poses of each motion that are taken; None: all.
         mark: Takes what has been rendered, and gives it where a rendering was broken off.
 

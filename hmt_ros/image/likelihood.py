@@ -130,11 +130,7 @@ class ImageLikelihood:
         observation: Observation,
         exchanges: Array | None = None,
     ) -> Posed:
-        """-log p(image | pose) - log prior(pose), of one observation.
-
-        Args:
-            exchanges: of sides, of each problem; see `KeypointTerm`.
-        """
+        """-log p(image | pose) - log prior(pose), of one observation."""
         seen = self.seen(observation, exchanges=exchanges)
         terms = (*seen, *self.priors)
         return Posed(self.body.skeleton, terms)

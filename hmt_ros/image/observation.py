@@ -104,7 +104,6 @@ def observe(
         others: (H, W) pixels that somebody else covers; None: none.
         depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and what is out
             of range says nothing.
-        threads: that take it; 0: one a core, see `together`.
 
     Raises:
         ValueError: shapes that contradict each other.

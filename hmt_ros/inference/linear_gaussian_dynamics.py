@@ -259,7 +259,6 @@ class LinearGaussianDynamics:
 
         Args:
             means, covariances: (K, d) and (K, d, d) of the poses.
-            interval: s.
         """
         d = self.dimension
         first = np.broadcast_to(self.initial_mean[d:], (len(means), self.state_dimension - d))

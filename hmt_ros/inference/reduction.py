@@ -35,7 +35,6 @@ def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
     """The mixture whose components have the moments of what they stand for.
 
     Args:
-        mixture: K components.
         share: (K, B) share of each component that goes to each of B new ones; a new one that gets
             nothing is left out.
     """
@@ -111,7 +110,6 @@ def led(weights: Array, points: Array, least: float, count: int) -> tuple[Array,
     Args:
         weights: (N,).
         points: (N, P, 3) of which one has to be apart, m.
-        least, count: as for `leaders`.
     """
 
     def distances(i: int) -> Array:

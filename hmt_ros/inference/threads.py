@@ -50,7 +50,6 @@ def together(calls: Sequence[Callable[[], Any]], threads: int = 0) -> list[Any]:
 
     Args:
         calls: none of which calls this or `in_threads`.
-        threads: as for `in_threads`.
     """
     results: list[Any] = [None] * len(calls)
 

@@ -89,7 +89,6 @@ def procedural_motion(
     """Poses (T, d) of a motion, T = duration * fps, in the camera optical frame of a viewpoint.
 
     Args:
-        name: one of `PROCEDURAL_MOTIONS`.
         body: body with flesh and the degrees of freedom of human32; those of a spine move, too.
         duration: duration, s.
         fps: poses per second. The motion as a function of time does not depend on it.

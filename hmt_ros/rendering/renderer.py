@@ -61,9 +61,7 @@ def render(body: Body, pose: ArrayLike, camera: Camera, scene: Scene, frame: int
     """Picture of a body at a pose (d,) in a scene.
 
     Args:
-        body: body with flesh.
         pose: (d,).
-        camera: the camera; the viewpoint of the scene is its place.
         frame: number of the picture, which seeds its noise.
 
     Raises:
@@ -87,8 +85,6 @@ def render_people(
     Args:
         bodies: with flesh; each person has clothes of its own.
         poses: (d,) of each.
-        camera: the camera; the viewpoint of the scene is its place.
-        frame: number of the picture, which seeds its noise.
 
     Returns:
         (H, W, 3) uint8, BGR, and (H, W) the number of the person who is seen there; -1: nobody.
@@ -264,11 +260,7 @@ class _Front(_Filled):
 
 @lru_cache(maxsize=8)
 def _mesh(body: Body) -> Mesh:
-    """Triangles of the flesh, the normals of which point outwards.
-
-    Raises:
-        ValueError: a body without flesh.
-    """
+    """Triangles of the flesh, the normals of which point outwards."""
     if not body.shapes:
         raise ValueError(f'body {body.name} has no flesh: it can not be drawn')
     mesh = body.flesh.mesh(STACKS, SLICES)
@@ -399,8 +391,6 @@ def sensed_depth(depth: Depth, camera: Camera, seed: int, frame: int = 0) -> NDA
 
     Args:
         depth: (H, W) along the axis of the camera, m; inf where nothing is.
-        camera: whose images the depths are registered to.
-        frame: number of the image, which seeds its noise.
 
     Returns:
         (H, W) mm, 0 where nothing was measured.

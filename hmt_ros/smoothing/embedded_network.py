@@ -55,7 +55,6 @@ def embedded_network(
     """The network of Gaussian modes, in closed form.
 
     Args:
-        mixtures: T mixtures over the pose.
         intervals: (T-1,) s; (T,) with `first`.
         first: a density of the state (n variables) at a time before the mixtures; its components
             are the first layer of nodes.

@@ -411,7 +411,6 @@ def with_refined_parts(
     Args:
         starts: (M, T, n); the first one is an optimum.
         shared: (M, T) whether they are as the first one.
-        prior, likelihood, lower, upper: as for `refine`.
     """
     times = starts.shape[1]
     parts: dict[tuple[int, int], list[int]] = {}

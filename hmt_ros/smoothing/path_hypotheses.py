@@ -183,7 +183,6 @@ class FilteredPaths:
     """The paths through the modes of images that come one after the other.
 
     Args:
-        count: of paths at most.
         points: maps poses (N, d) to points (N, P, 3), m: some paths are apart, see
             `PathHypotheses.followed`; None: they are the heaviest.
         first: states (H, n) that they begin in; None: the first mixture begins them.
@@ -280,7 +279,6 @@ def distances_of_paths(nodes: Index, gaps: Sequence[Array | None]) -> Array | No
     """Largest distances (H, H) at any time of paths with nodes (H, T).
 
     Args:
-        nodes: of the paths.
         gaps: T arrays (K_t, K_t) of distances of the nodes of each time; None: unknown.
     """
     result = np.zeros((len(nodes), len(nodes)))
@@ -407,11 +405,7 @@ class SmoothedPath:
 
 
 def smoothed_paths(steps: Sequence[PathHypotheses]) -> tuple[Array, tuple[SmoothedPath, ...]]:
-    """States (H, T, n) of the H paths of the last of T steps, and their covariances.
-
-    Args:
-        steps: one after the other, as of `FilteredPaths`.
-    """
+    """States (H, T, n) of the H paths of the last of T steps, and their covariances."""
     at = np.arange(len(steps[-1]))
     rows = [at]
     states = np.empty((len(at), len(steps), steps[-1].states.dimension))

@@ -91,7 +91,6 @@ class RestingPoints:
         Args:
             prior: of the states, whose first d variables are the pose.
             poses: (T, d) along which is decided what rests, and points are linear.
-            covariances, intervals: as for `probabilities`.
         """
         count, d = poses.shape
         points, jacobians = self.points(poses), self.jacobians(poses)

@@ -132,7 +132,6 @@ class TrajectoryMixture:
         """The density of the pose at index t, a component for each trajectory.
 
         Args:
-            t: index.
             which: trajectories whose components are wanted, which costs less; None: all.
         """
         chosen = np.arange(len(self)) if which is None else which

@@ -19,24 +19,22 @@ from hmt_ros.experts.keypoint_training import (
     training_windows,
     with_errors,
 )
-from hmt_ros.experts.keypoint_windows import (
+from hmt_ros.experts.lifted_fit import lift_poses, poses_of
+from hmt_ros.experts.lifter import (
     LANDMARKS,
     PROPORTIONED,
     TIMES,
-    filled,
-    landmark_offsets,
-    places_of,
-    proportions,
-    window_inputs,
-)
-from hmt_ros.experts.lifted_fit import lift_poses, poses_of
-from hmt_ros.experts.lifter import (
     KeypointHistory,
     Lifter,
     Network,
+    filled,
+    landmark_offsets,
     landmark_rays,
     lifted_positions,
     load_lifter,
+    places_of,
+    proportions,
+    window_inputs,
 )
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.experts.training_set import procedural_sequence

@@ -89,7 +89,6 @@ class FrameSource(ABC):
         first_number: number of the first frame for those who number frames.
 
     Attributes:
-        path, names: as given.
         claimed: number of frames that the source announces; 0: it does not tell.
         count: number of frames that were passed so far, wanted or not.
         ended: whether the last frame was passed.
@@ -143,7 +142,6 @@ def open_source(path: Path, fps: float | None, first_number: int = 0) -> FrameSo
 
     Args:
         fps: frames per second; None: a video file has its own times.
-        first_number: number of the first frame for those who number frames.
 
     Raises:
         ValueError: it is not there, or has no frames.
@@ -162,7 +160,6 @@ class VideoFile(FrameSource):
 
     Args:
         fps: frames per second; None: the times in the file.
-        first_number: see `FrameSource`.
     """
 
     def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
@@ -230,7 +227,6 @@ class ImageFolder(FrameSource):
 
     Args:
         fps: images per second; None: only their order is known.
-        first_number: see `FrameSource`.
     """
 
     def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
@@ -269,11 +265,7 @@ class ImageFolder(FrameSource):
 
 
 def _upright(content: bytes) -> tuple[Image, bytes | None]:
-    """The image in a file, upright, and the file if it is a JPEG that needs no turning.
-
-    Raises:
-        ValueError: the file does not hold an image.
-    """
+    """The image in a file, upright, and the file if it is a JPEG that needs no turning."""
     if content.startswith(b'\xff\xd8\xff'):
         as_stored = decode_picture(content, 'jpeg')
         if b'Exif\0' not in content[:_EXIF_WITHIN]:

@@ -41,10 +41,7 @@ class RecordedInput:
     """The topics of a bag that a replay reads.
 
     Attributes:
-        image: topic of the images.
-        camera_info: topic of their calibration.
         given: topics of what comes with the images, by the source that it is for.
-        ground_truth: topic of the ground truth; None if the bag has none.
         transforms: topics of transforms by source, those that the bag has of `TRANSFORMS`; None if
             transforms are not used.
         upright_frame: one of `UPRIGHT_FRAMES` that transforms lead to from the camera; empty: they

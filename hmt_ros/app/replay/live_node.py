@@ -43,8 +43,6 @@ class NodeProcess:
 
     Args:
         player: the participant that its nodes talk to.
-        opened: stack that ends the process.
-        module: that runs the nodes.
         words: for its command line, before those of ROS.
     """
 
@@ -120,10 +118,7 @@ class LiveNode:
 
     Args:
         player: the participant that publishes for the node and subscribes to it.
-        opened: stack that ends the node.
-        name: name of the node, 'filter_node' for example.
         inputs: topic and type of the messages for the node, by source.
-        topics: topics that the node publishes.
         sensors: topics with the QoS of sensor data, which may lose messages; here they are
             reliable.
         namespace: namespace of the node and of all its topics, '/humans/bodies/7' for example.

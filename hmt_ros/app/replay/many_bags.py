@@ -70,10 +70,7 @@ class Outcome:
     """The outcome of a job.
 
     Attributes:
-        name: name of the job.
         kind: `DONE`, `BEFORE` or `FAILED`.
-        text: one line about it.
-        told: lines for the user.
     """
 
     name: str
@@ -141,11 +138,7 @@ def replay_many(
 
 
 def _by_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[Outcome]:
-    """Outcomes of jobs in the order in which they end.
-
-    Raises:
-        ValueError: Dask is not installed, or the scheduler does not answer.
-    """
+    """Outcomes of jobs in the order in which they end."""
     try:
         distributed: Any = importlib.import_module('distributed')
     except ImportError as error:

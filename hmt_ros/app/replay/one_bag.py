@@ -43,7 +43,6 @@ class Replayed:
     """The outcome of a replay.
 
     Attributes:
-        images: number of images that were read.
         tracked: number of images in which the person was tracked.
         last_stamp: stamp of the last image, ns.
         last_fault: text of the newest fault; '' without faults.

@@ -195,11 +195,7 @@ def _tracking_values(options: ReplayOptions, recorded: RecordedInput, node: str)
 
 
 def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> PeopleParameters:
-    """Parameters of the people node, which takes the place of all other nodes.
-
-    Raises:
-        ValueError: options of one person, or no detections of several.
-    """
+    """Parameters of the people node, which takes the place of all other nodes."""
     unfit: dict[str, object] = {
         '--live': options.live,
         '--subject': options.subject,

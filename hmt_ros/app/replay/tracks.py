@@ -124,7 +124,6 @@ class PeopleTrack(PlayedTrack):
 
     Args:
         parameters: parameters of the nodes; those of the filter are those of the people node.
-        write: takes topic, stamp and bytes of each published message.
         add_topic: takes name, type and `latched` of a topic of a person before its first message.
 
     Raises:
@@ -162,7 +161,6 @@ class LiveTrack(PlayedTrack):
     """The real nodes, over DDS in lock step.
 
     Args:
-        write: takes topic, stamp and bytes of each published message, in the order of the nodes.
         together: whether the nodes run in one process.
 
     Raises:
