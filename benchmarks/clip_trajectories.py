@@ -13,18 +13,19 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from benchmarks.smoothing_clips import Seen
 from hmt_ros.body import Body
+from hmt_ros.body.mirror import free_limits, without_turns
 from hmt_ros.body.motion_prior import motion_prior
-from hmt_ros.body.whole_turns import free_limits, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.sessions.image_evidence import Evidence
 from hmt_ros.sessions.smoother_session import MERGED
+from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, Paths
 from hmt_ros.smoothing.likelihood import counted
 from hmt_ros.smoothing.mode_sequence import ModeSequence
-from hmt_ros.smoothing.paths import Paths, visiting_probabilities
 from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories, limits_of_states, refine
 from hmt_ros.smoothing.variational_mixture import (
     VariationalMixture,
@@ -177,3 +178,23 @@ def descent(found: ClipTrajectories) -> VariationalMixture:
         peak_weights(distinct.energies), distinct.states, distinct.factors, prior,
         found.sequence.likelihood, low=low, high=high, samples=SAMPLES, max_iterations=ITERATIONS,
     )  # fmt: skip
+
+
+def visiting_probabilities(network: EmbeddedNetwork, paths: Paths) -> tuple[Array, ...]:
+    """How probably the paths from each source visit each node (VMS fig. 2), T arrays (K_1, K_t).
+
+    Of the paths that start from the same first node, the sum of the probabilities of those through
+    a node over that of all. Rows of sources without paths are zero.
+    """
+    sources = len(network.nodes[0])
+    weights = np.zeros(len(paths))
+    for source in range(sources):
+        at = paths.nodes[:, 0] == source
+        if at.any():
+            weights[at] = np.exp(paths.log_values[at] - logsumexp(paths.log_values[at]))
+    result = []
+    for t, nodes in enumerate(network.nodes):
+        table = np.zeros((sources, len(nodes)))
+        np.add.at(table, (paths.nodes[:, 0], paths.nodes[:, t]), weights)
+        result.append(table)
+    return tuple(result)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import best_time, description, dgemm_rate, peak_memory_apart
+from benchmarks.whole_body_flips import full_body_flips
 from hmt_ros.body import Body, load_body
 from hmt_ros.flips.interpretation_tree import enumerate_flips, flip_counts
-from hmt_ros.flips.whole_body_flips import full_body_flips
 
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg')
 LEAVES = 1024

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import description, dgemm_rate
+from benchmarks.whole_body_flips import full_body_flips
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips import enumerate_flips
-from hmt_ros.flips.best_combinations import distinct_poses
-from hmt_ros.flips.interpretation_tree import flip_counts
-from hmt_ros.flips.whole_body_flips import full_body_flips
+from hmt_ros.flips.interpretation_tree import distinct_poses, flip_counts
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.image_term import TermSettings

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from benchmarks.arm_waving import STEP, Waving, waving
 from hmt_ros.inference.energy import Derivatives
+from hmt_ros.smoothing.embedded_network import k_best_paths
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
 from hmt_ros.smoothing.mode_sequence import ModeSequence
-from hmt_ros.smoothing.paths import most_probable_paths
 from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories, refine
 from hmt_ros.smoothing.variational_mixture import (
     VariationalMixture,
@@ -50,7 +50,7 @@ def analysis(times: int) -> Analysis:
     """Network, paths and optima."""
     sequence = waving(times)
     layers = layers_of(sequence)
-    paths = most_probable_paths(layers.network)
+    paths = k_best_paths(layers.network, 1)
     starts = layers.states(paths)
     refined = refine(starts, layers.prior, layers.likelihood, sequence.lower, sequence.upper)
     at = np.tile(np.arange(times), len(starts))

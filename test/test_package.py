@@ -264,7 +264,7 @@ HEADS = {
     'smoothing/mode_sequence.py': '    w_k N(X; M_k, P_k^-1),',
     'smoothing/path_hypotheses.py': '    N(x; A m,',
     'smoothing/trajectory_refinement.py': '    E(X) = -log p(x_1) - sum_t log p(x_t | x_{t-1})',
-    'inference/trust_region.py': '    rho = (E(x) - E(x + s)) / (m(0) - m(s))',
+    'inference/bounded_newton.py': '    rho = (E(x) - E(x + s)) / (m(0) - m(s))',
     'inference/reduction.py': '    w = sum_i w_i,   m = sum_i w_i m_i / w,',
 }
 

@@ -36,9 +36,7 @@ class CommandParser(argparse.ArgumentParser):
         """Adds --output, --overwrite and --quiet of a command that writes a folder.
 
         Args:
-            metavar: name of the folder in the help.
             what: what it is, 'bag' for example.
-            text: help text of --output.
         """
         self.add_argument('-o', '--output', type=Path, required=True, metavar=metavar, help=text)
         self.add_argument('--overwrite', action='store_true', help=f'replace an existing {what}')
@@ -82,26 +80,19 @@ class CommandParser(argparse.ArgumentParser):
             'bag', type=Path, metavar='OUT', help='bag with mixtures: a folder or a file'
         )
         self.add_argument(
-            '--truth',
-            type=Path,
-            metavar='FILE',
+            '--truth', type=Path, metavar='FILE',
             help='true joint positions: a .npz file with stamps, joint_names and joints, or a bag '
             'with ground truth (default: the ground truth in OUT)',
-        )
+        )  # fmt: skip
         self.add_argument(
-            '--topic',
-            action='append',
-            default=[],
-            dest='topics',
-            metavar='NAME',
+            '--topic', action='append', default=[], dest='topics', metavar='NAME',
             help=f'{verb} only this topic; may be repeated (default: all topics with mixtures)',
-        )
+        )  # fmt: skip
         self.add_argument(
-            '--body',
-            metavar='MODEL',
+            '--body', metavar='MODEL',
             help='body model of the poses: a name or a YAML file (default: the model that OUT '
             'names)',
-        )
+        )  # fmt: skip
 
 
 def add_body(parser: argparse._ActionsContainer) -> None:
@@ -119,12 +110,7 @@ def add_seed(parser: argparse._ActionsContainer) -> None:
 
 
 def add_sources(parser: argparse._ActionsContainer, said: str = '--acknowledgement') -> None:
-    """Adds --without, and what a file says of its motions, of a command that learns from them.
-
-    Args:
-        parser: to which they are added.
-        said: name of the argument for that.
-    """
+    """Adds --without, and what a file says of its motions, of a command that learns from them."""
     parser.add_argument(
         '--without', nargs='+', default=[], metavar='NAME',
         help='motions to leave out, names of files without suffix; * stands for any letters',

@@ -67,19 +67,15 @@ def _parser() -> CommandParser:
     )
     parser.add_mixtures('evaluate')
     parser.add_argument(
-        '--model-sigma',
-        type=number(0, 1, what='a length', unit=' m'),
-        default=MODEL_SIGMA,
+        '--model-sigma', type=number(0, 1, what='a length', unit=' m'), default=MODEL_SIGMA,
         metavar='M',
         help='standard deviation, in m, of each coordinate of a joint that is added to the '
         f'covariances of the mixture (default: {MODEL_SIGMA:g})',
-    )
+    )  # fmt: skip
     parser.add_argument(
-        '--seed',
-        type=whole_number(0),
-        default=0,
+        '--seed', type=whole_number(0), default=0,
         help='seed of the samples from which coverage is estimated (default: 0)',
-    )
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
     return parser
@@ -93,14 +89,9 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     total = message_count(bag, arguments.topics)
     with show_progress('evaluate', 'messages', total, quiet=arguments.quiet) as bar:
         found = score_bag(
-            bag,
-            truth,
-            topics=arguments.topics,
-            model_sigma=model_sigma,
-            body_model=arguments.body,
-            seed=arguments.seed,
-            progress=bar.update,
-        )
+            bag, truth, topics=arguments.topics, model_sigma=model_sigma, body_model=arguments.body,
+            seed=arguments.seed, progress=bar.update,
+        )  # fmt: skip
     verticals = score_gravity(bag, truth)
     if arguments.json:
         print(json.dumps(as_json(found, truth, model_sigma, verticals), indent=1))
@@ -216,14 +207,10 @@ def score_bag(
     """Scores of the topics of a bag, by name in the order of the bag.
 
     Args:
-        path: path of the bag.
-        truth: true joint positions.
         topics: names of the topics to score; empty: all topics with mixtures.
         model_sigma: see `hmt_ros.evaluation.pose_scores`, m.
         body_model: name or file of the body model, for a bag whose own name for it is unknown;
             None: the model that the bag names.
-        seed: of the samples from which coverage is estimated.
-        progress: called with the number of messages that were read.
 
     Raises:
         ValueError: no mixtures, messages that can not be understood, or no frame with a truth.
@@ -325,11 +312,7 @@ def _read_trajectories(stored: BagMessage, track: TrackScorer, bodies: RecordedB
 
 
 def _content(read: Callable[[Any], _Content], stored: BagMessage) -> _Content:
-    """The content of a message.
-
-    Raises:
-        ValueError: it can not be understood; one line that names it.
-    """
+    """The content of a message."""
     try:
         return read(stored.message)
     except MessageError as error:

@@ -192,7 +192,6 @@ def motion_bytes(motion: TrackedMotion, kind: str, rate: float | None = None) ->
     """The content of a file.
 
     Args:
-        motion: to be written.
         kind: one of `FORMATS`.
         rate: poses a second of a .bvh; None: the usual one of the motion.
 
@@ -274,14 +273,12 @@ def read_tracked_motion(
     """The motion of a recorded run; of several poses with the same stamp, the first.
 
     Args:
-        path: path of the bag.
         topic: of mixtures over poses; None: of smoothed ones, else of the posterior, else of
             predictions.
         identity: of the motion; None: the heaviest mode at each time.
         track: its number; None: the one with most poses.
         body_model: name or file of the body model, for a bag whose own name for it is unknown.
         camera_axes: whether gravity does not count though it is known.
-        progress: called with the number of messages that were read.
 
     Raises:
         ValueError: no such topic, track or motion, or messages that can not be understood.

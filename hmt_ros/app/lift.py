@@ -23,8 +23,7 @@ from hmt_ros.app.command_line import (
 )
 from hmt_ros.app.import_video.command import add_camera_arguments, camera_of, person_choice
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection
-from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
-from hmt_ros.app.import_video.persons import Choice, Chooser
+from hmt_ros.app.import_video.keypoint_files import Choice, Chooser, FoundPersons, read_keypoints
 from hmt_ros.app.progress import show_progress
 from hmt_ros.app.rendered_bag import START_NS
 from hmt_ros.app.report.command import ReportOptions, write_report

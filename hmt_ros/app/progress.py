@@ -133,7 +133,6 @@ def show_progress(
         what: what is made: a name of a file, or a verb such as 'reading'.
         unit: what is counted, in the plural; '' if nothing is.
         total: number of units of the whole; None if unknown.
-        quiet: whether nothing is shown.
     """
     if quiet or _is_wide_terminal():
         # One bar below another is removed at its end.
@@ -144,12 +143,7 @@ def show_progress(
 def with_progress(
     items: Iterable[Item], what: str, unit: str, total: float | None = None, *, quiet: bool = False
 ) -> Generator[Item, None, None]:
-    """The items; shows how many of them are done.
-
-    Args:
-        items: to go through.
-        what, unit, total, quiet: see `show_progress`.
-    """
+    """The items; shows how many of them are done."""
     with show_progress(what, unit, total, quiet=quiet) as bar:
         for item in items:
             yield item

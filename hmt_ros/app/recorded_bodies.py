@@ -85,7 +85,6 @@ def read_grounds(path: Path, topic: str, frame_id: str) -> dict[int, GroundState
     """What a bag tells of the ground, by stamp in ns; nothing if it has no such topic.
 
     Args:
-        path: path of the bag.
         topic: topic of the mixtures that are shown: the ground is on the topic of the same
             namespace, or else on the only one of the bag.
         frame_id: frame of the mixtures; a ground in another frame is left out.

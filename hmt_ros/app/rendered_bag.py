@@ -35,8 +35,7 @@ from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.depth_sensor import sensed_depth
-from hmt_ros.rendering.renderer import render_frames, render_people
+from hmt_ros.rendering.renderer import render_frames, render_people, sensed_depth
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.sessions.transform_buffer import TRANSFORMS_TYPE
 from msg_tools import BagWriter, RosbagsMessages
@@ -82,7 +81,6 @@ class Take:
 
     Attributes:
         source: name of the motion or of its file.
-        body: body of the poses.
         poses: (T, d) camera optical frame.
         fps: poses per second.
     """
@@ -111,12 +109,7 @@ def write_bag(
 
     Args:
         folder: new folder; its name becomes that of the bag.
-        take: the motion.
-        camera: camera of the images.
         scene: surroundings of the person; its seed is also that of the clicks.
-        quality: JPEG quality of the images, 1 to 100.
-        with_depth: whether a depth camera sees the scene as well.
-        progress: whether to show progress on stderr.
 
     Raises:
         ValueError: the first image does not show the person.
@@ -338,9 +331,7 @@ def detection(
 
     Args:
         body, pose: the person, pose (d,).
-        camera: that sees the person.
         own: (H, W) pixels that show the person.
-        rng: of the noise.
     """
     scheme, skeleton = schemes()['coco17'], body.skeleton
     marks = [x for x in zip(scheme.names, scheme.landmarks, strict=True) if x[1].joint]

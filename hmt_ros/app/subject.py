@@ -125,8 +125,6 @@ def find_start(
     """The joints in the image of a bag that a track starts from.
 
     Args:
-        path: of the bag.
-        body: whose joints they are.
         stamp_ns: of the image; or
         time: since the first image, s, of which the nearest image is taken; or neither: see EPILOG.
 
@@ -200,7 +198,6 @@ def subject_text(seen: Seen, *, stature: float | None = None, sigma: float | Non
     """The subject file.
 
     Args:
-        seen: the joints.
         stature: m; None: not known.
         sigma: standard deviation of a joint, px; None: follows from the size of the person.
     """

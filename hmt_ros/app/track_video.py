@@ -98,13 +98,10 @@ def _track(arguments: argparse.Namespace) -> int:
         start.write_text(subject_text(seen, stature=stature), encoding='utf-8')
         say(f'{start}: {len(seen.joints.names)} joints at {seen.stamp_ns} ns')
     options = ReplayOptions(
-        overwrite=overwrite,
-        quiet=quiet,
-        subject=arguments.subject if stature is None else start,
-        background=arguments.background,
-        seed=arguments.seed,
+        overwrite=overwrite, quiet=quiet, subject=arguments.subject if stature is None else start,
+        background=arguments.background, seed=arguments.seed,
         settings=[*_of_gravity(arguments), *arguments.settings],
-    )
+    )  # fmt: skip
     replayed = replay_bag(video, folder / TRACKED, options, tell)
     say(f'{folder / TRACKED}: {replayed}')
     _, written = write_report(

@@ -103,16 +103,13 @@ def _parser() -> CommandParser:
 
     learning = parser.add_argument_group('learning')
     learning.add_argument(
-        '--model',
-        choices=sorted(KINDS),
-        default='network',
+        '--model', choices=sorted(KINDS), default='network',
         help='model that learns; network, the default, needs jax and optax',
-    )
+    )  # fmt: skip
     learning.add_argument(
-        '--experts',
-        type=whole_number(1, 1000),
+        '--experts', type=whole_number(1, 1000),
         help='number of experts; maximum number of modes of the local model (5)',
-    )
+    )  # fmt: skip
     learning.add_argument(
         '--samples', type=whole_number(50, 1_000_000), default=6000,
         help='number of silhouettes (6000); a network can use ten times as many',
@@ -271,13 +268,6 @@ def write_report(
     training: Described,
 ) -> list[tuple[Path, str]]:
     """Draws the figures into a folder.
-
-    Args:
-        folder: Folder that exists.
-        body: Body of the poses.
-        sequences: Motions.
-        pairs: Silhouettes and poses.
-        training: Descriptors and targets.
 
     Returns:
         The path of each figure, and a description.

@@ -106,11 +106,7 @@ def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int
 
 
 def _truth_topic(bag: BagReader) -> str | None:
-    """The topic of the ground truth in a bag; None if it has none.
-
-    Raises:
-        ValueError: there are several.
-    """
+    """The topic of the ground truth in a bag; None if it has none."""
     found = [topic for topic in mixture_topics(bag) if is_truth(bag, topic)]
     if len(found) > 1:
         raise ValueError(f'{bag.path} has several ground truths ({", ".join(found)})')
@@ -133,11 +129,7 @@ def is_truth(bag: BagReader, topic: str) -> bool:
 
 
 def _truth_of(bag: BagReader, topic: str) -> Truth:
-    """The ground truth on a topic of a bag.
-
-    Raises:
-        ValueError: messages that contradict each other or have no component.
-    """
+    """The ground truth on a topic of a bag."""
     source = f'{bag.path} ({topic})'
     joints: dict[int, Array] = {}
     names: tuple[str, ...] | None = None

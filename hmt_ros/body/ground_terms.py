@@ -7,6 +7,14 @@
 upright; h_p the height of a point of the sole over the floor. The tails are heavy: people bend and
 lie. A floor that is only known from the feet of the track costs nothing: feet that were taken for
 too high would hold the next ones up.
+
+The soles are where the flesh of the feet meets a floor, and where it rests. The points of a foot
+are those of its flesh that lie farthest down when the foot is flat and pitched by `PITCH` up (heel)
+or down (toe). They move with the flesh when the shape changes.
+
+Shares of the mass of the body and distances of the centres from the upper ends, as shares of the
+lengths, are those of [Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009, table
+4.1, after Dempster]. The trunk of 0.497 is there 0.142 pelvis and 0.355 thorax and abdomen.
 """
 
 from __future__ import annotations
@@ -20,8 +28,8 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.ground_kernel import Constants, add_ground_energies
-from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.body.soles import soles
+from hmt_ros.body.kinematics import Frames, forward, point_jacobians
+from hmt_ros.body.skeleton import other_side
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
@@ -193,7 +201,6 @@ def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
 
     Args:
         columns: (S, 3, 3) frames at rest.
-        segment: whose axes.
         along: (3,) its long axis upwards, as the columns.
         lean: how far the long axis leans forwards where the person stands as usual, rad.
     """
@@ -228,3 +235,154 @@ def without_root_lean(body: Body) -> Body:
     sigma = body.prior_sigma.copy()
     sigma[lean] = np.inf
     return replace(body, prior_sigma=sigma)
+
+
+FEET = ('left', 'right')
+# Pitch of the foot at which its heel and its toe are lowest, rad: 15 degrees.
+PITCH = np.radians(15.0)
+# Height of the ankle over the floor as a share of the stature, where a foot has no flesh [Winter,
+# Biomechanics and Motor Control of Human Movement, 4th ed. 2009, figure 4.1].
+ANKLE_HEIGHT = 0.039
+
+
+@dataclass(frozen=True, eq=False)
+class Soles:
+    """Points of the soles: heel and toe of the left foot, then of the right one.
+
+    Attributes:
+        segments: (P,) that carry them; empty for a body without feet.
+        local: (P, 3) in the frames of the segments, m.
+        feet: (P,) 0: left, 1: right.
+    """
+
+    segments: Index
+    local: Array
+    feet: NDArray[np.intp]
+
+    def __len__(self) -> int:
+        return len(self.segments)
+
+
+@lru_cache(maxsize=16)
+def soles(body: Body) -> Soles:
+    """The soles of a body; none where it lacks an ankle or a toe of either side."""
+    names = body.joint_names
+    wanted = [f'{side}_{joint}' for side in FEET for joint in ('ankle', 'toe')]
+    if not set(wanted) <= set(names):
+        nothing = np.zeros(0, dtype=np.intp)
+        return Soles(nothing, np.zeros((0, 3)), nothing)
+    joints = body.skeleton.joint_index(tuple(wanted)).reshape(2, 2)
+    segments, local = [], []
+    for ankle, toe in joints:
+        carrier = int(body.skeleton.joint_segments[toe])
+        down, ahead = _down_and_ahead(body, ankle, toe, carrier)
+        points = body.flesh.points_on(carrier)
+        if not len(points):
+            own = body.skeleton.joint_offsets[toe]
+            heel = own - ahead * float(ahead @ own)
+            points = np.array([heel, own]) + ANKLE_HEIGHT * body.stature * down
+        for sign in (-1.0, 1.0):
+            lowest = points @ (np.cos(PITCH) * down + sign * np.sin(PITCH) * ahead)
+            # The middle of the points that are lowest alike: left and right of the middle line.
+            local.append(points[lowest > lowest.max() - 1e-6].mean(0))
+            segments.append(carrier)
+    feet = np.array([0, 0, 1, 1], dtype=np.intp)
+    return Soles(np.array(segments, dtype=np.intp), np.array(local), feet)
+
+
+def sole_points(body: Body, poses: Array) -> Array:
+    """Points (N, P, 3) of the soles of poses (N, d), camera frame, m."""
+    feet = soles(body)
+    points = forward(body.skeleton, poses).points(feet.segments, feet.local)
+    return np.ascontiguousarray(points.transpose(2, 0, 1))
+
+
+def sole_jacobians(body: Body, poses: Array) -> Array:
+    """Derivatives (N, P, 3, d) of the points of the soles with respect to the poses (N, d)."""
+    feet, frames = soles(body), forward(body.skeleton, poses)
+    found = point_jacobians(frames, feet.segments, frames.points(feet.segments, feet.local))
+    return np.ascontiguousarray(found.transpose(3, 0, 2, 1))
+
+
+def _down_and_ahead(body: Body, ankle: int, toe: int, carrier: int) -> tuple[Array, Array]:
+    """Unit vectors towards the sole and the toe, in the frame of the foot.
+
+    Towards the sole is where the shin points when all angles are 0, across the foot.
+    """
+    skeleton = body.skeleton
+    frames = forward(skeleton, np.zeros((1, body.dimension)))
+    joints, axes = frames.joints()[..., 0], frames.columns[carrier, ..., 0]
+    parent = skeleton.parents[carrier]
+    ahead = axes @ (joints[toe] - joints[ankle])
+    ahead /= np.linalg.norm(ahead)
+    shin = axes @ (joints[ankle] - frames.origins[parent, :, 0])
+    down = shin - ahead * float(ahead @ shin)
+    return down / np.linalg.norm(down), ahead
+
+
+# By segment without its side: share of the mass, share of the way from its start to its end.
+SHARES = {
+    'pelvis': (0.142, 0.0),
+    'trunk': (0.355, 0.37),
+    'head': (0.081, 1.0),
+    'upper_arm': (0.028, 0.436),
+    'forearm': (0.016, 0.430),
+    'hand': (0.006, 0.506),
+    'thigh': (0.100, 0.433),
+    'shin': (0.0465, 0.433),
+    'foot': (0.0145, 0.5),
+}
+# Least share of the mass that the segments of a body must have.
+LEAST_SHARE = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Masses:
+    """Point masses of the segments.
+
+    Attributes:
+        shares: (S,) of the mass of the body, with the sum 1; all 0 where they are not known.
+        centres: (S, 3) in the frames of the segments, m.
+    """
+
+    shares: Array
+    centres: Array
+
+    @property
+    def known(self) -> bool:
+        """Whether the masses are known."""
+        return bool(self.shares.any())
+
+    def centre_of_mass(self, frames: Frames) -> Array:
+        """Centres of mass (3, N) of poses, camera frame, m."""
+        every = np.arange(len(self.shares))
+        result: Array = np.einsum('s,sin->in', self.shares, frames.points(every, self.centres))
+        return result
+
+
+@lru_cache(maxsize=16)
+def masses(body: Body) -> Masses:
+    """The masses of a body whose segments have the names of `SHARES`; else none are known."""
+    skeleton = body.skeleton
+    count = len(skeleton.parents)
+    shares, centres = np.zeros(count), np.zeros((count, 3))
+    for s, name in enumerate(skeleton.segment_names):
+        bare = name.split('_', 1)[1] if other_side(name) != name else name
+        if bare not in SHARES:
+            continue
+        shares[s], way = SHARES[bare]
+        centres[s] = way * _end(body, s)
+    if shares.sum() < LEAST_SHARE:
+        return Masses(np.zeros(count), centres)
+    return Masses(shares / shares.sum(), centres)
+
+
+def _end(body: Body, segment: int) -> Array:
+    """Where a segment ends (3,): its farthest joint, or where the next segment starts, m."""
+    skeleton = body.skeleton
+    ends = [np.zeros(3), *skeleton.joint_offsets[skeleton.joint_segments == segment]]
+    children = [s for s, parent in enumerate(skeleton.parents) if parent == segment]
+    # Of several segments that start here, the middle: both shoulders, or the neck between them.
+    if children:
+        ends.append(np.mean([skeleton.offsets[s] for s in children], axis=0))
+    return np.asarray(max(ends, key=lambda end: float(end @ end)), dtype=np.float64)

@@ -39,16 +39,12 @@ def solve_joint_positions(
         1/2 sum |joint - target|^2 / sigma^2 + prior_weight / 2 sum ((x - mean) / prior sigma)^2.
 
     Args:
-        body: the body.
         poses: (N, d) starts.
         targets: (N, J', 3) camera frame, m; NaN for a joint without a target.
         joint_names: (J',) names of the joints of the targets; None selects all joints.
         sigma: standard deviation of the targets, scalar, (J',) or (N, J'), m.
-        prior_weight: weight of the body's soft prior.
         free_dofs: names of the degrees of freedom that may change; None selects all.
         along_rays: whether only the distance of a joint from the ray of its target counts.
-        max_iterations: maximum number of iterations.
-        tolerance: decrease of the energy below which the iteration ends.
     """
     skeleton = body.skeleton
     names = skeleton.joint_names if joint_names is None else tuple(joint_names)

@@ -4,6 +4,10 @@ A body is its own mirror image, left for right. Mirrored in the plane through th
 line of sight it has, apart from perspective, the same silhouette: a person who approaches looks
 like one who walks away. The joint angles of that pose are those of the mirrored body, so that they
 lie within the limits, too.
+
+Angles without limits are the same after a whole turn. A person who turns about passes the angle at
+which it is cut, and of two estimates of one heading one may be a turn ahead. Whoever compares poses
+by their variables has to take turns out first.
 """
 
 from __future__ import annotations
@@ -140,3 +144,30 @@ def faces_back(body: Body, poses: Array, reference: Array) -> Mask:
     away = np.linalg.det(np.stack([left, up, _units(pelvis)], axis=1))
     apart = (away[1:] * away[0] < 0) & (np.abs(away[1:] - away[0]) > 2 * SIDEWAYS)
     return np.asarray((left[1:] @ left[0] < 0) | apart, dtype=np.bool_)
+
+
+TURN = 2.0 * np.pi
+
+
+def endless(body: Body) -> Mask:
+    """The variables (d,) that are angles and go round: their limits are a turn apart, or more."""
+    return np.asarray(body.skeleton.dof_is_rotation & (body.upper - body.lower >= TURN))
+
+
+def free_limits(body: Body) -> tuple[Array, Array]:
+    """Limits (d,) of poses in any frame: the place and the turns of the root have none."""
+    free = endless(body)
+    free[:3] = True
+    return np.where(free, -np.inf, body.lower), np.where(free, np.inf, body.upper)
+
+
+def without_turns(body: Body, poses: Array, before: Array) -> Array:
+    """Poses (K, d) whose angles are within half a turn of the nearest pose before (L, d).
+
+    The nearest one is that whose joints, relative to the first, are nearest in the mean: joints do
+    not change with whole turns.
+    """
+    joints, known = (body.relative_joints(x) for x in (poses, before))
+    nearest = np.linalg.norm(joints[:, None] - known, axis=3).mean(2).argmin(1)
+    turns = np.round((before[nearest] - poses) / TURN)
+    return np.asarray(poses + TURN * np.where(endless(body), turns, 0.0))

@@ -25,7 +25,6 @@ class FrameTerm(Protocol):
         """The energy of N poses.
 
         Args:
-            frames: of the poses.
             rows: (N,) the problem that each pose belongs to, as for `EnergyTerm`.
             derivatives: by the pose, which are wanted.
         """

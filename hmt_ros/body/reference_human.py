@@ -297,9 +297,7 @@ def _joints(
     """The joints of the model, at the lengths that positions in the frame of the body have.
 
     Args:
-        at: positions of joints.
         ahead: how far the shoulders lie before the neck, by side, m.
-        additions: see `fit_reference_human`.
     """
 
     def length(first: str, last: str) -> float:

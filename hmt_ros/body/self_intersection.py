@@ -6,7 +6,6 @@ that connects the axes where they are nearest; the overlap is penalised quadrati
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -88,60 +87,6 @@ def overlaps_of(body: Body, sigma: float) -> Overlaps:
         _axes_of(body), first.astype(np.int64), second.astype(np.int64), skeleton.dof_is_rotation,
         skeleton.moves, float(sigma),
     )  # fmt: skip
-
-
-def deepest_overlaps(
-    body: Body,
-    columns: Array,
-    origins: Array,
-    rows: Index,
-    segments: Collection[int],
-    other_rows: Index,
-    other_segments: Collection[int],
-) -> Array:
-    """Largest overlap of parts on some segments of one pose with parts on others of another pose.
-
-    So limbs on the same trunk are compared without a pose for each of their combinations.
-
-    Args:
-        body: the body; parts that are neighbours along the skeleton are left out.
-        columns, origins: (N, S, 3, 3), (N, S, 3) of N poses, as `Frames.by_pose` gives them.
-        rows, other_rows: (M,) indices of the poses that are compared.
-        segments, other_segments: segments of the first and of the second pose.
-
-    Returns:
-        (M,) the largest overlap of two parts, m; at least 0.
-    """
-    first, second = _pairs(body)
-    carrier = np.array([p.segment for p in body.flesh.parts], dtype=np.intp)
-    one, two = np.isin(carrier, list(segments)), np.isin(carrier, list(other_segments))
-    straight, turned = one[first] & two[second], one[second] & two[first]
-    # A pair whose parts are on both sides either way is looked at both ways, if poses differ.
-    pairs = np.concatenate(
-        [
-            np.stack([first, second], axis=1)[straight],
-            np.stack([second, first], axis=1)[turned],
-        ]
-    )
-    result = np.zeros(len(rows))
-    _deepest(_axes_of(body), pairs, columns, origins, rows, other_rows, result)
-    return result
-
-
-@njit(cache=True, nogil=True)
-def _deepest(parts, pairs, columns, origins, rows, other_rows, result):  # type: ignore[no-untyped-def]
-    """Fills the largest overlaps of all pairs of parts."""
-    centres = np.empty((len(columns), len(parts.segments), 3))
-    for n in range(len(columns)):
-        _place_centres(parts, columns[n], origins[n], centres[n])
-    for m in range(len(rows)):
-        a, b = rows[m], other_rows[m]
-        for pair in range(len(pairs)):
-            i, j = pairs[pair, 0], pairs[pair, 1]
-            if _far(parts, i, j, centres[a], centres[b], 0.0):
-                continue
-            found = _overlap(parts, i, j, columns[a], centres[a], columns[b], centres[b])
-            result[m] = max(result[m], found[9])
 
 
 @lru_cache(maxsize=16)

@@ -27,7 +27,6 @@ class Skeleton:
     """A kinematic tree with S segments, d degrees of freedom, J joints and L lengths.
 
     Attributes:
-        name: name of the body, e.g. 'human34'.
         segment_names, parents: (S,) name and index of the parent (-1: the camera frame); parents
             come before their children.
         mounts: (S, 3, 3) rotation from the segment's frame at rest to its parent's frame.

@@ -53,7 +53,6 @@ def origin_joints(names: Sequence[str], source: str = 'truth') -> tuple[str, ...
 
     Args:
         names: of the joints whose true positions are known.
-        source: of the truth, for the message of the error.
 
     Raises:
         ValueError: neither is known.
@@ -74,7 +73,6 @@ def relative_positions(
     Args:
         positions: (..., J', 3) of all joints.
         names: (J',) of all joints.
-        joints: names of the J joints.
         origin: joints whose mean position is the origin.
 
     Raises:
@@ -139,7 +137,6 @@ def joint_mixtures(
     """Mixtures over joint positions relative to the origin, by linearisation.
 
     Args:
-        body: the body of the poses.
         mixtures: (T,) over poses (d,).
         names: (J,) of the joints.
         model_sigma: standard deviation of a coordinate that is added, m.
@@ -283,8 +280,6 @@ def marginal_regions(
     Args:
         mixtures: (T,) of the same joints.
         truth: (T, J, 3) true positions from the same origin, m.
-        seed: of the samples, or their generator.
-        samples: number of samples per frame.
 
     Returns:
         Levels (T, J) of the true positions, see `score`; volumes (T, J) of the regions of 90 %,
@@ -319,8 +314,6 @@ def score(
         mixtures: (T,) of the same joints, relative to the origin.
         truth: (T, J, 3) true positions relative to the true origin, m.
         names: (J,) of the joints.
-        seed: of the samples from which levels are estimated, or their generator.
-        samples: number of samples per frame.
 
     Raises:
         ValueError: no frames, or shapes that do not fit.

@@ -133,10 +133,7 @@ class TrackScorer:
     """Collects the estimates of a track and scores them in batches.
 
     Args:
-        name: name of the track, for messages.
-        truth: true joint positions.
         model_sigma: standard deviation of a coordinate that is added to those published, m.
-        seed: of the samples from which coverage is estimated.
 
     Attributes:
         kind: kind of the mixtures, to be set by the reader of the track.
@@ -208,13 +205,9 @@ class TrackScorer:
             )
         missing = len(self.truth.joints) - len(self._seen)
         return TrackScores(
-            self.kind,
-            Scores.concatenate(self._parts),
-            missing,
-            self._without_truth,
-            self._note,
+            self.kind, Scores.concatenate(self._parts), missing, self._without_truth, self._note,
             ground_scores(self._heaviest, self._names, self.truth.ground),
-        )
+        )  # fmt: skip
 
     def _keep_heaviest(self, estimate: Estimate) -> None:
         """Joint positions of the heaviest mode, for the scores of its feet."""
@@ -296,7 +289,6 @@ def mode_errors(
     Args:
         joints: stamp in ns -> (K, J, 3) of the modes, m.
         names: (J,) of the joints.
-        truth: true joint positions.
 
     Returns:
         Nothing where modes and truth share no evaluated joints, or no origin.

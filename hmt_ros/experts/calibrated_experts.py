@@ -75,11 +75,7 @@ class CalibratedExperts(ConditionalDensity):
     """A model whose gates and covariances are calibrated on motions left out.
 
     Args:
-        model: Model that learns.
         folds: Number of parts of the motions; each part is left out once.
-
-    Attributes:
-        calibration_: Calibration learned from the motions left out.
     """
 
     kind = 'calibrated_experts'
@@ -101,9 +97,6 @@ class CalibratedExperts(ConditionalDensity):
         """Learns from inputs (N, p) and targets (N, D).
 
         Args:
-            inputs: (N, p).
-            targets: (N, D).
-            sample_weight: (N,) or None.
             groups: (N,) number of the group of each sample, such as its motion. Neighbouring
                 numbers are left out together. None takes the order of the samples.
 

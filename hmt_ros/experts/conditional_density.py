@@ -81,7 +81,6 @@ class ConditionalDensity(ABC):
     unchanged, learned attributes end in an underscore, `get_params` and `set_params` exist.
 
     Attributes:
-        kind: Name of the model in files.
         kinds: All models by their names in files.
     """
 
@@ -251,10 +250,6 @@ class ConditionalDensity(ABC):
 
 def stored_model(arrays: Mapping[str, NDArray[Any]], where: str) -> ConditionalDensity:
     """The model that `ConditionalDensity.to_arrays` stored, of the kind that the arrays name.
-
-    Args:
-        arrays: Arrays of the model.
-        where: Name of the file, for messages.
 
     Raises:
         KeyError: no kind is named.

@@ -60,7 +60,6 @@ def e_step(features: TrainingPairs, state: EMState) -> Array:
 
     Args:
         features: Features phi of the samples with standardised targets.
-        state: State after an M-step.
     """
     log = state.gates.log_scores(state.gate_features)
     for i, one in enumerate(state.experts):
@@ -98,9 +97,6 @@ def climb(
 
     Args:
         features: Features phi of the samples with standardised targets.
-        state: State after an M-step.
-        learn: M-step of an expert.
-        iterations: Maximum number of iterations.
         tolerance: Gain of an iteration below which the iterations end, nats per sample.
 
     Returns:

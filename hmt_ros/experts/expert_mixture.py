@@ -61,11 +61,9 @@ class ExpertMixture(ConditionalDensity):
     Args:
         n_experts: Number of experts M at the start; experts without samples are pruned.
         basis: Basis functions of experts and gates: 'linear' or 'rbf' (Gaussian kernels).
-        seed: Seed of the starts.
         width: Width of the kernels, in scaled inputs; None chooses among candidates.
         max_kernels: Maximum number of candidate kernels, spread over the training inputs.
         n_starts: Number of starts of the iterations, for each width.
-        max_iterations: Maximum number of EM iterations.
         tolerance: Gain of an iteration below which EM ends, nats per sample.
         scaling: Scaling of inputs before distances are taken; see `Standardisation.of`.
         learning: 'bayesian', or 'maximum_likelihood' without priors (linear experts only).
@@ -124,8 +122,6 @@ class ExpertMixture(ConditionalDensity):
         """Learns from inputs (N, p) and targets (N, D).
 
         Args:
-            inputs: (N, p).
-            targets: (N, D).
             sample_weight: (N,) not negative; a sample of weight 2 counts like two equal samples.
             responsibilities: (N, M) to start from, instead of several starts.
 

@@ -21,7 +21,7 @@ from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import mirror
 from hmt_ros.body.skeleton import other_side
-from hmt_ros.experts.keypoint_windows import (
+from hmt_ros.experts.lifter import (
     FEWEST,
     INSTEAD,
     LANDMARKS,
@@ -115,7 +115,7 @@ class KeypointTracks:
         joints: (F, J, 3) of a person of the usual lengths from the middle of the hips, m.
         roots: (F, 3) of the person, m.
         starts, counts: (M,) first frame and number of frames of each track.
-        persons: (M, P) proportions (`keypoint_windows.proportions`).
+        persons: (M, P) proportions (`lifter.proportions`).
         weights: (M,) share of the windows that are drawn from a track; they sum to 1.
     """
 
@@ -140,10 +140,8 @@ def keypoint_tracks(
 
     Args:
         body: with the usual lengths.
-        sequences: motions.
         shares: of each motion among the windows, beside the square root of its length.
         variants: number of tracks of each motion; the first is the motion itself.
-        seed: of all random choices.
 
     Raises:
         ValueError: no motion is long enough.
@@ -244,10 +242,6 @@ def training_windows(
     """Random windows and the poses in them.
 
     Args:
-        tracks: of motions.
-        count: number of windows, N.
-        rng: source of randomness.
-        settings: what windows are drawn from; None: the defaults.
         scheme: row of `SCHEMES`; None: all of them.
 
     Returns:
@@ -358,7 +352,6 @@ def with_errors(
             image.
         distance: (N,) of the person, m.
         times: (N, S) of the images, s; the same order in all windows.
-        rng: source of randomness.
         amount: factor on the deviations.
     """
     e = detector_errors()

@@ -21,8 +21,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.body.pose_prior import LEARNED, pose_prior
-from hmt_ros.experts.keypoint_windows import landmark_offsets
-from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_rays
+from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_offsets, landmark_rays
 from hmt_ros.image.keypoint_schemes import AUTO, noise_of
 from hmt_ros.image.lifted_poses import HIPS, WHOLE, LiftedPoses
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -66,11 +65,9 @@ def lift_poses(
     """Mixtures over poses from the keypoints of a sequence, without any image.
 
     Args:
-        lifter: see `load_lifter`.
         body: of the person, with the lengths as far as they are known.
         camera: that saw the keypoints, and stood still.
         stamps: (T,) times of the images, increasing, s.
-        keypoints: T sets of keypoints of one person.
         ups: (T, 3) unit vectors against gravity, camera frame; None: unknown.
         lengths_known: whether the lengths of the body are those of the person.
         causal: whether images after each do not count.
@@ -109,7 +106,7 @@ def poses_of(
     Args:
         body: of the person, with lengths as far as they are known.
         lifted: N mixtures with the same joints and the same number of components.
-        rays: (N, L, 2) of the landmarks (`keypoint_windows.LANDMARKS`) at that time, x/z and y/z.
+        rays: (N, L, 2) of the landmarks (`LANDMARKS`) at that time, x/z and y/z.
         confidences: (N, L) of these; 0: not seen.
         size_spread: relative standard deviation of the person's size.
 
@@ -224,9 +221,7 @@ class KeypointPredictor:
     """Predicts mixtures over the poses of one person, as images come; see `lift_poses`.
 
     Args:
-        lifter: see `load_lifter`.
         body: of the person, with the lengths as far as they are known.
-        camera: that sees the keypoints.
         size_known: whether the body is as large as the person.
 
     Attributes:

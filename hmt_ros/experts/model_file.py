@@ -36,7 +36,6 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
     """The arrays that identify an archive.
 
     Args:
-        kind: Kind of model.
         parameters: Constructor's parameters; JSON must be able to hold them.
     """
     return {
@@ -49,11 +48,6 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
 
 def check_header(arrays: Mapping[str, NDArray[Any]], kind: str | None, where: str) -> None:
     """Checks the arrays of `header`.
-
-    Args:
-        arrays: Arrays of an archive.
-        kind: Kind that is wanted; None accepts any.
-        where: Name of the file, for messages.
 
     Raises:
         ValueError: the format, the version or the kind is another one.
@@ -91,7 +85,6 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
 
     Args:
         path: File to write; '.npz' is appended where it is missing.
-        arrays: Arrays with those of `header`.
 
     Returns:
         The path written.

@@ -130,8 +130,6 @@ class NearestNeighbours(_NeighbourModel):
         scaling: Scaling of inputs before distances are taken; see `Standardisation.of`.
 
     Attributes:
-        inputs_, targets_, sample_weight_: (N, p), (N, D), (N,) of the training set.
-        noise_: (D, D) O.
         spacing_: Root mean squared distance of a training input to its K neighbours, scaled.
     """
 
@@ -200,12 +198,8 @@ class LocalExperts(_NeighbourModel):
         n_experts: Maximum number of modes M of an input.
         n_neighbours: Number of neighbours K, less than the number of samples.
         width_neighbour: The kernel is as wide as the distance of this neighbour.
-        scaling: Scaling of inputs before distances are taken; see `Standardisation.of`.
-        seed: Seed for the choice of the samples that are left out.
 
     Attributes:
-        inputs_, targets_, sample_weight_: (N, p), (N, D), (N,) of the training set.
-        noise_: (D, D) O.
         spacing_: Root mean squared distance of a training input to its nearest one, scaled.
     """
 

@@ -20,8 +20,13 @@ from numpy.typing import ArrayLike, NDArray
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.model_file import Arrays
-from hmt_ros.experts.network_layers import Layers
-from hmt_ros.experts.network_learning import Descent, first_layers, layer_outputs, learned_network
+from hmt_ros.experts.network_learning import (
+    Descent,
+    Layers,
+    first_layers,
+    layer_outputs,
+    learned_network,
+)
 from hmt_ros.experts.training_pairs import Standardisation, checked_pairs
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import k_means, squared_distances
@@ -41,13 +46,8 @@ class NetworkExperts(ConditionalDensity):
     """Experts that share the layers of one network.
 
     Args:
-        n_experts: Number of experts M.
         units, layers: Width of the layers, and number of those that add to the first.
-        steps: Number of steps of learning.
-        batch: Samples a step.
-        rate: Of Adam, at its highest.
         jitter: Standard deviation of the noise on inputs while learning, in theirs.
-        seed: Of all random choices.
 
     Attributes:
         noise_: (M, D, D) O.

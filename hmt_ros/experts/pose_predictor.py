@@ -91,8 +91,6 @@ class PosePredictor:
     """Predicts mixtures over the poses of a body from silhouettes.
 
     Args:
-        body: Body of the poses.
-        descriptor: Descriptor that has learned.
         model: Model of p(z | descriptor) that has learned.
         target_basis: (D, D) B; models learn z = B' x of a target x.
         equilibrium: p(x) of targets: a mixture of one component.
@@ -168,7 +166,6 @@ class PosePredictor:
 
         Args:
             mask: (H, W), not zero in the foreground.
-            camera: Camera of the mask.
             previous: Mixture over poses before, which is propagated; None: the image counts alone.
             interval: s, since then.
             propagation: one of `PROPAGATIONS`.
@@ -225,7 +222,6 @@ class PosePredictor:
 
         Args:
             descriptor: (p,).
-            previous, interval, propagation, max_components: see `observe`.
 
         Raises:
             ValueError: the propagation is another one, or its model is missing.
@@ -318,7 +314,6 @@ class PosePredictor:
         """Reads a predictor that `save` wrote.
 
         Args:
-            path: File to read.
             body: Body of the person, with the degrees of freedom that the predictor has learned.
                 None takes the shipped body of that name, with the lengths in the file.
 

@@ -62,7 +62,6 @@ class ModelKind:
     Attributes:
         make: Makes the model from a number of experts, a seed and, if known, the number of samples.
             The baselines take the first as the number of neighbours, or ignore it.
-        experts: Default number of experts M.
         components: Number of components of the descriptor that the model sees.
         dynamics_experts: Number of experts of p(x_t | x_t-1, r_t); None takes M.
         few: Whether each expert needs many samples, so that few samples have few experts.
@@ -124,10 +123,7 @@ def new_model(
     """A calibrated model before learning.
 
     Args:
-        name: Name in `KINDS`.
         experts: Number of experts M; None takes the default. Few samples have fewer.
-        seed: Seed of the model.
-        samples: Number of samples that it will learn from.
 
     Raises:
         ValueError: there is no such model.
@@ -146,7 +142,6 @@ class Described:
     """Descriptors and targets of a training set.
 
     Attributes:
-        descriptor: Descriptor that has learned from the silhouettes.
         descriptors: (N, p).
         targets, previous: (N, D) encoded poses, and those one step before.
         motions: (N,) number of the motion of each sample.
@@ -180,9 +175,6 @@ def described(
     """Descriptors and targets of a training set.
 
     Args:
-        body: Body of the poses.
-        pairs: Silhouettes and poses.
-        descriptor: Descriptor that learns; None takes the default.
         progress: Iterates over the silhouettes, given their number.
     """
     descriptor = descriptor or SilhouetteDescriptor()
@@ -211,12 +203,8 @@ def learned_predictor(
     """A predictor that has learned from a training set.
 
     Args:
-        body: Body of the poses.
-        training: Descriptors and targets.
         model: Model that learns p(z | descriptor).
         dynamics: Model that learns p(z | previous z, descriptor), or None.
-        notes: Notes for the file.
-        seed: Seed of the noise of previous states.
 
     Raises:
         ValueError: there are too few samples, or some are not finite.
@@ -285,7 +273,6 @@ def multimodality(inputs: Array, targets: Array, clusters: int, seed: int = 0) -
     Args:
         inputs, targets: (N, p) and (N, D); they are clustered independently.
         clusters: Number of clusters of inputs, and of targets.
-        seed: Seed of the clustering.
 
     Returns:
         (H,) number of clusters of inputs under which 1, 2, ... H clusters of targets fall.

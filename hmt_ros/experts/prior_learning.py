@@ -105,13 +105,7 @@ def mirrored_log_densities(mixture: GaussianMixture, angles: Array, images: Arra
 
 
 def seeds_of(samples: MirroredSamples, count: int, rng: np.random.Generator) -> Array:
-    """Samples (K, n) that are far from each other, drawn as k-means++ does.
-
-    Args:
-        samples: to draw from.
-        count: K.
-        rng: source of randomness.
-    """
+    """Samples (K, n) that are far from each other, drawn as k-means++ does."""
     scale = np.sqrt(np.maximum(np.diagonal(samples.scatter()[1]), 1e-12))
     chosen: list[Array] = []
     nearest = np.ones(len(samples.angles))
@@ -136,10 +130,7 @@ def fitted_mixture(
     """The mixture that EM reaches.
 
     Args:
-        samples: N samples.
         start: component 0, which stays as it is, then K components; weights sum to 1.
-        prior: of the covariances.
-        iterations: maximum number.
         tolerance: gain of an iteration at which the iterations end, nats per sample.
 
     Returns:
@@ -182,7 +173,6 @@ class PriorSettings:
         folds: Number of groups of people of which one at a time is left out.
         novelty: Mean distance of the joints from the last pose kept, below which a pose of a motion
             is dropped, m.
-        most_poses: Maximum number of poses of a motion.
         shrinkage: Number of poses for which the covariance of all poses counts in that of a
             component.
         compactness: Factor on that covariance.
@@ -283,14 +273,7 @@ class PriorData:
 def prior_data(
     body: Body, sequences: Sequence[PoseSequence], people: Sequence[str], settings: PriorSettings
 ) -> PriorData:
-    """What is kept of motions.
-
-    Args:
-        body: of the poses.
-        sequences: motions.
-        people: the person of each.
-        settings: of the learning.
-    """
+    """What is kept of motions."""
     kept = []
     for sequence in sequences:
         frames = novel_frames(body, sequence.poses, settings.novelty)
@@ -331,10 +314,8 @@ def learned_prior(
     """Learns a prior.
 
     Args:
-        data: the poses.
         dofs: (n,) angles that it covers.
         card: what the data are, text by heading.
-        settings: of the learning.
         progress: iterates over the numbers of components, given how many.
 
     Raises:

@@ -77,9 +77,6 @@ def place_roots(
     """Roots of the postures that were predicted from a silhouette.
 
     Args:
-        encoding: Encoding of the body, which has flesh.
-        camera: Camera of the silhouette.
-        place: Person in the image.
         targets: (M, D) predicted.
         covariances: (M, D, D) of the prediction.
         size_spread: Relative standard deviation of the person's size; 0 if the body has the lengths
@@ -141,9 +138,7 @@ def placed_gaussians(
     The root moves with the posture so that the box stays that of the silhouette.
 
     Args:
-        encoding: Encoding of the body.
         targets, covariances: (M, D), (M, D, D) of the postures.
-        placement: Placement of these postures.
     """
     by_target, by_root = placement.jacobians
     whole = by_target + by_root @ placement.by_targets

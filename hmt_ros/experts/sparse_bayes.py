@@ -163,8 +163,6 @@ def maximise_evidence(
     """Maximises the evidence from a start, or from no functions.
 
     Args:
-        sums: Sums over the samples.
-        prior: Prior of the noise.
         start: Earlier result, perhaps for other weights of the samples.
         steps: Number of greedy steps between two estimates of the noise.
         rounds: Maximum number of estimates of the noise.

@@ -92,10 +92,7 @@ def checked_pairs(
     """The pairs as arrays, without samples of weight zero.
 
     Args:
-        inputs: (N, p).
-        targets: (N, D).
         sample_weight: (N,) not negative, or None for ones.
-        at_least: Minimum number of samples.
         what: Reason for that minimum, for the message.
 
     Raises:

@@ -215,9 +215,6 @@ def training_set(
 
     Args:
         body: Body of the poses, with flesh.
-        sequences: Motions.
-        settings: Settings; None takes the defaults.
-        progress: Iterates over groups of silhouettes, given their number.
         shares: Share of the poses of each motion that are taken; None: all.
         mark: Takes what has been rendered, and gives it where a rendering was broken off.
 
@@ -395,14 +392,11 @@ def seen_from(
 
     Args:
         body: Body of the sequence's poses, with flesh.
-        sequence: Motion.
         heading: Mean heading of the person: 0 looks at the camera, 90 to the right of the image,
             180 away from the camera, degrees.
         elevation: Angle by which the camera looks down, degrees.
-        frames: Frames of the motion.
         distance: Distance of the camera, m.
         boundary_noise: Standard deviation of the outline, px of a person 200 px tall.
-        seed: Seed of that noise.
 
     Returns:
         Poses (n, d) with the middle of the joints on the optical axis, and silhouettes

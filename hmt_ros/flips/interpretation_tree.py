@@ -8,13 +8,19 @@ All choices of sign along a chain are the leaves of its interpretation tree; a b
 the product of the trees of its chains. Every leaf has the image and the segment lengths of the
 given pose, which is itself the first leaf. Branches whose ray misses the sphere, that put a joint
 behind the camera, or that no joint angles within the limits reach, are pruned.
+
+`distinct_poses` compares poses by their joint positions, not by their angles: a rotation has two
+triples of Euler angles, Rx(a) Ry(b) Rz(c) = Rx(a + pi) Ry(pi - b) Rz(c + pi), every angle has its
+turns of 2 pi, and the twist of a straight limb moves nothing that is seen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
@@ -58,49 +64,6 @@ def enumerate_flips(
     result = q[parents]
     for chain, (angles, _), choice in zip(links, trees, choices, strict=True):
         result[:, chain.dofs] = angles[parents, choice]
-    return result, parents
-
-
-def rehang_chain(
-    body: Body,
-    poses: ArrayLike,
-    new_poses: ArrayLike,
-    chain: str,
-    *,
-    image_of: str | None = None,
-    slack: float = 0.1,
-) -> tuple[Array, Index]:
-    """Poses whose chain hangs on another trunk and still has the image that it had.
-
-    When a trunk turns or flips, its limbs start elsewhere. Their joints are put back onto the rays
-    through their images, in all ways that lengths and limits allow. `image_of` puts them onto the
-    image of another chain instead, such as a left leg onto that of the right leg.
-
-    Args:
-        body: the body.
-        poses: (N, d) that have the image.
-        new_poses: (N, d) with the other trunk.
-        chain: name of the chain.
-        image_of: name of the chain whose image is taken; None selects the chain itself.
-        slack: a ray that misses its sphere by less than this touches it, m.
-
-    Returns:
-        poses (M, d), equal to the new ones outside the chain, and the index (M,) of each.
-
-    Raises:
-        KeyError, ValueError: as `enumerate_flips`.
-    """
-    skeleton = body.skeleton
-    links = chain_links(skeleton, chain)
-    new = np.array(new_poses, dtype=np.float64, ndmin=2, order='C')
-    seen = forward(skeleton, np.array(poses, dtype=np.float64, ndmin=2))
-    ends = links if image_of is None else chain_links(skeleton, image_of)
-    if len(ends.lengths) != len(links.lengths):
-        raise ValueError(f'chains {chain} and {image_of} differ in their number of segments')
-    angles, valid = _grown(forward(skeleton, new), new, links, _ends(seen, ends), slack)
-    parents, choice = np.nonzero(valid)
-    result = new[parents]
-    result[:, links.dofs] = angles[parents, choice]
     return result, parents
 
 
@@ -148,3 +111,64 @@ def _grown(
         valid,
     )  # fmt: skip
     return angles, valid
+
+
+class Distinct(NamedTuple):
+    """Poses that represent all of a set.
+
+    Attributes:
+        kept: (K,) indices, in the order of the poses.
+        owner: (N,) position in `kept` of the representative of each pose; -1 where the maximum
+            number was reached before.
+    """
+
+    kept: Index
+    owner: Index
+
+
+def distinct_poses(joints: ArrayLike, apart: float, most: int | None = None) -> Distinct:
+    """Poses that differ from every earlier one.
+
+    The distance of two poses is that of the joint that is furthest apart. A pose that is nearer
+    than `apart` to one that is kept is represented by the nearest of these. So the first, best
+    poses represent later ones.
+
+    Args:
+        joints: (N, J, 3) joint positions of the poses, m.
+        apart: distance from which on two poses are distinct, m.
+        most: maximum number of poses that are kept; None keeps all that are distinct.
+
+    Raises:
+        ValueError: joints of another shape.
+    """
+    points = np.ascontiguousarray(joints, dtype=np.float64)
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise ValueError(f'joints must have shape (N, J, 3), saw {points.shape}')
+    flat = points.reshape(len(points), 3 * points.shape[1])
+    return Distinct(*keep_distinct(flat, float(apart), len(flat) if most is None else int(most)))
+
+
+@njit(cache=True, nogil=True)
+def keep_distinct(points, apart, most):  # type: ignore[no-untyped-def]
+    """Indices of the poses (N, 3 J) that are kept, and which stands for each."""
+    n = len(points)
+    kept, owner = np.empty(n, np.int64), np.full(n, -1)
+    count = 0
+    for i in range(n):
+        least = apart * apart
+        for place in range(count):
+            k = kept[place]
+            gap = 0.0
+            for j in range(0, points.shape[1], 3):
+                x = points[k, j] - points[i, j]
+                y = points[k, j + 1] - points[i, j + 1]
+                z = points[k, j + 2] - points[i, j + 2]
+                gap = max(gap, x * x + y * y + z * z)
+                if gap >= least:
+                    break
+            if gap < least:
+                owner[i], least = place, gap
+        if owner[i] < 0 and count < most:
+            kept[count], owner[i] = i, count
+            count += 1
+    return kept[:count], owner

@@ -81,7 +81,6 @@ class LimbProducts:
             found: further angles (F, chain dofs) of some chains.
             price: of a configuration that is not a mode's own, nats.
             apart: configurations are distinct when some joint is as far apart, m.
-            most: number of configurations of a limb.
         """
         limbs, skeleton = limbs_of(body.skeleton), body.skeleton
         modes = np.ascontiguousarray(modes, dtype=np.float64)
@@ -142,10 +141,8 @@ class LimbProducts:
 
         Args:
             energies: (R,) of the poses `alone`.
-            log_weights: (G,) of the modes.
             exchange, flip: prices of limbs that change places, and of a flipped torso, nats.
             share: of the energy that counts.
-            count: of products on each trunk, at most.
         """
         found = self.configurations
         prices = np.full(len(found.trunks), flip)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.kinematics import place_pose, place_segment
 from hmt_ros.body.skeleton import Skeleton, sided_pairs
-from hmt_ros.flips.best_combinations import keep_distinct
+from hmt_ros.flips.interpretation_tree import keep_distinct
 from hmt_ros.flips.tree_growth import ChainLinks, chain_links, grow_leaves
 from hmt_ros.inference.arrays import Array
 
@@ -411,7 +411,7 @@ def _among(pick, taken):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _least_sums(costs, sizes, sums, picks, last_sums, last_picks, heads):  # type: ignore[no-untyped-def]
-    """The choices of one entry a list with the least sums, as `best_combinations.least_sums`.
+    """The choices of one entry a list with the least sums, the least first.
 
     List by list: each entry of a list stands before all sums so far, which are in order, and the
     least of the heads goes on. Equal sums stand in the order of the lists.

@@ -3,8 +3,7 @@
 The line of the hips may turn towards or away from the camera, the neck may lie before or behind the
 start of the trunk, and the line of the shoulders may turn either way: three binary choices, with
 nearly the same image. The torso is not a chain of links that each end in one joint, so its flips
-change the image of hips, neck and shoulders a little; `rehang_chain` then puts the limbs back onto
-their rays.
+change the image of hips, neck and shoulders a little; the limbs are then put back onto their rays.
 """
 
 from __future__ import annotations

@@ -5,6 +5,14 @@ is absent or moves. OpenCV's mixture (MOG2) or nearest-neighbour (KNN) model doe
 work, on images made smaller to about `LINES` lines: what they cost does not depend on the camera,
 and the outline that comes back is smooth to a fraction of their pixels. A background that turns out
 to be useless is rebuilt from the pixels of images where the person is not.
+
+`SceneWatch` tells whether the camera still sees the scene from where the background was taken:
+
+    r(s) = normalised cross-correlation of |grad background| with |grad image|, shifted by s
+
+on images that are `WIDTH` px wide, for shifts of up to `REACH`. The maximum is at s = 0 as long as
+the camera has not moved, whoever walks in front of it, and whatever the light does: edges stay
+where they are. It is elsewhere after a bump; after a larger one nothing fits.
 """
 
 from __future__ import annotations
@@ -16,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.inference.arrays import Image, Mask
+from hmt_ros.inference.arrays import Array, Image, Mask
 
 Box = tuple[int, int, int, int]
 
@@ -183,7 +191,6 @@ class BackgroundModel:
         """Foreground of an image, as for `silhouette`, and what may be person or shadow.
 
         Args:
-            image, region: as for `silhouette`.
             others: (H, W) pixels that somebody else covers; None: none.
         """
         raw = self._subtracted(image)
@@ -335,13 +342,7 @@ class _Parts:
 
 
 def one_person(mask: Mask, settings: BackgroundSettings, region: Box | None = None) -> Mask:
-    """The largest piece of a mask (H, W) and what is large and near enough to belong to it.
-
-    Args:
-        mask: of all that is no background.
-        settings: what is large and near.
-        region: where the person can be, as for `BackgroundModel.silhouette`.
-    """
+    """The largest piece of a mask (H, W) and what is large and near enough to belong to it."""
     result = np.zeros(mask.shape, dtype=np.bool_)
     part, found = mask[_part(region)], result[_part(region)]
     if part.size == 0:
@@ -375,3 +376,68 @@ def _part(region: Box | None) -> tuple[slice, slice]:
     """Rows and columns of a region; None: all."""
     left, top, right, bottom = region or (0, 0, None, None)
     return slice(top, bottom), slice(left, right)
+
+
+WIDTH, REACH = 320, 24
+# Gradients count no more than this; Gaussian before the derivative, px.
+STRONGEST, SMOOTHING = 200.0, 1.0
+# One image in so many is looked at, and so many in a row must agree.
+EVERY, IN_A_ROW = 10, 2
+# Least correlation that says something, and by how much it exceeds that of no shift.
+LEAST, MARGIN = 0.3, 0.05
+# Below this fraction of the first correlation without a shift the scene is another.
+LEFT = 0.4
+
+
+class SceneWatch:
+    """Watches the scene of a camera that is to stand still.
+
+    Attributes:
+        moved: whether the camera has moved since the background was taken.
+        shift: how far the scene lies from where the background has it, px; NaN: farther than can
+            be told.
+    """
+
+    def __init__(self) -> None:
+        self.moved = False
+        self.shift = 0.0
+        self._count = self._signs = 0
+        self._seen: tuple[BackgroundModel | None, int] = None, 0
+        self._edges: Array | None = None
+        self._usual = 0.0
+
+    def look(self, image: Image, background: BackgroundModel) -> None:
+        """Takes the next image (H, W, 3), before a background that is known."""
+        self._count += 1
+        if self._count % EVERY != 1 or background.unknown is not None:
+            return
+        if self._seen != (background, background.frames):
+            self._seen = background, background.frames
+            self._edges, self._usual, self._signs = _edges(background.empty), 0.0, 0
+        assert self._edges is not None
+        shift, best, here = _correlation(self._edges, _edges(image))
+        self._usual = self._usual or here
+        elsewhere = best >= LEAST and best - here >= MARGIN
+        another = self._usual >= LEAST and here < LEFT * self._usual
+        self._signs = self._signs + 1 if elsewhere or another else 0
+        self.moved = self._signs >= IN_A_ROW
+        self.shift = shift * image.shape[1] / WIDTH if elsewhere else np.nan if another else 0.0
+
+
+def _edges(image: Image) -> Array:
+    """Lengths (h, w) of the gradients of an image (H, W, 3), at `WIDTH`."""
+    height = max(round(image.shape[0] * WIDTH / image.shape[1]), 2 * REACH + 8)
+    small = cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), SMOOTHING)
+    lengths = np.hypot(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1))
+    strongest: Array = np.minimum(lengths.max(axis=2), STRONGEST)
+    return strongest
+
+
+def _correlation(background: Array, image: Array) -> tuple[float, float, float]:
+    """The shift with the best correlation, px; that correlation; and that of no shift."""
+    inner = background[REACH:-REACH, REACH:-REACH]
+    found = np.nan_to_num(cv2.matchTemplate(image, inner, cv2.TM_CCOEFF_NORMED))
+    row, column = np.unravel_index(int(found.argmax()), found.shape)
+    shift = float(np.hypot(row - REACH, column - REACH))
+    return shift, float(found[row, column]), float(found[REACH, REACH])

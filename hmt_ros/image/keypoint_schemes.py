@@ -97,7 +97,6 @@ def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
     """The scheme of keypoints; None: their names are those of joints.
 
     Args:
-        names: of the keypoints.
         scheme: name of a scheme, 'joints', or 'auto': see `recognised`.
 
     Raises:
@@ -130,9 +129,7 @@ def landmarks_of(
     """What the names of keypoints mean; None: a joint of the body, or nothing that is known.
 
     Args:
-        names: of the keypoints.
         joints: of the body; outside schemes a name of one of them means this joint.
-        scheme: see `scheme_of`.
 
     Raises:
         ValueError: there is no such scheme.

@@ -130,12 +130,7 @@ class ImageLikelihood:
         observation: Observation,
         exchanges: Array | None = None,
     ) -> Posed:
-        """-log p(image | pose) - log prior(pose), of one observation.
-
-        Args:
-            observation: of the image.
-            exchanges: of sides, of each problem; see `KeypointTerm`.
-        """
+        """-log p(image | pose) - log prior(pose), of one observation."""
         seen = self.seen(observation, exchanges=exchanges)
         terms = (*seen, *self.priors)
         return Posed(self.body.skeleton, terms)
@@ -163,7 +158,6 @@ class ImageLikelihood:
         """The term of the keypoints of an observation that has some.
 
         Args:
-            observation: of the image.
             exchanges: of sides, see `KeypointTerm`; None: as usual for detectors.
             share: of the energy that counts, beside what is known of the exchanges.
             lifted_share: the same of the energy of lifted poses.
@@ -202,8 +196,6 @@ class ImageLikelihood:
         """The image terms, one by one, at the frames of N poses.
 
         Args:
-            frames: of the poses.
-            observation: of the image.
             explained: (N, M) or (1, M) what each sample of the outline costs at most, because
                 something else explains it.
             derivatives: whether gradient and Hessian are wanted.

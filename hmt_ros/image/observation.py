@@ -95,7 +95,6 @@ def observe(
     Args:
         image: (H, W, 3) BGR uint8.
         silhouette: (H, W) foreground; None or empty: the silhouette is not used.
-        keypoints: joints seen in the image.
         window: (left, top, right, bottom) where the person is expected, for images without a
             silhouette; the whole image when None.
         last_image: the image before, of the same size, that the optical flow starts from; None:
@@ -105,7 +104,6 @@ def observe(
         others: (H, W) pixels that somebody else covers; None: none.
         depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and what is out
             of range says nothing.
-        threads: that take it; 0: one a core, see `together`.
 
     Raises:
         ValueError: shapes that contradict each other.

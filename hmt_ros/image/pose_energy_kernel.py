@@ -17,8 +17,13 @@ from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, add_keypoints
 from hmt_ros.image.terms.registry import Model, look, new_view, run_terms
 from hmt_ros.image.terms.residuals import assemble_pose
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.bounded_newton import DAMPING_LIMIT, LEAST_FACTOR, box_step
-from hmt_ros.inference.trust_region import LEAST_RATIO, Status
+from hmt_ros.inference.bounded_newton import (
+    DAMPING_LIMIT,
+    LEAST_FACTOR,
+    LEAST_RATIO,
+    Status,
+    box_step,
+)
 
 # As compiled code writes them.
 _CONVERGED, _LIMIT, _STALLED, _NOT_FINITE = (

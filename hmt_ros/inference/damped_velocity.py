@@ -42,7 +42,6 @@ class DampedVelocity(LinearGaussianDynamics):
             damping: (d,) G, share of the velocity lost per second.
             diffusion: (d, d) D, covariance that the velocity gains per second.
             white: (d,) W, variance that the pose gains per second besides.
-            step: interval between observations without stamps, s.
 
         Raises:
             ValueError: shapes that do not fit, damping or white noise that is not positive, or a

@@ -60,10 +60,8 @@ class EnergyTerm(Protocol):
         """The energy at points x (n, d).
 
         Args:
-            x: (n, d).
             rows: (n,) the problem that each point belongs to: a term that differs from problem to
                 problem (another centre, texture or time) looks up its own data there.
-            derivatives: which are wanted.
         """
         ...
 

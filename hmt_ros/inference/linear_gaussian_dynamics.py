@@ -135,7 +135,6 @@ class LinearGaussianDynamics:
         Args:
             rates: (d,) variances, or (d, d) covariance, that the pose gains per second.
             initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
-            step: interval between observations without stamps, s.
         """
         diffusion = _matrix(rates)
         d = len(diffusion)
@@ -158,7 +157,6 @@ class LinearGaussianDynamics:
             rates: (d,) variances, or (d, d) covariance, that the velocity gains per second.
             velocity_sigma: (d,) or scalar, standard deviation of the first velocity, per second.
             initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
-            step: interval between observations without stamps, s.
         """
         white = _matrix(rates)
         d = len(white)
@@ -261,7 +259,6 @@ class LinearGaussianDynamics:
 
         Args:
             means, covariances: (K, d) and (K, d, d) of the poses.
-            interval: s.
         """
         d = self.dimension
         first = np.broadcast_to(self.initial_mean[d:], (len(means), self.state_dimension - d))

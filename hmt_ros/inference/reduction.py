@@ -35,7 +35,6 @@ def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
     """The mixture whose components have the moments of what they stand for.
 
     Args:
-        mixture: K components.
         share: (K, B) share of each component that goes to each of B new ones; a new one that gets
             nothing is left out.
     """
@@ -68,7 +67,6 @@ def merged_if_close(mixture: GaussianMixture, distance: float) -> GaussianMixtur
     """The mixture with components merged, the closest first, until none are closer than a distance.
 
     Args:
-        mixture: any.
         distance: between means, in standard deviations of the average of two covariances.
     """
     return _merged_pairs(mixture, _squared_distances, lambda _, cost: cost < distance**2)
@@ -112,7 +110,6 @@ def led(weights: Array, points: Array, least: float, count: int) -> tuple[Array,
     Args:
         weights: (N,).
         points: (N, P, 3) of which one has to be apart, m.
-        least, count: as for `leaders`.
     """
 
     def distances(i: int) -> Array:
@@ -177,7 +174,7 @@ def _squared_distances(w: Array, m: Array, s: Array, log_det: Array, pairs: Inde
 
 
 def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> GaussianMixture:
-    """At most `count` components: clusters of means, then descent of `divergence_bound`.
+    """At most `count` components: clusters of means, then descent of the bound of `assignment`.
 
     Where pairwise merging opens with a lower bound than the clusters, it is what descends.
 
@@ -194,11 +191,11 @@ def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> Gauss
         return large
     starts = clustered(large, count), merged_pairwise(large, count)
     bound, share, small = min(
-        ((*_assignment(large, start), start) for start in starts), key=lambda one: one[0]
+        ((*assignment(large, start), start) for start in starts), key=lambda one: one[0]
     )
     for _ in range(iterations):
         better = merged(large, share)
-        new_bound, share = _assignment(large, better)
+        new_bound, share = assignment(large, better)
         if bound - new_bound < 1e-4:
             break
         bound, small = new_bound, better
@@ -228,22 +225,13 @@ def clustered(mixture: GaussianMixture, count: int, iterations: int = 20) -> Gau
     return merged(mixture, share)
 
 
-def divergence_bound(large: GaussianMixture, small: GaussianMixture) -> float:
-    """sum_a w_a min_b KL(large_a || small_b) >= KL(large || small), nats.
+def assignment(large: GaussianMixture, small: GaussianMixture) -> tuple[float, Array]:
+    """A bound on the divergence, nats, and which large component goes to which small one.
 
-    It bounds the divergence where the weight of each small component is the sum of the weights that
-    it stands for, as `refined` leaves them [Goldberger & Roweis, NIPS 2004].
+    sum_a w_a min_b KL(large_a || small_b) >= KL(large || small) where the weight of each small
+    component is the sum of those that it stands for, as `merged` leaves them [Goldberger & Roweis,
+    NIPS 2004]; the shares (A, B) are 0 or 1.
     """
-    return _assignment(large, small)[0]
-
-
-def refined(large: GaussianMixture, small: GaussianMixture) -> GaussianMixture:
-    """One descent of `divergence_bound`: components to the closest, then their moments."""
-    return merged(large, _assignment(large, small)[1])
-
-
-def _assignment(large: GaussianMixture, small: GaussianMixture) -> tuple[float, Array]:
-    """The bound, and which large component goes to which small one, (A, B) of 0 and 1."""
     divergences = gaussian_divergences(large, small)
     share = np.zeros_like(divergences)
     share[np.arange(len(large)), np.argmin(divergences, axis=1)] = 1.0

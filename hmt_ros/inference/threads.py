@@ -30,7 +30,6 @@ def in_threads(
 
     Args:
         work: on the poses from one number up to another.
-        count: number of poses.
         least: number of poses that are worth a thread.
         threads: their number at most; 0: one a core, up to `MOST_THREADS`, but one core, where a
             camera, a smoother and whoever listens run.
@@ -51,7 +50,6 @@ def together(calls: Sequence[Callable[[], Any]], threads: int = 0) -> list[Any]:
 
     Args:
         calls: none of which calls this or `in_threads`.
-        threads: as for `in_threads`.
     """
     results: list[Any] = [None] * len(calls)
 

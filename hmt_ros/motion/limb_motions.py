@@ -65,12 +65,10 @@ def reaching_posture(
     """Random posture with the wrists inside bounds, reached without self-intersection.
 
     Args:
-        body: the body.
         before: previous posture, from which all angles move by minimum jerk; or None.
         bend: angles of other parts of the body in the posture.
         bounds: (2, 3) lowest and highest position of the wrists from the shoulders, in lengths of
             an arm; x outwards.
-        rng: random number generator.
 
     Raises:
         ValueError: no posture was found.
@@ -148,7 +146,6 @@ def standing_foot(
     """Ankle and toe (T, 3) of a foot.
 
     Args:
-        body: the body.
         place: (T, 2) position of the ankle over the floor, m.
         up: height of the ankle above that with a flat foot, m.
         pitch: pitch of the foot, positive with the toe up, rad.
@@ -171,7 +168,6 @@ def walking_foot(
     turns about the toe.
 
     Args:
-        body: the body.
         phase: (T,) increasing phases of the stride.
         path: function from phases to the position (..., 2) and heading of the body.
         aside: distance of the foot to the right of the path, m.

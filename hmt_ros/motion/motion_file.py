@@ -116,7 +116,6 @@ def read_motion(
     """Motion of a .bvh or .amc file.
 
     Args:
-        path: path of the file.
         skeleton: ASF of an AMC; None selects the .asf of the same name beside the file.
         unit_to_m: metres per unit of length. None selects that of the ASF; for a BVH the first of
             metres, centimetres, millimetres, inches and CMU's 5.6444 cm that makes the skeleton a

@@ -89,11 +89,9 @@ def procedural_motion(
     """Poses (T, d) of a motion, T = duration * fps, in the camera optical frame of a viewpoint.
 
     Args:
-        name: one of `PROCEDURAL_MOTIONS`.
         body: body with flesh and the degrees of freedom of human32; those of a spine move, too.
         duration: duration, s.
         fps: poses per second. The motion as a function of time does not depend on it.
-        seed: seed of the random numbers.
         heading: direction in which the person looks or walks at first, rad: 0 is towards the
             camera, positive to the person's left. None selects one that suits the motion.
         viewpoint: place of the camera; the person moves around the origin of its world.

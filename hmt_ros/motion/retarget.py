@@ -112,7 +112,6 @@ def retarget(
     """Poses of a body that follow a motion, (T, d) in the camera optical frame.
 
     Args:
-        motion: motion with the standard joint names.
         body: body with the limbs of KJS fig. 3, such as those that ship, and the lengths of the
             person (see `body_from_motion`).
         camera_from_world: rotation (3, 3) and translation (3,) m that take a point of the motion's

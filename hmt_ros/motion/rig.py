@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.length_prior import length_covariance
-from hmt_ros.body.model_file import joint_errors_of, load_body
+from hmt_ros.body.model_file import joint_errors_of, length_covariance, load_body
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.bounded_file import read_bytes

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Camera
-from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.scene_watch import SceneWatch
+from hmt_ros.image.background import BackgroundModel, SceneWatch
 from hmt_ros.inference.arrays import Image, Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters

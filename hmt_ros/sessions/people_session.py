@@ -23,8 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hmt_ros.body import Camera
-from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.scene_watch import SceneWatch
+from hmt_ros.image.background import BackgroundModel, SceneWatch
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_session import IMAGE, WaitingImage

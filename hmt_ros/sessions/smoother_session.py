@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
-from hmt_ros.body.whole_turns import free_limits, without_turns
+from hmt_ros.body.mirror import free_limits, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.handled import Fault, Output

@@ -15,15 +15,14 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockCholesky
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
+from hmt_ros.smoothing.embedded_network import Paths
 from hmt_ros.smoothing.likelihood import LikelihoodPart, SequenceLikelihood, check_mixtures
 from hmt_ros.smoothing.mode_sequence import (
     ModeSequence,
     path_gaussians,
 )
-from hmt_ros.smoothing.path_hypotheses import FilteredPaths
-from hmt_ros.smoothing.paths import Paths
+from hmt_ros.smoothing.path_hypotheses import FilteredPaths, SmoothedPath, smoothed_paths
 from hmt_ros.smoothing.resting_points import RestingPoints
-from hmt_ros.smoothing.smoothed_paths import SmoothedPath, smoothed_paths
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states, refine
 from hmt_ros.smoothing.variational_mixture import (
@@ -119,7 +118,6 @@ class MixtureSmoother:
 
         Args:
             mixtures: T likelihoods over the pose; weights need not sum to 1.
-            seed: of all randomness.
             stamps_ns: (T,) times, increasing; None: one `dynamics.step` apart.
             observation: what stands for the likelihood in refinement and free energy, the images
                 themselves for example; the mixtures then give the starts. None: the mixtures.
@@ -413,7 +411,6 @@ def with_refined_parts(
     Args:
         starts: (M, T, n); the first one is an optimum.
         shared: (M, T) whether they are as the first one.
-        prior, likelihood, lower, upper: as for `refine`.
     """
     times = starts.shape[1]
     parts: dict[tuple[int, int], list[int]] = {}

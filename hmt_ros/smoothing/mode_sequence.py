@@ -31,16 +31,17 @@ from hmt_ros.inference.block_tridiagonal import (
 )
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.inference.reduction import merged_if_close
-from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
-from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
-from hmt_ros.smoothing.path_hypotheses import FilteredPaths
-from hmt_ros.smoothing.paths import (
+from hmt_ros.smoothing.embedded_network import (
+    EmbeddedNetwork,
     Paths,
     distinct_paths,
     diverse_subset,
+    embedded_network,
     k_best_paths,
     paths_through_nodes,
 )
+from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
+from hmt_ros.smoothing.path_hypotheses import FilteredPaths
 
 # Candidates for each path that is chosen.
 CANDIDATES = 4

@@ -5,27 +5,35 @@ A path that goes on to mode k of the next image has the state and the weight
     N(x; A m, A S A' + Q) N(C x; mu_k, S_k) w_k        m, S: its state before
 
 where C takes the pose out of the state. So weights are those of the components of the posterior.
-The network of VMS 4 weighs a path by pairs of neighbours (`paths`), and a pair knows nothing of
-what was before it: where most modes are wide, a path may turn round and back. In every image few
-paths are kept of all: some that are apart, and the heaviest.
+The network of VMS 4 weighs a path by pairs of neighbours (`embedded_network`), and a pair knows
+nothing of what was before it: where most modes are wide, a path may turn round and back. In every
+image few paths are kept of all: some that are apart, and the heaviest.
 
-What a path was before, given all of it, follows backwards from its states (`smoothed_paths`).
+What a path was before, given all of it, follows backwards from its states (`smoothed_paths`):
+
+    x_t = m_t + G_t (x_{t+1} - A m_t),          G_t = S_t A' P_{t+1}^-1,  P_{t+1} = A S_t A' + Q
+    C_t = S_t + G_t (C_{t+1} - P_{t+1}) G_t'    [Rauch, Tung and Striebel 1965]
+
+Paths that part at a time have the same states and gains before it, which are held once. A mean
+costs a product of a matrix and a vector; covariances are made of the paths that are asked for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
 from hmt_ros.inference.gaussian_pairs import pair_log_densities
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.reduction import leaders
-from hmt_ros.smoothing.paths import Paths
+from hmt_ros.smoothing.embedded_network import Paths
 
 # Motions are one as long as no point of theirs is farther apart than this, m: half the length of a
 # forearm, which a flip turns over.
@@ -129,7 +137,6 @@ class PathHypotheses:
 
         Args:
             mixture: the likelihood of the next pose, K modes of positive weight.
-            dynamics: of the state.
             interval: to the next pose, s.
             count: paths at most. Half of them were apart before, a quarter are apart now, if there
                 are so many; the others are the heaviest.
@@ -176,8 +183,6 @@ class FilteredPaths:
     """The paths through the modes of images that come one after the other.
 
     Args:
-        dynamics: of the state.
-        count: of paths at most.
         points: maps poses (N, d) to points (N, P, 3), m: some paths are apart, see
             `PathHypotheses.followed`; None: they are the heaviest.
         first: states (H, n) that they begin in; None: the first mixture begins them.
@@ -274,7 +279,6 @@ def distances_of_paths(nodes: Index, gaps: Sequence[Array | None]) -> Array | No
     """Largest distances (H, H) at any time of paths with nodes (H, T).
 
     Args:
-        nodes: of the paths.
         gaps: T arrays (K_t, K_t) of distances of the nodes of each time; None: unknown.
     """
     result = np.zeros((len(nodes), len(nodes)))
@@ -316,3 +320,110 @@ def first_state(mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> G
             mixture.means, mixture.covariances, dynamics.initial_mean[None, :d], spread[None], pairs
         )
     return GaussianMixture(np.exp(log - logsumexp(log)), means, covariances)
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedPath:
+    """A Gaussian Markov process by what each state is, given the next one.
+
+        x_T ~ N(m_T, S_T),    x_t | x_{t+1} ~ N(m_t + G_t (x_{t+1} - A m_t), D_t)
+        D_t = (1 - G_t A) S_t (1 - G_t A)' + G_t Q G_t' = R_t R_t'
+
+    White noise is R_t^-1 (x_t - G_t x_{t+1}). The methods are those of `BlockCholesky`.
+
+    Attributes:
+        filtered: T covariances S_t (n, n).
+        passages: T-1; of the path before each the row in it.
+    """
+
+    filtered: tuple[Array, ...]
+    passages: tuple[tuple[Passage, int], ...]
+
+    @property
+    def times(self) -> int:
+        """T."""
+        return len(self.filtered)
+
+    @property
+    def size(self) -> int:
+        """n."""
+        return len(self.filtered[0])
+
+    @cached_property
+    def gains(self) -> tuple[Array, ...]:
+        """T-1 matrices G_t (n, n)."""
+        return tuple(passage.gains[row] for passage, row in self.passages)
+
+    @cached_property
+    def roots(self) -> Array:
+        """(T, n, n) R_t, lower triangular; the last is that of S_T."""
+        left = np.empty((self.times, self.size, self.size))
+        left[-1] = self.filtered[-1]
+        for t, (gain, (passage, _)) in enumerate(zip(self.gains, self.passages, strict=True)):
+            kept = np.eye(self.size) - gain @ passage.transition
+            left[t] = kept @ self.filtered[t] @ kept.T + gain @ passage.noise @ gain.T
+        return np.asarray(np.linalg.cholesky(0.5 * (left + left.swapaxes(1, 2))))
+
+    @cached_property
+    def log_determinant(self) -> float:
+        """log |P| of the precision P."""
+        return float(-2.0 * np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum())
+
+    def solve_transposed(self, right: Array) -> Array:
+        """White noise (..., T, n) becomes noise of covariance P^-1."""
+        result = np.array((self.roots @ right[..., None])[..., 0])
+        for t in range(self.times - 2, -1, -1):
+            result[..., t, :] += result[..., t + 1, :] @ self.gains[t].T
+        return result
+
+    def whiten(self, x: Array) -> Array:
+        """The white noise of trajectories x (..., T, n): x' P x is its square."""
+        apart = np.array(x)
+        for t, gain in enumerate(self.gains):
+            apart[..., t, :] -= x[..., t + 1, :] @ gain.T
+        return np.asarray(np.linalg.solve(self.roots, apart[..., None])[..., 0])
+
+    def inverse_blocks(self) -> tuple[Array, Array]:
+        """Blocks of P^-1: (T, n, n) on the diagonal and (T-1, n, n) below it."""
+        covariances = np.array(self.filtered)
+        neighbours = np.empty_like(covariances[1:])
+        for t in range(self.times - 2, -1, -1):
+            (passage, row), gain = self.passages[t], self.gains[t]
+            np.matmul(covariances[t + 1], gain.T, out=neighbours[t])
+            change = gain @ (neighbours[t] - passage.covariances[row] @ gain.T)
+            covariances[t] += 0.5 * (change + change.T)
+        return covariances, neighbours
+
+    def matrix(self) -> BlockTridiagonal:
+        """P."""
+        inverse = np.linalg.inv(self.roots)
+        diagonal = inverse.swapaxes(1, 2) @ inverse
+        gains = np.array(self.gains).reshape(-1, self.size, self.size)
+        lower = -gains.swapaxes(1, 2) @ diagonal[:-1]
+        diagonal[1:] -= lower @ gains
+        return BlockTridiagonal(diagonal, lower)
+
+
+def smoothed_paths(steps: Sequence[PathHypotheses]) -> tuple[Array, tuple[SmoothedPath, ...]]:
+    """States (H, T, n) of the H paths of the last of T steps, and their covariances."""
+    at = np.arange(len(steps[-1]))
+    rows = [at]
+    states = np.empty((len(at), len(steps), steps[-1].states.dimension))
+    states[:, -1] = steps[-1].states.means
+    for t in range(len(steps) - 2, -1, -1):
+        step, passage = steps[t], steps[t + 1].passage
+        assert passage is not None
+        at = steps[t + 1].parents[at]
+        moved = states[:, t + 1] - passage.means[at]
+        for row in np.unique(at):
+            mine = at == row
+            states[mine, t] = step.states.means[row] + moved[mine] @ passage.gains[row].T
+        rows.append(at)
+    passages = [step.passage for step in steps[1:] if step.passage is not None]
+    return states, tuple(
+        SmoothedPath(
+            tuple(step.states.covariances[row] for step, row in zip(steps, own, strict=True)),
+            tuple(zip(passages, own[:-1], strict=True)),
+        )
+        for own in np.stack(rows[::-1], axis=1).tolist()
+    )

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmt_ros.body import Body
-from hmt_ros.body.soles import sole_jacobians, sole_points, soles
+from hmt_ros.body.ground_terms import sole_jacobians, sole_points, soles
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
@@ -91,7 +91,6 @@ class RestingPoints:
         Args:
             prior: of the states, whose first d variables are the pose.
             poses: (T, d) along which is decided what rests, and points are linear.
-            covariances, intervals: as for `probabilities`.
         """
         count, d = poses.shape
         points, jacobians = self.points(poses), self.jacobians(poses)

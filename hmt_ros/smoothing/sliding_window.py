@@ -79,12 +79,9 @@ class SlidingWindow:
     observations in the same order give the same numbers.
 
     Args:
-        smoother: how a window is smoothed.
         fixed_lag: time by which a pose is older than the newest one at most when it is final, s:
             the next one, expected as long after the last as that after the one before, would make
             it older. 0 is filtering; infinite: nothing is final before the end.
-        seed: of all randomness.
-        first_identity: of the first trajectory.
         every: least time between two smoothings, s; poses that become final meanwhile wait for
             the next.
 
@@ -133,7 +130,6 @@ class SlidingWindow:
         """Takes the likelihood of the next pose.
 
         Args:
-            stamp_ns: its time, after that of the one before.
             mixture: its likelihood; weights need not sum to 1.
             lasting: factor on the covariances of the result, because errors last, see `counted`;
                 of the poses of a window the mean counts.

@@ -23,7 +23,7 @@ from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     BlockTridiagonal,
 )
-from hmt_ros.smoothing.smoothed_paths import SmoothedPath
+from hmt_ros.smoothing.path_hypotheses import SmoothedPath
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,6 @@ class TrajectoryMixture:
         """The density of the pose at index t, a component for each trajectory.
 
         Args:
-            t: index.
             which: trajectories whose components are wanted, which costs less; None: all.
         """
         chosen = np.arange(len(self)) if which is None else which

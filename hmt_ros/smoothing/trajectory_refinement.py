@@ -30,9 +30,9 @@ from hmt_ros.inference.block_tridiagonal import (
     add_diagonal,
     factorise_band,
 )
+from hmt_ros.inference.bounded_newton import Status, TrustRegion
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
-from hmt_ros.inference.trust_region import Status, TrustRegion
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 FIRST_DAMPING = 1e-4

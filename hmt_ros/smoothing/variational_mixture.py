@@ -112,12 +112,9 @@ def minimise_free_energy(
     Args:
         weights: (M,) proportions.
         states: (M, T, n) means.
-        factors: of the precisions.
-        prior, likelihood: what -log p(X, R) is made of.
         adapt: some of 'weights', 'means', 'inflation', 'covariances'.
         low, high: (n,) limits of the means.
         samples: per component, an even number.
-        seed: of the samples.
         max_iterations: of L-BFGS; 0 evaluates only.
         tolerance: ends when an iteration gains less, nats.
 

@@ -7,7 +7,7 @@
 
 A camera hardly tells a pose from its reversal in depth (`body.mirror`), and a wrong one does not
 come right by small steps. S = logit p are the log odds that the person faces the other way than the
-heaviest mode, Q the rate of the symmetry `reversal` (`body.symmetries`), e_k what an image says
+heaviest mode, Q the rate of the symmetry `reversal` (`body.body`), e_k what an image says
 against mode k. Nobody turns about from one image to the next: a hypothesis that faces the other way
 is another history of the track, and weighs what all images so far say of that history, whether a
 mode was kept of it or not. Seen from the side the two histories meet (1): t is the transition of

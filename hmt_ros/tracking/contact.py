@@ -18,8 +18,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.ground_terms import FloorPlane
-from hmt_ros.body.soles import FEET, sole_points
+from hmt_ros.body.ground_terms import FEET, FloorPlane, sole_points
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS, share_of_time
 from hmt_ros.tracking.camera_motion import CameraMotion

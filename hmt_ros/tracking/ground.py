@@ -16,11 +16,9 @@ from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
+from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm, masses, soles
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.mass import masses
 from hmt_ros.body.mirror import root_angles, root_rotation_dofs, root_rotations
-from hmt_ros.body.soles import soles
 from hmt_ros.image.vertical_lines import Vertical, seen_vertical
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.tracking.camera_motion import USUAL_DISTANCE, CameraMotion

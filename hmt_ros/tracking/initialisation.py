@@ -21,9 +21,8 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.ground_terms import without_root_lean
 from hmt_ros.body.kinematics import directed_derivatives, forward, joint_length_jacobians
-from hmt_ros.body.length_prior import held
-from hmt_ros.flips.best_combinations import distinct_poses
-from hmt_ros.flips.interpretation_tree import enumerate_flips
+from hmt_ros.body.model_file import held
+from hmt_ros.flips.interpretation_tree import distinct_poses, enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.pose_energy import PoseEnergy

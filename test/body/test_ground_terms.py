@@ -12,18 +12,19 @@ from hmt_ros.body import load_body
 from hmt_ros.body.ground_terms import (
     LEAN_TAILS,
     PELVIS_SIGMA,
+    SHARES,
     TRUNK_LEAN,
     TRUNK_SIGMA,
     FloorPlane,
     GroundSettings,
     GroundTerm,
+    masses,
     root_lean_dofs,
+    soles,
     without_root_lean,
 )
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.mass import SHARES, masses
 from hmt_ros.body.mirror import root_angles, root_rotations
-from hmt_ros.body.soles import soles
 from hmt_ros.inference.energy import Derivatives
 
 TERMS = ('upright', 'floor')

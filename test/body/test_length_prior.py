@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.length_prior import STATURE_SPREAD, held, length_covariance
+from hmt_ros.body.model_file import STATURE_SPREAD, held, length_covariance
 
 LENGTHS, PROPORTIONS = np.array([0.42, 0.41, 0.02]), np.array([0.04, 0.05, 0.8])
 

@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from scipy.special import expit, logit
 
 from hmt_ros.body import load_body
-from hmt_ros.body.symmetries import MAPS, Symmetry, symmetries_of
+from hmt_ros.body.body import MAPS, Symmetry, symmetries_of
 
 FACING = Symmetry(0.02)
 

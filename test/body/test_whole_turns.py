@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body import load_body
-from hmt_ros.body.whole_turns import TURN, endless, without_turns
+from hmt_ros.body.mirror import TURN, endless, without_turns
 
 BODY = load_body('human37')
 YAW = BODY.dof_names.index('root_z')

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hmt_ros.app.learn_lifter import LearningSettings, learn_lifter, lifter_scores
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_angles, root_rotations
@@ -18,26 +19,23 @@ from hmt_ros.experts.keypoint_training import (
     training_windows,
     with_errors,
 )
-from hmt_ros.experts.keypoint_windows import (
+from hmt_ros.experts.lifted_fit import lift_poses, poses_of
+from hmt_ros.experts.lifter import (
     LANDMARKS,
     PROPORTIONED,
     TIMES,
+    KeypointHistory,
+    Lifter,
+    Network,
     filled,
     landmark_offsets,
+    landmark_rays,
+    lifted_positions,
+    load_lifter,
     places_of,
     proportions,
     window_inputs,
 )
-from hmt_ros.experts.lifted_fit import lift_poses, poses_of
-from hmt_ros.experts.lifter import (
-    KeypointHistory,
-    Lifter,
-    Network,
-    landmark_rays,
-    lifted_positions,
-    load_lifter,
-)
-from hmt_ros.experts.lifter_learning import LearningSettings, learn_lifter, lifter_scores
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.keypoint_schemes import schemes

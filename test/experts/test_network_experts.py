@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.experts.network_experts import NetworkExperts
-from hmt_ros.experts.network_layers import Layers
-from hmt_ros.experts.network_learning import first_layers
+from hmt_ros.experts.network_learning import Layers, first_layers
 from hmt_ros.experts.training_pairs import Standardisation
 
 needs_jax = pytest.mark.skipif(

@@ -7,8 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
+from benchmarks.whole_body_flips import least_sums
 from hmt_ros.body import load_body
-from hmt_ros.flips.best_combinations import distinct_poses, least_sums
+from hmt_ros.flips.interpretation_tree import distinct_poses
 
 
 @pytest.mark.parametrize('count', [1, 5, 40, 1000])

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.whole_body_flips import full_body_flips
 from hmt_ros.body import Body, load_body
 from hmt_ros.flips.interpretation_tree import enumerate_flips
-from hmt_ros.flips.whole_body_flips import full_body_flips
 
 BODY = load_body('human34')
 NAMES = BODY.dof_names

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.whole_body_flips import rehang_chain
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.flips.interpretation_tree import enumerate_flips, flip_counts, rehang_chain
+from hmt_ros.flips.interpretation_tree import enumerate_flips, flip_counts
 
 CAMERA = Camera(500.0, 510.0, 320.0, 240.0, 640, 480)
 LIMBS = {

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.whole_body_flips import DepthOrder, deepest_overlaps, full_body_flips
 from hmt_ros.body import load_body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.self_intersection import deepest_overlaps
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.flips.torso_flips import JOINTS
-from hmt_ros.flips.whole_body_flips import DepthOrder, full_body_flips
 
 ALL = 10**6
 

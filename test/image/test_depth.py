@@ -23,8 +23,7 @@ from hmt_ros.image.terms.depth import (
     usable_depths,
 )
 from hmt_ros.image.terms.image_term import TermSettings
-from hmt_ros.rendering.depth_sensor import sensed_depth
-from hmt_ros.rendering.renderer import render
+from hmt_ros.rendering.renderer import render, sensed_depth
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 

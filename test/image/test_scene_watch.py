@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.scene_watch import SceneWatch
+from hmt_ros.image.background import BackgroundModel, SceneWatch
 
 SIZE = (640, 480)
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 
 from hmt_ros.inference import Minimum, Status, minimise
+from hmt_ros.inference.bounded_newton import TrustRegion
 from hmt_ros.inference.energy import EnergyFunction
-from hmt_ros.inference.trust_region import TrustRegion
 
 
 def minimum(objective, *arguments, **options) -> Minimum:

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hmt_ros.body import load_body
-from hmt_ros.motion.length_learning import (
+from hmt_ros.app.learn_lengths import (
     LengthSpread,
     held_out,
     learned_spread,
@@ -16,6 +15,7 @@ from hmt_ros.motion.length_learning import (
     relative_lengths,
     usual_spread,
 )
+from hmt_ros.body import load_body
 
 
 @pytest.fixture(scope='module')

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_ros.app.learn_motion import learned_motion, modelled_moments
 from hmt_ros.body.mirror import mirror
 from hmt_ros.inference.damped_velocity import DampedVelocity
-from hmt_ros.motion.motion_learning import learned_motion, modelled_moments
 
 RATE = 30.0
 

@@ -3,7 +3,7 @@ import pytest
 
 from hmt_ros.body import Camera
 from hmt_ros.body.camera import Viewpoint
-from hmt_ros.rendering.depth_sensor import DARK, FURTHEST, NEAREST, NOISE, sensed_depth
+from hmt_ros.rendering.renderer import DARK, FURTHEST, NEAREST, NOISE, sensed_depth
 from hmt_ros.rendering.scene import Scene
 
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)

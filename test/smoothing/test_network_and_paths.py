@@ -9,22 +9,27 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
+from benchmarks.clip_trajectories import visiting_probabilities
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing import LinearGaussianDynamics
-from hmt_ros.smoothing.embedded_network import embedded_network
+from hmt_ros.smoothing.embedded_network import (
+    diverse_subset,
+    embedded_network,
+    k_best_paths,
+    paths_through_nodes,
+)
 from hmt_ros.smoothing.likelihood import merged_modes, or_missed
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from hmt_ros.smoothing.mode_sequence import ModeSequence
-from hmt_ros.smoothing.paths import (
-    diverse_subset,
-    k_best_paths,
-    most_probable_paths,
-    paths_through_nodes,
-    visiting_probabilities,
-)
 
 INTERVALS = np.array([0.5, 1.0, 0.5, 1.0])
+
+
+def log_value(network, path):
+    """Sum of the log values along a path (T,)."""
+    links = [links[i, j] for links, i, j in zip(network.links, path[:-1], path[1:])]
+    return sum(nodes[k] for nodes, k in zip(network.nodes, path)) + sum(links)
 
 
 @pytest.fixture
@@ -35,7 +40,7 @@ def network(modes, walk):
 @pytest.fixture
 def every_path(network):
     paths = [np.array(p) for p in itertools.product(range(3), repeat=5)]
-    return paths, np.array([network.log_value(p) for p in paths])
+    return paths, np.array([log_value(network, p) for p in paths])
 
 
 @pytest.mark.parametrize('d', [1, 2, 5])
@@ -60,13 +65,13 @@ def test_values_in_closed_form(modes, d):
 
 def test_most_probable_paths_are_those_of_enumeration(network, every_path):
     paths, values = every_path
-    found = most_probable_paths(network)
+    found = k_best_paths(network, 1)
     assert len(found) == 9
     assert (np.diff(found.log_values) <= 0).all()
     for nodes, value in zip(found.nodes, found.log_values):
         same = [v for p, v in zip(paths, values) if (p[0], p[-1]) == (nodes[0], nodes[-1])]
         assert value == pytest.approx(max(same))
-        assert network.log_value(nodes) == pytest.approx(value)
+        assert log_value(network, nodes) == pytest.approx(value)
 
 
 def test_k_best_paths_are_those_of_enumeration(network, every_path):
@@ -113,7 +118,7 @@ def test_a_diverse_subset_differs_more_than_the_best_paths(network):
 def test_one_time_and_one_mode(walk):
     one = GaussianMixture([3.0], [[1.0, 2.0]], [np.eye(2)])
     network = embedded_network([one], walk, np.zeros(0))
-    assert most_probable_paths(network).nodes.tolist() == [[0]]
+    assert k_best_paths(network, 1).nodes.tolist() == [[0]]
 
 
 def test_merging_keeps_the_moments_and_leaves_no_close_pair(modes):
@@ -143,11 +148,11 @@ def test_a_first_state_is_a_layer_of_its_own(modes, walk):
 def test_paths_through_every_node_are_the_best_that_visit_it(modes, walk):
     network = embedded_network(modes(2.0, times=4), walk, np.ones(3))
     every = list(itertools.product(range(3), repeat=4))
-    values = np.array([network.log_value(np.array(path)) for path in every])
+    values = np.array([log_value(network, np.array(path)) for path in every])
     found = paths_through_nodes(network)
     assert len(np.unique(found.nodes, axis=0)) == len(found)
     np.testing.assert_allclose(
-        found.log_values, [network.log_value(path) for path in found.nodes], rtol=1e-12
+        found.log_values, [log_value(network, path) for path in found.nodes], rtol=1e-12
     )
     for t, k in itertools.product(range(4), range(3)):
         visiting = np.array([path[t] == k for path in every])

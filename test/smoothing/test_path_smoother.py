@@ -9,8 +9,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, SlidingWindow
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from hmt_ros.smoothing.mode_sequence import ModeSequence, path_gaussians
-from hmt_ros.smoothing.path_hypotheses import FilteredPaths
-from hmt_ros.smoothing.smoothed_paths import smoothed_paths
+from hmt_ros.smoothing.path_hypotheses import FilteredPaths, smoothed_paths
 
 
 def test_it_is_exact_where_all_paths_are_kept(modes, walk, exact):

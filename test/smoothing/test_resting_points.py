@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.soles import sole_jacobians, sole_points
+from hmt_ros.body.ground_terms import sole_jacobians, sole_points
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, resting_points
 from hmt_ros.smoothing.mixture_smoother import PathSmoother

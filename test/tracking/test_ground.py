@@ -9,9 +9,8 @@ import pytest
 
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
-from hmt_ros.body.ground_terms import GroundSettings
+from hmt_ros.body.ground_terms import GroundSettings, sole_points, soles
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.soles import sole_points, soles
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.error_model import ERRORS

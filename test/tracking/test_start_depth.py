@@ -12,8 +12,7 @@ from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.depth_sensor import sensed_depth
-from hmt_ros.rendering.renderer import render_frames
+from hmt_ros.rendering.renderer import render_frames, sensed_depth
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.beginning import Starts

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.soles import sole_points
+from hmt_ros.body.ground_terms import sole_points
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.tracking import KnownGround, Status, Subject, Tracker, TrackerSettings
 

@@ -18,8 +18,7 @@ import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Masks, Selection, open_source
-from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
-from hmt_ros.app.import_video.persons import Choice, Chooser
+from hmt_ros.app.import_video.keypoint_files import Choice, Chooser, FoundPersons, read_keypoints
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.body import Camera
@@ -104,7 +103,6 @@ class Imported:
     """What was written.
 
     Attributes:
-        images: number of images.
         with_keypoints: number of images in which keypoints were seen; None: none were given.
         with_masks: number of images with a mask; None: none were given.
         inside, outside: number of keypoints that lie in or near the frame, and farther out.
@@ -231,10 +229,6 @@ def _import(arguments: argparse.Namespace) -> int:
 
 def import_video(options: ImportOptions, tell: Tell) -> Imported:
     """Writes a video into a new bag, completely or not at all.
-
-    Args:
-        options: of the command.
-        tell: receives lines for the user.
 
     Raises:
         ValueError: bad input.
@@ -378,11 +372,7 @@ def _check_ends(
     masks: Masks | None,
     tell: Tell,
 ) -> None:
-    """Whether frames, keypoints and masks are equally many, as far as the frames were read.
-
-    Raises:
-        ValueError: keypoints or masks are those of other frames.
-    """
+    """Whether frames, keypoints and masks are equally many, as far as the frames were read."""
     if not source.ended:
         return
     count, claimed = source.count, source.claimed

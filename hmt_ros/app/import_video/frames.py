@@ -85,12 +85,10 @@ class FrameSource(ABC):
     """Frames of a file or a folder.
 
     Args:
-        path: of the source.
         names: of the files of its frames in their order; empty for a video file.
         first_number: number of the first frame for those who number frames.
 
     Attributes:
-        path, names: as given.
         claimed: number of frames that the source announces; 0: it does not tell.
         count: number of frames that were passed so far, wanted or not.
         ended: whether the last frame was passed.
@@ -143,9 +141,7 @@ def open_source(path: Path, fps: float | None, first_number: int = 0) -> FrameSo
     """Opens a video file or a folder of images.
 
     Args:
-        path: of the source.
         fps: frames per second; None: a video file has its own times.
-        first_number: number of the first frame for those who number frames.
 
     Raises:
         ValueError: it is not there, or has no frames.
@@ -163,9 +159,7 @@ class VideoFile(FrameSource):
     """A video file. Phones write how they were held: the frames are turned upright.
 
     Args:
-        path: of the file.
         fps: frames per second; None: the times in the file.
-        first_number: see `FrameSource`.
     """
 
     def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
@@ -232,9 +226,7 @@ class ImageFolder(FrameSource):
     """A folder of images, in the order of the numbers in their names.
 
     Args:
-        path: of the folder.
         fps: images per second; None: only their order is known.
-        first_number: see `FrameSource`.
     """
 
     def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
@@ -273,11 +265,7 @@ class ImageFolder(FrameSource):
 
 
 def _upright(content: bytes) -> tuple[Image, bytes | None]:
-    """The image in a file, upright, and the file if it is a JPEG that needs no turning.
-
-    Raises:
-        ValueError: the file does not hold an image.
-    """
+    """The image in a file, upright, and the file if it is a JPEG that needs no turning."""
     if content.startswith(b'\xff\xd8\xff'):
         as_stored = decode_picture(content, 'jpeg')
         if b'Exif\0' not in content[:_EXIF_WITHIN]:
@@ -311,10 +299,6 @@ class Masks:
 
     In a folder a mask belongs to the frame that its file name means (`FrameSource.number_of`); in a
     video, to the frame of the same number.
-
-    Args:
-        path: folder or video file.
-        source: whose frames they belong to.
 
     Raises:
         ValueError: there are none.

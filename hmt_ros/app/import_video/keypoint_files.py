@@ -1,12 +1,4 @@
-"""Files of 2D detectors: COCO, OpenPose, arrays as of MediaPipe, and tables.
-
-| file | content |
-|---|---|
-| `.json` | COCO: a list of results, or `images` and `annotations` |
-| folder | OpenPose: a JSON file for each frame |
-| `.npz` | `landmark_names (n,)`, `pixels (T, n, 2)`, `visibility (T, n)`, `world (T, n, 3)` |
-| `.csv` | a row for each frame, or for each keypoint |
-"""
+"""Files of 2D detectors, with the layouts that import-video --help tells, and whom to track."""
 
 from __future__ import annotations
 
@@ -16,21 +8,141 @@ import json
 import math
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hmt_ros.app.import_video.frames import Frame, FrameSource, natural_order
-from hmt_ros.app.import_video.persons import Person, person
 from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.array_file import read_archive
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.headers import SECOND_NS
+
+LARGEST, NEAREST, INDEX, TRACK = 'largest', 'nearest', 'index', 'id'
+# A person moves at most by this much of the diagonal of their box from frame to frame.
+_FASTEST = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """A person in a frame.
+
+    Attributes:
+        keypoints: under the detector's names; their covariances are not known (NaN).
+        track: what the detector calls the person in all frames; '' if it does not track.
+    """
+
+    keypoints: Keypoints
+    track: str = ''
+
+    @property
+    def box(self) -> Array:
+        """(2, 2) least and greatest column and row of the keypoints that were seen."""
+        seen = self.keypoints.pixels[self.keypoints.seen]
+        return np.stack([seen.min(0), seen.max(0)])
+
+    def distance(self, other: Person) -> float:
+        """Mean distance of the keypoints that both have, px; of the boxes if there is none."""
+        both = self.keypoints.seen & other.keypoints.seen
+        apart = self.keypoints.pixels[both] - other.keypoints.pixels[both]
+        if not both.any():
+            apart = (self.box.mean(0) - other.box.mean(0))[None]
+        return float(np.linalg.norm(apart, axis=1).mean())
+
+
+def person(
+    names: Sequence[str],
+    pixels: ArrayLike,
+    confidences: ArrayLike | None = None,
+    positions: ArrayLike | None = None,
+    track: str = '',
+) -> Person | None:
+    """A person as a detector reports one; None if it sees nothing of the person.
+
+    What lies at (0, 0) or at NaN, or has no confidence, was not seen. Confidences above 1, which
+    some detectors give, count as 1.
+
+    Args:
+        pixels: (n, 2) px.
+        confidences: (n,); None: 1.
+        positions: (n, 3) m; None: the detector does not lift.
+    """
+    n = len(names)
+    places = np.array(pixels, dtype=np.float64)
+    sure = np.ones(n) if confidences is None else np.array(confidences, dtype=np.float64)
+    sure = np.clip(np.nan_to_num(sure, nan=0.0), 0.0, 1.0)
+    unseen = ~np.isfinite(places).all(1) | (places == 0.0).all(1) | (sure == 0.0)
+    if unseen.all():
+        return None
+    places[unseen], sure[unseen] = np.nan, 0.0
+    lifted = None if positions is None else np.array(positions, dtype=np.float64)
+    unknown = np.full((n, 2, 2), np.nan)
+    return Person(Keypoints(tuple(names), places, unknown, sure, lifted), track)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How the person to track is chosen among several.
+
+    Attributes:
+        kind: `LARGEST`: box in each frame. `NEAREST`: to the person chosen before; the first is
+            the largest. `INDEX`: place in the list of the frame. `TRACK`: what the detector calls
+            the person.
+        value: the place, or the name.
+    """
+
+    kind: str = NEAREST
+    value: str = ''
+
+    @classmethod
+    def parse(cls, text: str) -> Choice:
+        """A choice as the command line has it: largest, nearest, index:N or id:NAME.
+
+        Raises:
+            ValueError: another text.
+        """
+        kind, colon, value = text.partition(':')
+        if kind in (LARGEST, NEAREST) and not colon:
+            return cls(kind)
+        if (kind == INDEX and value.isdecimal()) or (kind == TRACK and value):
+            return cls(kind, value)
+        raise ValueError(f'wanted largest, nearest, index:N or id:NAME, saw {text!r}')
+
+
+class Chooser:
+    """Chooses a person frame by frame."""
+
+    def __init__(self, choice: Choice) -> None:
+        self._choice = choice
+        self._last: tuple[int, Person] | None = None
+
+    def of(self, number: int, found: Sequence[Person]) -> Person | None:
+        """The person among those in a frame, whose numbers must rise; None: not there."""
+        kind, value = self._choice.kind, self._choice.value
+        if kind == INDEX:
+            return found[int(value)] if int(value) < len(found) else None
+        if kind == TRACK:
+            return next((x for x in found if x.track == value), None)
+        if not found:
+            return None
+        if kind == LARGEST or self._last is None:
+            chosen = max(found, key=lambda x: float(np.prod(x.box[1] - x.box[0])))
+        else:
+            before, last = self._last
+            chosen = min(found, key=last.distance)
+            reach = _FASTEST * float(np.linalg.norm(last.box[1] - last.box[0]))
+            if chosen.distance(last) > reach * (number - before):
+                return None
+        self._last = number, chosen
+        return chosen
+
 
 LARGEST_FILE = 2**30  # bytes
 # Schemes of lists without names, by their number of keypoints.
@@ -48,7 +160,6 @@ class FoundPersons:
     """Persons by frame.
 
     Attributes:
-        by_number: persons of frames, by number.
         by_time: persons of frames, by time since the first frame, ns.
         rows: number of frames that the file describes one by one; None: it skips frames.
         size: width and height of the frames that the detector saw, px; None: not known.
@@ -106,8 +217,6 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
     """Reads what a detector found in the frames of a source.
 
     Args:
-        path: of the file or folder.
-        source: the frames.
         first_stamp_ns: stamp of the first frame, which stamps in the file refer to.
 
     Raises:

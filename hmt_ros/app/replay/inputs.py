@@ -41,10 +41,7 @@ class RecordedInput:
     """The topics of a bag that a replay reads.
 
     Attributes:
-        image: topic of the images.
-        camera_info: topic of their calibration.
         given: topics of what comes with the images, by the source that it is for.
-        ground_truth: topic of the ground truth; None if the bag has none.
         transforms: topics of transforms by source, those that the bag has of `TRANSFORMS`; None if
             transforms are not used.
         upright_frame: one of `UPRIGHT_FRAMES` that transforms lead to from the camera; empty: they
@@ -99,7 +96,6 @@ def recorded_input(
     `/tf_static`.
 
     Args:
-        bag: an open bag.
         image_topic, camera_info_topic: names that replace the automatic choice.
         topics: the same, by the name of the input.
         namespace: topics in it are preferred to those in the root, '/humans/bodies/p1' for example.

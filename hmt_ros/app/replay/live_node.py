@@ -43,9 +43,6 @@ class NodeProcess:
 
     Args:
         player: the participant that its nodes talk to.
-        opened: stack that ends the process.
-        name: of its files.
-        module: that runs the nodes.
         words: for its command line, before those of ROS.
     """
 
@@ -121,11 +118,7 @@ class LiveNode:
 
     Args:
         player: the participant that publishes for the node and subscribes to it.
-        opened: stack that ends the node.
-        name: name of the node, 'filter_node' for example.
-        parameters: parameters of the node.
         inputs: topic and type of the messages for the node, by source.
-        topics: topics that the node publishes.
         sensors: topics with the QoS of sensor data, which may lose messages; here they are
             reliable.
         namespace: namespace of the node and of all its topics, '/humans/bodies/7' for example.
@@ -185,7 +178,6 @@ class LiveNode:
         """Waits until the next message is handled, and writes what the node has published.
 
         Args:
-            source: source of the message.
             seconds: longest time to wait; None: `MESSAGE_SECONDS`.
 
         Raises:
@@ -366,12 +358,9 @@ class LiveNode:
                 raw=True,
             )
         node.create_subscription(
-            player.classes[HANDLED],
-            f'/{self.full_name}/handled',
-            _into(self._answers),
-            player.reliable,
-            raw=True,
-        )
+            player.classes[HANDLED], f'/{self.full_name}/handled', _into(self._answers),
+            player.reliable, raw=True,
+        )  # fmt: skip
         # Created last: discovery announces the topics above to the node before this client.
         self._state = node.create_client(GetState, f'/{self.full_name}/get_state')
         self._state_request = GetState.Request()

@@ -70,10 +70,7 @@ class Outcome:
     """The outcome of a job.
 
     Attributes:
-        name: name of the job.
         kind: `DONE`, `BEFORE` or `FAILED`.
-        text: one line about it.
-        told: lines for the user.
     """
 
     name: str
@@ -100,10 +97,6 @@ def replay_many(
     """Replays all bags.
 
     Args:
-        sources: bags, and folders of bags.
-        output: folder of the new bags.
-        options: options of the command.
-        tell: receives lines for stderr.
         scheduler: address of a Dask scheduler, or `LOCAL`; None: one bag after the other.
 
     Returns:
@@ -145,11 +138,7 @@ def replay_many(
 
 
 def _by_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[Outcome]:
-    """Outcomes of jobs in the order in which they end.
-
-    Raises:
-        ValueError: Dask is not installed, or the scheduler does not answer.
-    """
+    """Outcomes of jobs in the order in which they end."""
     try:
         distributed: Any = importlib.import_module('distributed')
     except ImportError as error:

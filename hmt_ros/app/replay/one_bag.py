@@ -43,7 +43,6 @@ class Replayed:
     """The outcome of a replay.
 
     Attributes:
-        images: number of images that were read.
         tracked: number of images in which the person was tracked.
         last_stamp: stamp of the last image, ns.
         last_fault: text of the newest fault; '' without faults.
@@ -64,10 +63,6 @@ def replay_bag(
     """Replays a bag into a new one, which is written completely or not at all.
 
     Args:
-        source: path of the bag.
-        target: folder of the new bag.
-        options: options of the command, for this bag.
-        tell: receives lines for the user.
         shows: whether progress is shown; None: unless `options.quiet`.
 
     Raises:

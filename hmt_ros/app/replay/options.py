@@ -108,12 +108,9 @@ class ReplayOptions:
             return None if value is None else Path(rename(str(value)))
 
         return replace(
-            self,
-            subject=path(self.subject),
-            background=path(self.background),
-            bme=self.bme and rename(self.bme),
-            body=self.body and rename(self.body),
-        )
+            self, subject=path(self.subject), background=path(self.background),
+            bme=self.bme and rename(self.bme), body=self.body and rename(self.body),
+        )  # fmt: skip
 
 
 class NodeParameters(NamedTuple):
@@ -198,11 +195,7 @@ def _tracking_values(options: ReplayOptions, recorded: RecordedInput, node: str)
 
 
 def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> PeopleParameters:
-    """Parameters of the people node, which takes the place of all other nodes.
-
-    Raises:
-        ValueError: options of one person, or no detections of several.
-    """
+    """Parameters of the people node, which takes the place of all other nodes."""
     unfit: dict[str, object] = {
         '--live': options.live,
         '--subject': options.subject,

@@ -18,9 +18,6 @@ class LiveNodeError(ValueError):
 class Player:
     """A ROS node in a domain of its own that publishes for other nodes and subscribes to them.
 
-    Args:
-        opened: stack that closes it.
-
     Raises:
         LiveNodeError: there is no ROS.
     """

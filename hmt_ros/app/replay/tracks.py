@@ -52,7 +52,6 @@ class OfflineTrack(PlayedTrack):
     """Without ROS.
 
     Args:
-        parameters: parameters of the nodes.
         write: takes topic, stamp and bytes of each published message.
 
     Raises:
@@ -125,7 +124,6 @@ class PeopleTrack(PlayedTrack):
 
     Args:
         parameters: parameters of the nodes; those of the filter are those of the people node.
-        write: takes topic, stamp and bytes of each published message.
         add_topic: takes name, type and `latched` of a topic of a person before its first message.
 
     Raises:
@@ -163,8 +161,6 @@ class LiveTrack(PlayedTrack):
     """The real nodes, over DDS in lock step.
 
     Args:
-        parameters: parameters of the nodes.
-        write: takes topic, stamp and bytes of each published message, in the order of the nodes.
         together: whether the nodes run in one process.
 
     Raises:
@@ -205,12 +201,9 @@ class LiveTrack(PlayedTrack):
                     BME, self._parameters.bme, inputs={}, topics=bme_session.TOPICS, sensors=sensors
                 )
             self._filter = live(
-                FILTER,
-                self._parameters.filter,
-                inputs=inputs,
-                topics=track_messages.TOPICS,
+                FILTER, self._parameters.filter, inputs=inputs, topics=track_messages.TOPICS,
                 sensors=sensors,
-            )
+            )  # fmt: skip
             if self._parameters.smoother is not None:
                 self._smoother = live(
                     SMOOTHER, self._parameters.smoother, inputs={}, topics=smoothed_messages.TOPICS
@@ -307,9 +300,6 @@ def _together(one: Handled | None, other: Handled) -> Handled:
     if one is None:
         return other
     return Handled(
-        one.source,
-        one.stamp_ns,
-        one.faults + other.faults,
-        one.warnings + other.warnings,
+        one.source, one.stamp_ns, one.faults + other.faults, one.warnings + other.warnings,
         one.published + other.published,
-    )
+    )  # fmt: skip

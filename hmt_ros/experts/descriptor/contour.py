@@ -147,7 +147,6 @@ def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
 
     Args:
         mask: (h, w) uint8, 1 inside.
-        count: Number of points.
 
     Returns:
         points (count, 2), px, and directions (count,), rad.
@@ -200,12 +199,7 @@ def _smooth(outline: Array) -> Array:
 
 
 def centred_view(blob: PersonBlob, camera: Camera) -> Bytes:
-    """The person (h, w), 1 inside, seen by the camera turned to the middle of the box.
-
-    Args:
-        blob: Person in the camera's image.
-        camera: Camera of the image.
-    """
+    """The person (h, w), 1 inside, seen by the camera turned to the middle of the box."""
     left, top, right, bottom = blob.box
     middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
     axis = camera.rays(middle)

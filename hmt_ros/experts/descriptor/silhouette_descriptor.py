@@ -193,7 +193,6 @@ def silhouette_parts(mask: ArrayLike, points: int = 100) -> SilhouetteParts:
 
     Args:
         mask: (H, W), not zero in the foreground.
-        points: Number of points on the outline.
 
     Raises:
         NoSilhouetteError: the mask has no person.
@@ -211,9 +210,7 @@ class SilhouetteDescriptor:
 
     Args:
         codebook_size: Number of centres of the codebook.
-        points: Number of points on the outline.
         components: Maximum number of components of the vector.
-        seed: Seed of the codebook.
 
     Attributes:
         codebook_: Codebook of shape contexts.

@@ -133,7 +133,6 @@ class Keypoints:
         Unknown covariances become those that are learned for keypoints of a scheme.
 
         Args:
-            body: with the joints.
             scheme: of the names, see `keypoint_schemes`; 'auto': the one that has them all,
                 'joints': none, they are names of joints.
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hmt_ros.app.import_video.persons import Choice, Chooser, person
+from hmt_ros.app.import_video.keypoint_files import Choice, Chooser, person
 
 NAMES = ('left_hip', 'right_hip', 'left_knee')
 

@@ -12,7 +12,7 @@ a known order in depth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -20,15 +20,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
 from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.body.self_intersection import deepest_overlaps
-from hmt_ros.flips.best_combinations import distinct_poses, least_sums
-from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
+from hmt_ros.body.self_intersection import _axes_of, _far, _overlap, _pairs, _place_centres
+from hmt_ros.flips.interpretation_tree import _ends, _grown, distinct_poses, enumerate_flips
 from hmt_ros.flips.torso_flips import JOINTS, flip_torso
+from hmt_ros.flips.tree_growth import chain_links
 from hmt_ros.inference.arrays import Array, Index, Mask
 
 SAME_TRUNK = 0.03  # m; torsos of which no joint differs by more are the same
@@ -415,3 +415,133 @@ def _put_angles(poses, dofs, angles, trunks, picks):  # type: ignore[no-untyped-
     for n in range(len(poses)):
         for k in range(len(dofs)):
             poses[n, dofs[k]] = angles[trunks[n], picks[n], k]
+
+
+def least_sums(
+    costs: Sequence[Array],
+    count: int,
+    allowed: Mapping[tuple[int, int], NDArray[np.bool_]] | None = None,
+) -> tuple[Array, Index]:
+    """The `count` choices of one entry per list with the least sums, least first.
+
+    List by list, only the `count` best sums so far go on: what is among the best of all lists is
+    among the best of the first few. Where pairs are ruled out this does not hold, and all sums go
+    on that they allow. Equal sums stand in the order of the lists.
+
+    Args:
+        costs: C lists of costs, (A,) each.
+        count: maximum number of choices.
+        allowed: (A, A') for pairs i < j of lists, which entries go together; all, where missing.
+
+    Returns:
+        sums (n,) and choices (n, C).
+    """
+    tables = dict(allowed or {})
+    sums, picks = np.zeros(1), np.zeros((1, 0), dtype=np.intp)
+    for c, cost in enumerate(costs):
+        total = (sums[:, None] + cost).ravel()
+        order = np.argsort(total, kind='stable')[: None if tables else count]
+        before, last = np.divmod(order, len(cost))
+        for (i, j), table in tables.items():
+            if j == c:
+                fits = table[picks[before, i], last]
+                order, before, last = order[fits], before[fits], last[fits]
+        sums, picks = total[order], np.column_stack([picks[before], last])
+    return sums[:count], picks[:count]
+
+
+def rehang_chain(
+    body: Body,
+    poses: ArrayLike,
+    new_poses: ArrayLike,
+    chain: str,
+    *,
+    image_of: str | None = None,
+    slack: float = 0.1,
+) -> tuple[Array, Index]:
+    """Poses whose chain hangs on another trunk and still has the image that it had.
+
+    When a trunk turns or flips, its limbs start elsewhere. Their joints are put back onto the rays
+    through their images, in all ways that lengths and limits allow. `image_of` puts them onto the
+    image of another chain instead, such as a left leg onto that of the right leg.
+
+    Args:
+        body: the body.
+        poses: (N, d) that have the image.
+        new_poses: (N, d) with the other trunk.
+        chain: name of the chain.
+        image_of: name of the chain whose image is taken; None selects the chain itself.
+        slack: a ray that misses its sphere by less than this touches it, m.
+
+    Returns:
+        poses (M, d), equal to the new ones outside the chain, and the index (M,) of each.
+
+    Raises:
+        KeyError, ValueError: as `enumerate_flips`.
+    """
+    skeleton = body.skeleton
+    links = chain_links(skeleton, chain)
+    new = np.array(new_poses, dtype=np.float64, ndmin=2, order='C')
+    seen = forward(skeleton, np.array(poses, dtype=np.float64, ndmin=2))
+    ends = links if image_of is None else chain_links(skeleton, image_of)
+    if len(ends.lengths) != len(links.lengths):
+        raise ValueError(f'chains {chain} and {image_of} differ in their number of segments')
+    angles, valid = _grown(forward(skeleton, new), new, links, _ends(seen, ends), slack)
+    parents, choice = np.nonzero(valid)
+    result = new[parents]
+    result[:, links.dofs] = angles[parents, choice]
+    return result, parents
+
+
+def deepest_overlaps(
+    body: Body,
+    columns: Array,
+    origins: Array,
+    rows: Index,
+    segments: Collection[int],
+    other_rows: Index,
+    other_segments: Collection[int],
+) -> Array:
+    """Largest overlap of parts on some segments of one pose with parts on others of another pose.
+
+    So limbs on the same trunk are compared without a pose for each of their combinations.
+
+    Args:
+        body: the body; parts that are neighbours along the skeleton are left out.
+        columns, origins: (N, S, 3, 3), (N, S, 3) of N poses, as `Frames.by_pose` gives them.
+        rows, other_rows: (M,) indices of the poses that are compared.
+        segments, other_segments: segments of the first and of the second pose.
+
+    Returns:
+        (M,) the largest overlap of two parts, m; at least 0.
+    """
+    first, second = _pairs(body)
+    carrier = np.array([p.segment for p in body.flesh.parts], dtype=np.intp)
+    one, two = np.isin(carrier, list(segments)), np.isin(carrier, list(other_segments))
+    straight, turned = one[first] & two[second], one[second] & two[first]
+    # A pair whose parts are on both sides either way is looked at both ways, if poses differ.
+    pairs = np.concatenate(
+        [
+            np.stack([first, second], axis=1)[straight],
+            np.stack([second, first], axis=1)[turned],
+        ]
+    )
+    result = np.zeros(len(rows))
+    _deepest(_axes_of(body), pairs, columns, origins, rows, other_rows, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _deepest(parts, pairs, columns, origins, rows, other_rows, result):  # type: ignore[no-untyped-def]
+    """Fills the largest overlaps of all pairs of parts."""
+    centres = np.empty((len(columns), len(parts.segments), 3))
+    for n in range(len(columns)):
+        _place_centres(parts, columns[n], origins[n], centres[n])
+    for m in range(len(rows)):
+        a, b = rows[m], other_rows[m]
+        for pair in range(len(pairs)):
+            i, j = pairs[pair, 0], pairs[pair, 1]
+            if _far(parts, i, j, centres[a], centres[b], 0.0):
+                continue
+            found = _overlap(parts, i, j, columns[a], centres[a], columns[b], centres[b])
+            result[m] = max(result[m], found[9])
