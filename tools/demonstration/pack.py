@@ -1,4 +1,4 @@
-"""Writes the bag of the demonstration from rendered images, with MediaPipe's keypoints of them.
+"""Writes the bag of the demonstration from rendered images, with the keypoints of MediaPipe Pose in them.
 
     python pack.py MOTION.npz FOLDER BAG
 
@@ -24,7 +24,7 @@ from hmt_ros.app.rendered_bag import (
 )
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
-from hmt_ros.detectors.mediapipe_pose import MediaPipePose
+from hmt_ros.detectors.blazepose import BlazePose
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.images import compressed_image_message, decode_image
@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
     viewpoint = Viewpoint(*motion['place'].tolist())
     joints = viewpoint.to_camera(motion['joints'])
     stamps = START_NS + np.round(np.arange(len(joints)) * 1e9 / motion['fps']).astype(np.int64)
-    messages, detector, rng = RosbagsMessages(), MediaPipePose(), np.random.default_rng(0)
+    messages, detector, rng = RosbagsMessages(), BlazePose(), np.random.default_rng(0)
     with BagWriter(target) as bag:
         write_camera_place(bag, messages, viewpoint, START_NS)
         for number, stamp in enumerate(stamps.tolist()):
@@ -66,7 +66,6 @@ def main(argv: list[str]) -> int:
                 bag.write('keypoints_3d', stamp, lifted)
             true = ground_truth(messages, body, motion['poses'][number], joints[number], stamp)
             bag.write('ground_truth', stamp, true)
-    detector.close()
     take = Take('reach', body, motion['poses'], float(motion['fps']))
     subject = subject_text(take, camera, camera.project(joints[:1])[0], 0)
     (target / 'subject.yaml').write_text(subject, 'utf-8')
