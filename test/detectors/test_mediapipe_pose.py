@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import stat
+import subprocess
 import sys
 from pathlib import Path
 
@@ -120,6 +121,13 @@ def test_images_of_any_layout(stand_in: str) -> None:
     np.testing.assert_allclose(found.pixels[0], [24.5, 19.5])
 
 
+def process_of(detector: MediaPipePose) -> subprocess.Popen[bytes]:
+    worker = detector._worker
+    assert worker is not None
+    process: subprocess.Popen[bytes] = worker.end.peek()[2][0]
+    return process
+
+
 def test_a_detector_that_ends_is_told_and_started_again(stand_in: str) -> None:
     with MediaPipePose(stand_in) as detector:
         broken = IMAGE.copy()
@@ -127,8 +135,7 @@ def test_a_detector_that_ends_is_told_and_started_again(stand_in: str) -> None:
         with pytest.raises(DetectorError, match=r'has ended: the model is broken$'):
             detector.detect(broken, 0)
         assert detector.detect(somebody(), 1) is not None
-        assert detector._worker is not None
-        os.kill(detector._worker.end.peek()[2][0].pid, signal.SIGKILL)
+        os.kill(process_of(detector).pid, signal.SIGKILL)
         with pytest.raises(DetectorError, match=r'has ended: (it says|noise)'):
             detector.detect(somebody(), 2)
         assert detector.detect(somebody(), 3) is not None
@@ -136,8 +143,7 @@ def test_a_detector_that_ends_is_told_and_started_again(stand_in: str) -> None:
 
 def test_its_process_ends_with_it(stand_in: str) -> None:
     detector = MediaPipePose(stand_in)
-    assert detector._worker is not None
-    process = detector._worker.end.peek()[2][0]
+    process = process_of(detector)
     assert process.poll() is None
     del detector
     assert process.poll() is not None

@@ -22,10 +22,13 @@ NAMES = schemes()['mediapipe33'].names
 class StubDetector:
     """What `MediaPipePose` shows; somebody is where the image is white."""
 
+    made = []  # noqa: RUF012
+
     def __init__(self, python, with_mask):
         if python == 'nowhere':
             raise DetectorError('nowhere can not run MediaPipe')
         self.with_mask, self.mask, self.fault = with_mask, None, None
+        StubDetector.made.append(self)
 
     def detect(self, image, stamp_ns):
         if self.fault is not None:
@@ -42,6 +45,7 @@ class StubDetector:
 @pytest.fixture
 def session(outputs, monkeypatch):
     monkeypatch.setattr(keypoints_session, 'MediaPipePose', StubDetector)
+    monkeypatch.setattr(StubDetector, 'made', [])
 
     def make(wanted=lambda topic: True, **values):
         parameters = with_values(KeypointsParameters(), values)
@@ -107,10 +111,11 @@ def test_what_goes_wrong_is_told(session, outputs, somebody):
     bad = somebody.image(6)
     bad.encoding = 'morse'
     assert 'morse' in one.take(IMAGE, bad).faults[0]
-    one._detector.fault = DetectorError('MediaPipe has ended: it says nothing')
+    (detector,) = StubDetector.made
+    detector.fault = DetectorError('MediaPipe has ended: it says nothing')
     (fault,) = one.take(IMAGE, somebody.image(7)).faults
     assert fault == f'image of {somebody.stamp(7)} ns: MediaPipe has ended: it says nothing'
-    one._detector.fault = None
+    detector.fault = None
     assert one.take(IMAGE, somebody.image(8)).faults == ()
     assert one.state.counts['skipped'] == 4
     with pytest.raises(ValueError, match='nowhere can not run MediaPipe'):
