@@ -40,7 +40,7 @@ demo:
 
 test:
 	@$(WORKSPACE) ros test detector build
-	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadfile --cov --cov-report term $(ARGS)
+	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint:
 	@$(WORKSPACE) ros lint

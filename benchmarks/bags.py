@@ -81,8 +81,8 @@ def reading(folder: Path, scale: float = 1.0, rounds: int = ROUNDS) -> list[dict
     }
     for what, path in cases.items():
         for how, functions in (
-            ('as bytes', (_our_bytes, _their_bytes)),
-            ('as messages', (_our_messages, _their_messages)),
+            ('as bytes', (read_our_bytes, read_their_bytes)),
+            ('as messages', (read_our_messages, read_their_messages)),
         ):
             seconds = _in_turn(functions, path, rounds)
             count, size = functions[0](path)
@@ -113,7 +113,8 @@ def _in_turn(functions: tuple[Callable[[Path], Any], ...], path: Path, rounds: i
     return best
 
 
-def _our_bytes(path: Path) -> tuple[int, int]:
+def read_our_bytes(path: Path) -> tuple[int, int]:
+    """This package reads all messages of a bag, as bytes; how many there are, and their size."""
     count = size = 0
     with BagReader(path) as bag:
         for stored in bag.messages():
@@ -122,7 +123,8 @@ def _our_bytes(path: Path) -> tuple[int, int]:
     return count, size
 
 
-def _their_bytes(path: Path) -> tuple[int, int]:
+def read_their_bytes(path: Path) -> tuple[int, int]:
+    """rosbags reads all messages of a bag, as bytes; how many there are, and their size."""
     count = size = 0
     with Reader(path) as bag:
         for _, _, data in bag.messages():
@@ -131,7 +133,8 @@ def _their_bytes(path: Path) -> tuple[int, int]:
     return count, size
 
 
-def _our_messages(path: Path) -> tuple[int, int]:
+def read_our_messages(path: Path) -> tuple[int, int]:
+    """This package reads and decodes all messages of a bag; how many there are, and their size."""
     count = size = 0
     with BagReader(path) as bag:
         for stored in bag.messages():
@@ -140,7 +143,8 @@ def _our_messages(path: Path) -> tuple[int, int]:
     return count, size
 
 
-def _their_messages(path: Path) -> tuple[int, int]:
+def read_their_messages(path: Path) -> tuple[int, int]:
+    """rosbags reads and decodes all messages of a bag; how many there are, and their size."""
     count = size = 0
     store = typestore()
     with Reader(path) as bag:

@@ -330,16 +330,16 @@ def verdicts(result: dict[str, Any], names: Sequence[str]) -> list[dict[str, Any
                     a: mine[a][unit] / min(result[b]['alone'][a][unit] for b in both)
                     for a in result['ambiguous']
                 }
-                found.append(_verdict(name, f'mean {unit} over the better baseline', ratio, 1.0))
+                found.append(verdict_of(name, f'mean {unit} over the better baseline', ratio, 1.0))
                 ratio = {
                     a: mine[a][f'max_{unit}'] / regression[a][f'max_{unit}']
                     for a in result['ambiguous']
                 }
-                found.append(_verdict(name, f'maximum {unit} over one regression', ratio, 1.0))
+                found.append(verdict_of(name, f'maximum {unit} over one regression', ratio, 1.0))
             for unit in ('best_degrees', 'best_mm'):
                 ratio = {a: mine[a][unit] / regression[a][unit] for a in result['ambiguous']}
                 what = f'{unit.removeprefix("best_")} of the best of {BEST_OF} over one regression'
-                found.append(_verdict(name, what, ratio, BEST_SHARE))
+                found.append(verdict_of(name, what, ratio, BEST_SHARE))
         for kind in ('coverage_90', 'joint_coverage_90'):
             low, high = COVERED
             value = mine['all'][kind]
@@ -352,7 +352,7 @@ def verdicts(result: dict[str, Any], names: Sequence[str]) -> list[dict[str, Any
     return found
 
 
-def _verdict(name: str, what: str, ratio: dict[str, float], wanted: float) -> dict[str, Any]:
+def verdict_of(name: str, what: str, ratio: dict[str, float], wanted: float) -> dict[str, Any]:
     """Whether a ratio is at most the wanted one for every activity."""
     missed = sorted(activity for activity, value in ratio.items() if value > wanted)
     return {

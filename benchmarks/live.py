@@ -262,7 +262,7 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
     if case.people:
         return result | _listed(by_stamp[LISTED])
     if case.clip == VISIT:
-        return result | _told_of_a_visit(by_stamp[TOLD], clip, rate)
+        return result | told_of_a_visit(by_stamp[TOLD], clip, rate)
     with BagWriter(target) as bag:
         for topic in (POSTERIOR, SMOOTHED):
             bag.add_topic(topic, POSE_MIXTURE)
@@ -299,7 +299,7 @@ def _listed(messages: Mapping[int, bytes]) -> dict[str, Any]:
     return {'people': float(np.mean(counts))}
 
 
-def _told_of_a_visit(messages: Mapping[int, bytes], clip: Path, rate: float) -> dict[str, Any]:
+def told_of_a_visit(messages: Mapping[int, bytes], clip: Path, rate: float) -> dict[str, Any]:
     """Whether the states of the answers are those of the images."""
     shares = shares_in_view(clip)
     stamps = sorted(shares)

@@ -115,7 +115,7 @@ def measure(
 
 
 def _added(transport: str, seconds: float) -> dict[str, Any]:
-    (found,) = followed(_prompt(transport), seconds, RATE)
+    (found,) = followed(prompt_feed(transport), seconds, RATE)
     times = found['latency_ms']
     wanted = f'{MEDIAN_MS:g} ms median, {LATE_MS:g} ms at 99 %, none lost'
     return {
@@ -286,7 +286,7 @@ def _recorded() -> tuple[Path, Any, list[Any]]:
     return folder, *read_messages(folder, [COMPRESSED])
 
 
-def _prompt(transport: str) -> Feed:
+def prompt_feed(transport: str) -> Feed:
     """A node whose estimate costs nothing, and images of the usual size."""
     messages = RosbagsMessages()
     _, info, recorded = _recorded()

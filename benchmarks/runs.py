@@ -326,7 +326,7 @@ def recorded(
         return Record(
             np.array(stamps, dtype=np.int64), joints, weights, point, blind, np.empty(0),
             np.empty((0, len(scored))), np.empty(0), np.array(evaluations), np.array(seconds),
-            np.array([len(clip.images)]), true, *_feet_and_views(clip, stamps),
+            np.array([len(clip.images)]), true, *feet_and_views(clip, stamps),
         )  # fmt: skip
     for i in range(1, len(bodies) + 1):
         if i == len(bodies) or bodies[i] is not bodies[first]:
@@ -352,7 +352,7 @@ def recorded(
     return Record(
         np.array(stamps), joints, weights, point, blind, scores.levels, scores.joint_levels,
         scores.log_densities, np.array(evaluations), np.array(seconds),
-        np.array([len(clip.images)]), true, *_feet_and_views(clip, stamps),
+        np.array([len(clip.images)]), true, *feet_and_views(clip, stamps),
         absolute_levels=absolute_levels, volumes=volumes,
     )  # fmt: skip
 
@@ -379,7 +379,7 @@ def joints_of(body: Body, poses: NDArray[np.float64], clip: Clip) -> NDArray[np.
     return result
 
 
-def _feet_and_views(clip: Clip, stamps: list[int]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def feet_and_views(clip: Clip, stamps: list[int]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Contact and views of a record."""
     contact, views = np.zeros((0, 2), dtype=np.bool_), np.tile(np.eye(3, 4), (len(stamps), 1, 1))
     with np.load(clip.folder / 'truth.npz') as content:

@@ -96,7 +96,7 @@ def measure(
                     for seed in range(seeds):
                         runs.append(new_minima(name, vote, seed, poses, budget))
                         bar.update()
-                    found[vote] = _summary(runs)
+                    found[vote] = summary_of(runs)
                 result['minima'][name] = found
     if 'tracking' in parts:
         runs_of: dict[str, dict[str, list[dict[str, float]]]] = {}
@@ -110,17 +110,17 @@ def measure(
                         runs_of.setdefault(motion, {}).setdefault(name, []).append(one)
                         bar.update()
         result['tracking'] = {
-            motion: {name: _summary(runs) for name, runs in found.items()}
+            motion: {name: summary_of(runs) for name, runs in found.items()}
             for motion, found in runs_of.items()
         }
         result['tracking']['together'] = {
-            name: _summary([run for found in runs_of.values() for run in found[name]])
+            name: summary_of([run for found in runs_of.values() for run in found[name]])
             for name in SEARCHED
         }
     return result
 
 
-def _summary(runs: list[dict[str, float]]) -> dict[str, float]:
+def summary_of(runs: list[dict[str, float]]) -> dict[str, float]:
     """Means over runs, and standard errors of the means."""
     result: dict[str, float] = {}
     for key in runs[0]:

@@ -27,6 +27,21 @@ settings.load_profile('hmt_ros')
 # Nor must it print lines of progress where a test expects the lines of a command.
 progress.INTERVAL = 3600.0
 
+# Files of tests that take longest, the longest first. They begin first, so that at the end no
+# process waits for another that has just begun a long one.
+LONGEST = (
+    'app/replay/test_live_node.py',
+    'tracking/test_bad_input.py',
+    'test_benchmarks.py',
+    'test_tracking_benchmark.py',
+    'test_docs.py',
+    'test_launch.py',
+    'tracking/test_absence.py',
+    'nodes/test_filter_node.py',
+    'nodes/test_robustness.py',
+    'nodes/test_usage.py',
+)
+
 _domain_reservation = pytest.StashKey[socket.socket]()
 
 
@@ -66,6 +81,12 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     if item.get_closest_marker('ros') is not None and 'AMENT_PREFIX_PATH' not in os.environ:
         reason = 'no ROS environment: "make test" or "source tools/environment.bash" first'
         item.add_marker(pytest.mark.skip(reason=reason))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    folder = Path(__file__).resolve().parent
+    places = {folder / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path, len(places)))
 
 
 @pytest.fixture(scope='session')

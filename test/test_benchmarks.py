@@ -66,10 +66,15 @@ def body():
     return load_body('human37')
 
 
-def test_the_tree_that_is_timed_has_1024_leaves(body):
+@pytest.fixture(scope='module')
+def timed_flips():
+    return flips.measure(seconds=0.0)
+
+
+def test_the_tree_that_is_timed_has_1024_leaves(body, timed_flips):
     pose, chains = flips.pose_with_leaves(body, flips.LEAVES)
     assert len(enumerate_flips(body, pose[None], list(chains))[0]) == 1024
-    result = flips.measure(seconds=0.0)
+    result = timed_flips
     first = next(iter(result['cases'].values()))
     assert (first['poses'], first['leaves']) == (1, 1024)
     assert all(case['us_per_leaf'] > 0 for case in result['cases'].values())
@@ -89,8 +94,10 @@ def test_both_read_the_same_bags_and_memory_is_followed(tmp_path):
         assert case['ratio'] == pytest.approx(
             case['ours_mb_per_s'] / case['rosbags_mb_per_s'], rel=1e-9
         )
-    assert bags._our_bytes(tmp_path / 'states') == bags._their_bytes(tmp_path / 'states')
-    assert bags._our_messages(tmp_path / 'states') == bags._their_messages(tmp_path / 'states')
+    assert bags.read_our_bytes(tmp_path / 'states') == bags.read_their_bytes(tmp_path / 'states')
+    assert bags.read_our_messages(tmp_path / 'states') == bags.read_their_messages(
+        tmp_path / 'states'
+    )
     remembered = bags.memory(tmp_path, 20_000_000)
     assert 0.019 < remembered['gb'] < 0.021
     assert [share for share, _ in remembered['resident_mb']][-1] == 1.0
@@ -182,15 +189,22 @@ def test_back_and_forth(clip):
 
 
 def test_time_in_a_stage_is_not_charged_to_the_one_around_it():
-    clock = StageClock()
-    clock._enter('chain search')
-    clock._enter('rating')
-    clock._leave()
-    outer = clock.seconds['chain search']
-    clock._leave()
-    assert set(clock.seconds) == {'chain search', 'rating'}
-    assert clock.seconds['chain search'] >= outer
-    assert clock._stack == []
+    class Part:
+        def search(self):
+            self.rate()
+
+        def rate(self):
+            pass
+
+    stages = ((Part, 'search', 'chain search'), (Part, 'rate', 'rating'))
+    times = iter([0.0, 1.0, 3.0, 6.0, 10.0, 11.0])
+    clock = StageClock(stages, times.__next__)
+    with clock.running():
+        Part().search()
+        assert clock.seconds == {'chain search': 4.0, 'rating': 2.0}
+        # Time between stages is charged to none.
+        Part().rate()
+    assert clock.seconds == {'chain search': 4.0, 'rating': 3.0}
 
 
 def test_where_clips_come_from(tmp_path, monkeypatch):
@@ -216,7 +230,7 @@ def test_votes():
     tracked = [votes.tracked(film, count, 0) for count in votes.SEARCHED.values()]
     assert all(one['best_mm'] < 150 for one in tracked)
     assert tracked[0]['evaluations'] < tracked[1]['evaluations']
-    summary = votes._summary([{'best_mm': 1.0}, {'best_mm': 3.0}])
+    summary = votes.summary_of([{'best_mm': 1.0}, {'best_mm': 3.0}])
     assert summary == {'best_mm': 2.0, 'best_mm_error': 1.0}
 
 
@@ -308,7 +322,7 @@ def test_tables():
     assert lines[3] == '| b         | 22 |'
 
 
-def test_command_line(capsys, tmp_path):
+def test_command_line(capsys, tmp_path, monkeypatch, timed_flips):
     assert main(['--help']) == 0
     assert 'tracking' in capsys.readouterr().out
     assert main(['flops']) == 1
@@ -321,8 +335,12 @@ def test_command_line(capsys, tmp_path):
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
-    assert main(['flips', '--json', '--quick']) == 0
-    assert json.loads(capsys.readouterr().out)['cases']
+    asked = []
+    monkeypatch.setattr(flips, 'measure', lambda seconds: asked.append(seconds) or timed_flips)
+    for options, seconds in (([], 1.0), (['--quick'], 0.1)):
+        assert main(['flips', '--json', *options]) == 0
+        assert json.loads(capsys.readouterr().out)['cases']
+        assert asked.pop() == seconds
 
 
 def test_stages_are_told_as_they_begin(capsys):
@@ -357,7 +375,7 @@ def test_nodes_that_lose_images_are_told():
     text = nodes.as_text({'added, raw': found, '4': 'skipped: no ROS'})
     assert '60  4.0 ms  9.0 ms           missed, wanted all' in ' '.join(text.split('\n'))
     assert 'skipped: no ROS' in text
-    assert nodes._prompt('raw').images[0].data.size == 640 * 480 * 3
+    assert nodes.prompt_feed('raw').images[0].data.size == 640 * 480 * 3
 
 
 # keypoint_noise
@@ -433,12 +451,12 @@ def test_states_of_a_visit_are_counted_a_second_late(tmp_path, monkeypatch):
         )
         for k, state in enumerate(states)
     }
-    found = live._told_of_a_visit(messages, tmp_path, 10.0)
+    found = live.told_of_a_visit(messages, tmp_path, 10.0)
     assert found == {
         'nobody': 0, 'in_view': 20, 'in_view_tracked': 20, 'away': 20, 'away_not_nobody': 0,
     }  # fmt: skip
     messages[30] = messages[79]
-    assert live._told_of_a_visit(messages, tmp_path, 10.0)['nobody'] == 1
+    assert live.told_of_a_visit(messages, tmp_path, 10.0)['nobody'] == 1
 
 
 def test_depth_brings_tracks_nearer():

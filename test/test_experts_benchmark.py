@@ -45,7 +45,7 @@ def test_verdicts_name_what_misses(found):
     for one in found['wanted']:
         assert one['model'] == 'joint'
         assert one['met'] == (not one['missed']) or 'coverage' in one['what']
-    verdict = experts_motion._verdict('joint', 'ratio', {'walk': 0.5, 'dance': 0.7}, 0.6)
+    verdict = experts_motion.verdict_of('joint', 'ratio', {'walk': 0.5, 'dance': 0.7}, 0.6)
     assert verdict['missed'] == ['dance']
     assert (verdict['value'], verdict['mean'], verdict['met']) == (0.7, pytest.approx(0.6), False)
 

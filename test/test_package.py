@@ -18,6 +18,7 @@ import pytest
 import setuptools
 
 import hmt_ros
+from test.conftest import LONGEST
 
 ROOT = Path(__file__).resolve().parents[1]
 HMT_MSGS = ROOT / 'msg_tools' / 'hmt_msgs'
@@ -281,3 +282,7 @@ def test_module_heads_keep_their_equations_on_lines_of_their_own() -> None:
             # Text that is filled: a formatter that wraps again leaves words on lines of their own.
             for line, following in pairwise(lines):
                 assert len(line) + len(following.split()[0]) >= 100, f'{name}: {line}'
+
+
+def test_tests_that_begin_first_exist() -> None:
+    assert [name for name in LONGEST if not (ROOT / 'test' / name).is_file()] == []

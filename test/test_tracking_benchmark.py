@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -86,19 +87,26 @@ def timed(clip):
     return found, before, [getattr(owner, name) for owner, name, _ in STAGES]
 
 
+@pytest.fixture(scope='module')
+def followed(body):
+    """Function (folder, changes) -> the record of two images by a small tracker, made once."""
+
+    @cache
+    def record(folder, changes):
+        short = read_clip(folder, 2)
+        return follow(short, new_tracker(short, body, replace(SMALL, **dict(changes)), 0), 0)
+
+    return record
+
+
 @pytest.fixture
-def quick_runs(monkeypatch, tmp_path):
+def quick_runs(monkeypatch, followed):
     """The benchmark with runs of two images, by small trackers, in this process; the runs done."""
     done = []
 
     def run_here(runs, _processes=0):
-        records = []
-        for one in runs:
-            short = read_clip(one.folder, 2)
-            settings = replace(SMALL, **dict(one.changes))
-            records.append(follow(short, new_tracker(short, load_body('human37'), settings, 0), 0))
-            done.append(one)
-        return records
+        done.extend(runs)
+        return [followed(one.folder, one.changes) for one in runs]
 
     for module in (tracking, tracking_budgets, tracking_rules):
         monkeypatch.setattr(module, 'run_all', run_here)
@@ -368,10 +376,10 @@ def test_a_foot_stands_if_it_does_in_images_that_are_left_out(clip, tmp_path):
     with np.load(REACH / 'truth.npz') as content:
         np.savez(tmp_path / 'truth.npz', contact=contact, stamps=content['stamps'][rows])
     here = replace(clip, folder=tmp_path)
-    assert runs._feet_and_views(here, clip.stamps)[0].tolist() == [
+    assert runs.feet_and_views(here, clip.stamps)[0].tolist() == [
         [True, True], [True, False], [True, False], [True, True],
     ]  # fmt: skip
-    assert runs._feet_and_views(here, clip.stamps[::2])[0].tolist() == [[True, True], [True, False]]
+    assert runs.feet_and_views(here, clip.stamps[::2])[0].tolist() == [[True, True], [True, False]]
 
 
 def test_modes_that_are_absent_do_not_count():
@@ -592,10 +600,16 @@ def test_without_the_image_terms_another_image_changes_nothing(clip, body):
     assert scores_of(record)['best_mm'] < 150
 
 
-def test_runs_go_on_where_they_were(tmp_path):
-    """Of runs that were broken off only what is missing or damaged is done again."""
+def test_runs_go_on_where_they_were(tmp_path, monkeypatch):
+    """Of runs that were broken off only what is missing or damaged is done again.
+
+    The first is done in a process of its own, the others in this one.
+    """
     runs = [Run(REACH, IMAGES, seed, limit=2) for seed in (0, 1)]
     (first,) = run_all(runs[:1], 1, tmp_path)
+    monkeypatch.setattr(
+        'benchmarks.runs.in_processes', lambda work, items, *_: [work(item) for item in items]
+    )
     paths = [tmp_path / f'{name_of(one)}.npz' for one in runs]
     (tmp_path / f'{name_of(runs[1])}.1.tmp.npz').write_bytes(b'half')
     written = paths[0].stat().st_mtime_ns

@@ -19,7 +19,7 @@ from hmt_ros.experts import load_predictor
 from hmt_ros.experts.model_file import read_arrays, write_arrays
 from msg_tools import BagReader
 
-_MODEL = ROOT / 'hmt_ros' / 'experts' / 'models' / 'silhouettes.npz'
+MODEL = ROOT / 'hmt_ros' / 'experts' / 'models' / 'silhouettes.npz'
 _CHEAP = (
     '--set', 'max_hypotheses=1', '--set', 'evaluation_budget=20',
     '--set', 'overlay_modes=0',
@@ -122,7 +122,7 @@ def _makes(target: Path) -> str:
 
 def _writes_model(target: Path) -> str:
     try:
-        write_arrays(target.with_suffix('.npz'), read_arrays(_MODEL))
+        write_arrays(target.with_suffix('.npz'), read_arrays(MODEL))
     except OSError as error:
         return str(error)
     return ''

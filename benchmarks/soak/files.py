@@ -154,7 +154,7 @@ def _damaged_arrays(data: bytes, rng: np.random.Generator) -> bytes:
     target = io.BytesIO()
     np.savez(target, **arrays)
     if rng.random() < 0.1:
-        return _with_member(target.getvalue(), names, rng)
+        return with_member(target.getvalue(), names, rng)
     return target.getvalue()
 
 
@@ -182,7 +182,7 @@ def _damaged_array(values: Any, rng: np.random.Generator) -> Any:
     return values[:1] if values.ndim else values
 
 
-def _with_member(data: bytes, names: list[str], rng: np.random.Generator) -> bytes:
+def with_member(data: bytes, names: list[str], rng: np.random.Generator) -> bytes:
     """An archive with a member whose header lies about what follows."""
     target = io.BytesIO(data)
     with zipfile.ZipFile(target, 'a') as archive:

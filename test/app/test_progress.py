@@ -5,6 +5,7 @@ import os
 import queue
 import select
 import sys
+import threading
 import time
 
 import pytest
@@ -14,10 +15,14 @@ from hmt_ros.app.progress import INTERVAL, ProgressLines, show_progress, with_pr
 
 
 class Clock:
-    """A clock that a test sets, which is also the event that wakes the thread of the lines."""
+    """A clock that a test sets, which is also the event that wakes the thread of the lines.
+
+    Attributes:
+        printed: file of the lines.
+    """
 
     def __init__(self):
-        self.now, self.waits = 0.0, []
+        self.now, self.waits, self.printed = 0.0, [], io.StringIO()
         self._asked, self._answers = queue.Queue(), queue.Queue()
 
     def __call__(self):
@@ -46,7 +51,7 @@ def clock():
 
 
 def lines(clock, unit='images', total=120):
-    return ProgressLines('out', unit, total, file=io.StringIO(), clock=clock, ended=clock)
+    return ProgressLines('out', unit, total, file=clock.printed, clock=clock, ended=clock)
 
 
 def test_a_line_every_ten_seconds(clock, monkeypatch):
@@ -60,7 +65,7 @@ def test_a_line_every_ten_seconds(clock, monkeypatch):
         clock.pass_to(82.0)
         shown.update(79)
         clock.now = 90.0
-    assert shown._file.getvalue().splitlines() == [
+    assert clock.printed.getvalue().splitlines() == [
         'out: 0 of 120 images, 00:10 so far',
         'out: 40 of 120 images, 2 a second, 00:40 left',
         'out: 41 of 120 images, 0.5 a second, 02:38 left',
@@ -85,12 +90,12 @@ def test_a_short_command_prints_nothing(clock):
     shown = lines(clock)
     with shown:
         shown.update(120)
-    assert shown._file.getvalue() == ''
+    assert clock.printed.getvalue() == ''
 
 
 def test_an_error_ends_the_lines(clock):
     """The line about the error is the last."""
-    shown = lines(clock)
+    shown, running = lines(clock), threading.active_count()
 
     def work():
         clock.pass_to(10.0)
@@ -98,8 +103,8 @@ def test_an_error_ends_the_lines(clock):
 
     with pytest.raises(ValueError, match='bad'), shown:
         work()
-    assert not shown._thread.is_alive()
-    assert shown._file.getvalue() == 'out: 0 of 120 images, 00:10 so far\n'
+    assert threading.active_count() == running
+    assert clock.printed.getvalue() == 'out: 0 of 120 images, 00:10 so far\n'
 
 
 @pytest.mark.parametrize('columns', [100, 0])

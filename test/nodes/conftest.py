@@ -10,6 +10,7 @@ import sys
 import time
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -82,6 +83,52 @@ class World:
 
         return self.other.create_subscription(kind, topic, receive, qos)
 
+    def hear(self, kinds):
+        """Listens to topics, by their classes; returns lists of messages once the node knows."""
+        found = {topic: [] for topic in kinds}
+        for topic, kind in kinds.items():
+            self.listen(kind, topic, found[topic])
+        self.spin_until(lambda: all(map(self.is_heard, kinds)), 'a subscription')
+        return found
+
+    def is_heard(self, topic):
+        """Whether the node knows of somebody who listens to a topic of its own."""
+        name = self.node.resolve_topic_name(topic)
+        return any(
+            one.topic_name == name and one.get_subscription_count() for one in self.node.publishers
+        )
+
+    @property
+    def session(self):
+        """What estimates in the node; None while it is not configured."""
+        return self.node._session
+
+    @property
+    def thread(self):
+        """The thread that estimates."""
+        return self.node._thread
+
+    def limit(self, source):
+        """How many messages of a source may wait."""
+        return self.thread.queue._limits[source]
+
+    def own_periods(self):
+        """Stops the clock of the diagnostics; returns what ends a period."""
+        (timer,) = self.node.timers
+        timer.cancel()
+        return timer.callback
+
+    def event(self, topic, kind, **content):
+        """Has the middleware tell the node of an event of a subscription or a publisher."""
+        (told,) = (
+            handler.callback
+            for one in (*self.node.subscriptions, *self.node.publishers)
+            if one.topic_name == topic
+            for handler in one.event_handlers
+            if handler.event_type.name.endswith(kind)
+        )
+        told(SimpleNamespace(**content))
+
     def spin_until(self, done, what='it'):
         end = time.monotonic() + PATIENCE
         while not done():
@@ -99,7 +146,7 @@ class World:
                 all(p.get_subscription_count() for p in self.publishers.values())
                 and self.other.count_publishers(f'{self.name}/handled') == 1
                 and self.node.count_subscribers(f'{self.name}/handled') == 1
-                and self.node._handled.get_subscription_count() == 1
+                and self.is_heard(f'{self.name}/handled')
             )
         )
         return self

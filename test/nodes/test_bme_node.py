@@ -37,9 +37,7 @@ def running(world, somebody):
 def test_images_become_predictions(running, somebody):
     from hmt_msgs.msg import PoseMixture
 
-    found = []
-    running.listen(PoseMixture, 'pose_prediction', found)
-    running.spin_until(lambda: running.node._is_wanted('pose_prediction'))
+    found = running.hear({'pose_prediction': PoseMixture})['pose_prediction']
     for message in (somebody.image(0), somebody.empty(1)):
         ((topic, _),) = running.send('image', message).published
         assert topic == 'pose_prediction'
@@ -74,8 +72,8 @@ def test_parameters_are_those_of_the_file(running):
         ({'autostart': False}, 'read-only'),
     )
     assert running.set(max_hypotheses=1, queue_size=3) == (True, '')
-    assert running.node._session.parameters.max_hypotheses == 1
-    assert running.node._thread.queue._limits['image'] == 3
+    assert running.session.parameters.max_hypotheses == 1
+    assert running.limit('image') == 3
 
 
 def test_one_warning_for_each_kind_and_the_node_lives(running, somebody):

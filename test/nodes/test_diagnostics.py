@@ -125,12 +125,7 @@ def test_other_types_and_unknown_policies_are_told():
 def test_lost_messages_are_in_the_diagnostics(running, small_camera):
     running.send('camera_info', small_camera.info())
     running.send('image', small_camera.image(0))
-    (callbacks,) = (
-        handler.callback
-        for handler in running.node._connected[-1].event_handlers
-        if handler.event_type.name.endswith('MESSAGE_LOST')
-    )
-    callbacks(SimpleNamespace(total_count_change=4))
+    running.event('/image', 'MESSAGE_LOST', total_count_change=4)
     running.spin_until(
         lambda: any(
             status.message == '4 messages lost on their way in a second'
@@ -179,8 +174,7 @@ def status_lines(world):
 
 def test_status_line(running, small_camera):
     """One a period of diagnostics, which is a second, and only when something has come."""
-    running.node._timer.cancel()
-    period = running.node._diagnose_period
+    period = running.own_periods()
     period()
     assert status_lines(running) == []
     running.send('camera_info', small_camera.info())
@@ -204,11 +198,9 @@ def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
     running.send('camera_info', small_camera.info())
     running.send('camera_info', small_camera.uncalibrated())
     running.send('image', small_camera.image(0))
-    events = running.node._events.of_subscription('/image')
-    events.message_lost(SimpleNamespace(total_count_change=1))
-    events.incompatible_qos(SimpleNamespace(total_count_change=1, last_policy_kind=16))
-    events = running.node._events.of_publisher('/tf')
-    events.incompatible_qos(SimpleNamespace(total_count_change=1, last_policy_kind=2))
+    running.event('/image', 'MESSAGE_LOST', total_count_change=1)
+    running.event('/image', 'INCOMPATIBLE_QOS', total_count_change=1, last_policy_kind=16)
+    running.event('/tf', 'INCOMPATIBLE_QOS', total_count_change=1, last_policy_kind=2)
     running.patience(0.0)
     page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
     table = page.partition('## Diagnostics')[2].partition('| key |')[2]

@@ -80,11 +80,8 @@ def test_images_become_messages(running, small_camera):
     from std_msgs.msg import String
     from tf2_msgs.msg import TFMessage
 
-    mixtures, transforms, bodies, descriptions = [], [], [], []
-    running.listen(PoseMixture, 'pose_mixture', mixtures)
-    running.listen(TFMessage, '/tf', transforms)
-    running.spin_until(lambda: running.node.count_subscribers('pose_mixture') == 1)
-    running.spin_until(lambda: running.node._is_wanted('/tf'))
+    bodies, descriptions = [], []
+    mixtures, transforms = running.hear({'pose_mixture': PoseMixture, '/tf': TFMessage}).values()
     running.send('camera_info', small_camera.info())
     first = running.send('image', small_camera.image(0))
     assert first.source == 'image'
@@ -129,7 +126,7 @@ def test_parameters_are_those_of_the_file(running):
     of_ros = ('use_sim_time', 'start_type_description_service')
     names = [
         name
-        for name in running.node._parameters
+        for name in running.node.get_parameters_by_prefix('')
         if name not in of_ros and not name.startswith('qos_overrides.')
     ]
     parameters = running.assert_described(FilterParameters())
@@ -157,11 +154,10 @@ def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
         ({'max_hypotheses': 8.0}, 'type'),
     )
     before = FilterParameters()
-    assert running.node._settings.tracker == before.tracker
+    assert running.session.parameters.tracker == before.tracker
     assert running.set(max_hypotheses=20, evaluation_budget=800, queue_size=2) == (True, '')
-    assert running.node._settings.tracker.max_hypotheses == 20
-    assert running.node._session.parameters is running.node._settings
-    assert running.node._thread.queue._limits['image'] == 2
+    assert running.session.parameters.tracker.max_hypotheses == 20
+    assert running.limit('image') == 2
 
 
 def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera, stub_tracker):
@@ -222,7 +218,7 @@ def test_bytes_that_are_no_message(running, small_camera):
     running.send('camera_info', small_camera.info())
     data = serialise(small_camera.image(0))
     count = len(running.handled)
-    running.node._thread.put('image', data[:60], time.monotonic())
+    running.thread.put('image', data[:60], time.monotonic())
     running.spin_until(lambda: len(running.handled) > count)
     assert faults(running.handled[-1])[0].startswith('message of image can not be read: ')
     assert faults(running.send('image', small_camera.image(1))) == []
@@ -267,11 +263,11 @@ def test_lifecycle(world, small_camera):
     one.connect()
     # The track and the camera are those of before.
     assert faults(one.send('image', small_camera.image(1))) == []
-    assert one.node._session.state.counts['tracked'] == 2
+    assert one.session.state.counts['tracked'] == 2
     assert one.change_state('deactivate')
     assert one.change_state('cleanup')
     assert one.state == 'unconfigured'
-    assert one.node._session is None
+    assert one.session is None
     assert one.change_state('configure')
     assert one.change_state('activate')
     assert one.change_state('active_shutdown')
@@ -306,13 +302,13 @@ def test_reset_counts_though_the_node_is_deactivated(world, small_camera, held_e
     one.send('camera_info', small_camera.info())
     one.publishers['image'].publish(serialise(small_camera.image(0)))
     one.spin_until(begun.is_set, 'the estimate of the first image')
-    session, before = one.node._session, one.node._session.start
+    session, before = one.session, one.session.start
     answers = [one.call(Reset, 'reset') for _ in range(3)]
     assert all(answer.success for answer in answers)
     # Several wait as one, the last.
-    assert len(one.node._thread.queue) == 1
+    assert len(one.thread.queue) == 1
     one.publishers['image'].publish(serialise(small_camera.image(1)))
-    one.spin_until(lambda: len(one.node._thread.queue) == 2)
+    one.spin_until(lambda: len(one.thread.queue) == 2)
     threading.Timer(0.3, go.set).start()
     assert one.change_state('deactivate')
     assert session.start is not before
@@ -343,7 +339,7 @@ def test_reset(running, small_camera, stub_tracker, subject_file, body):
     )
     assert running.call(Reset, 'reset', initial=mixture).success
     running.send('image', small_camera.image(2))
-    assert np.array_equal(stub_tracker.made[2]._start.means, [body.prior_mean])
+    assert np.array_equal(stub_tracker.made[2].start.means, [body.prior_mean])
     mixture.components[0].weight = 0.5
     answer = running.call(Reset, 'reset', initial=mixture)
     assert (answer.success, answer.message) == (
@@ -366,19 +362,23 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     begun, go = held_estimate
     one = world(queue_size=2).start()
     one.send('camera_info', small_camera.info())
-    queue = one.node._thread.queue
+    queue = one.thread.queue
+
+    def waiting_and_dropped():
+        return len(queue), queue._dropped
+
     for index in range(12):
         one.publishers['image'].publish(serialise(small_camera.image(index)))
         one.spin_until(begun.is_set, 'the estimate of the first image')
-        one.spin_until(lambda index=index: len(queue) + queue._dropped == index)
-    assert (len(queue), queue._dropped) == (2, 9)
+        one.spin_until(lambda index=index: sum(waiting_and_dropped()) == index)
+    assert waiting_and_dropped() == (2, 9)
     assert one.state == 'active'
     assert one.set(overlay_modes=1) == (True, '')
     go.set()
-    one.spin_until(lambda: one.node._session.state.counts['tracked'] == 3)
+    one.spin_until(lambda: one.session.state.counts['tracked'] == 3)
     stamps = [stamp for stamp, _ in stub_tracker.made[0].seen]
     assert stamps == [small_camera.stamp(index) for index in (0, 10, 11)]
-    assert one.node._session.state.counts == {'received': 12, 'tracked': 3, 'dropped': 9}
+    assert one.session.state.counts == {'received': 12, 'tracked': 3, 'dropped': 9}
     # Every image is answered, those that were dropped by their stamps.
     one.spin_until(lambda: sum(h.source == 'image' for h in one.handled) == 12)
     dropped = [h for h in one.handled if h.source == 'image' and h.faults]
@@ -396,12 +396,12 @@ def test_what_images_waited_for_comes_before_that_they_are_late(world, small_cam
     one = world(use_keypoints=True, input_timeout=60.0).start()
     one.send('camera_info', small_camera.info())
     told = 'waits for keypoints; late: 3 images dropped in a second'
-    one.node._timer.cancel()
+    end_period = one.own_periods()
     for index in range(MOST_INCOMPLETE + 3):
         one.send('image', small_camera.image(index))
-    one.node._diagnose_period()
+    end_period()
     one.spin_until(lambda: any(d.status[0].message == told for d in one.diagnostics), told)
-    assert one.node._session.state.counts['dropped'] == 3
+    assert one.session.state.counts['dropped'] == 3
 
 
 def test_late_node_goes_on_with_the_newest_complete_image(
@@ -410,7 +410,7 @@ def test_late_node_goes_on_with_the_newest_complete_image(
     begun, go = held_estimate
     one = world(use_keypoints=True).start()
     one.send('camera_info', small_camera.info())
-    queue = one.node._thread.queue
+    queue = one.thread.queue
     sent = 0
 
     def publish(source, index):
@@ -438,7 +438,7 @@ def test_late_node_goes_on_with_the_newest_complete_image(
     assert [stamp for stamp, _ in seen] == [small_camera.stamp(index) for index in (0, 4, 5, 6)]
     assert all(keypoints is not None for _, keypoints in seen)
     one.spin_until(lambda: len(one.handled) == 1 + 7 + 7)
-    counts = one.node._session.state.counts
+    counts = one.session.state.counts
     assert counts == {'received': 7, 'tracked': 4, 'dropped': 3}
     assert sum(h.source == 'image' for h in one.handled) == 7
     told = [text for h in one.handled for text in h.faults]
@@ -476,7 +476,7 @@ def informed(one, *parts):
 def test_a_track_leaves_lines_in_the_log(running, small_camera, stub_tracker):
     from hmt_msgs.srv import Reset
 
-    running.node._timer.cancel()
+    running.own_periods()
     running.send('camera_info', small_camera.info())
     stub_tracker.empty |= {small_camera.stamp(2), small_camera.stamp(3)}
     for index in range(6):
@@ -508,15 +508,18 @@ def test_ends_cleanly(number, subject_file, executable):
 def test_kernels_are_ready_before_the_node_listens(world, monkeypatch):
     prepared = []
 
+    def topics():
+        return {publisher.topic_name for publisher in one.node.publishers} & {'/pose_mixture'}
+
     def prepare(session):
-        prepared.append((one.node.preparing, dict(one.node._outputs)))
+        prepared.append((one.node.preparing, topics()))
 
     monkeypatch.setattr('hmt_ros.sessions.filter_session.FilterSession.prepare', prepare)
     one = world()
     one.node.trigger_configure()
-    assert prepared == [(True, {})]
+    assert prepared == [(True, set())]
     assert not one.node.preparing
-    assert one.node._outputs
+    assert topics() == {'/pose_mixture'}
 
 
 @pytest.mark.parametrize(
@@ -536,11 +539,7 @@ def test_an_empty_view_is_a_warning_and_no_error(running, small_camera, stub_tra
     from hmt_msgs.msg import PoseMixture
     from visualization_msgs.msg import Marker, MarkerArray
 
-    mixtures, markers = [], []
-    running.listen(PoseMixture, 'pose_mixture', mixtures)
-    running.listen(MarkerArray, 'markers', markers)
-    running.spin_until(lambda: running.node._is_wanted('pose_mixture'))
-    running.spin_until(lambda: running.node._is_wanted('markers'))
+    mixtures, markers = running.hear({'pose_mixture': PoseMixture, 'markers': MarkerArray}).values()
     running.send('camera_info', small_camera.info())
     stub_tracker.empty |= {small_camera.stamp(index) for index in (1, 2)}
     outcomes = [published(running.send('image', small_camera.image(i))) for i in range(4)]

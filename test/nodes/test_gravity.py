@@ -45,7 +45,7 @@ def test_gravity_of_a_frame(world, small_camera, stub_tracker):
     one.listen(Ground, 'ground', found)
     one.listen(TFMessage, '/tf', transforms)
     one.start()
-    one.spin_until(lambda: one.node._outputs['ground'].get_subscription_count() == 1)
+    one.spin_until(lambda: one.is_heard('ground'))
     one.send('camera_info', small_camera.info())
     # A static mount, sent once and kept for those who come late, and a robot that stands.
     one.send('tf_static', camera_place(0, 'robot'))
@@ -70,7 +70,7 @@ def test_gravity_of_a_frame(world, small_camera, stub_tracker):
     # What the node itself publishes on /tf is no input.
     sources = [handled.source for handled in one.handled]
     assert sources == ['camera_info', 'tf_static', *['tf', 'image'] * 3]
-    assert one.node._session.state.faults == {}
+    assert one.session.state.faults == {}
 
 
 def test_without_the_frame_nobody_listens(world, small_camera):
@@ -99,8 +99,8 @@ def test_parameters_of_the_ground(world, stub_tracker, small_camera):
     np.testing.assert_array_equal(stub_tracker.made[0].known_ground.up, [0.0, 0.0, -1.0])
     for value, up in (([0, 2, 0], [0.0, -1.0, 0.0]), ([], None)):
         assert one.set(gravity=value) == (True, '')
-        assert one.node._session.parameters.known_ground.up is None or up is not None
-        assert list(one.node._settings.gravity) == [float(x) for x in value]
+        assert one.session.parameters.known_ground.up is None or up is not None
+        assert list(one.session.parameters.gravity) == [float(x) for x in value]
 
 
 def test_missing_frames_are_told_once(world, small_camera):
@@ -113,7 +113,7 @@ def test_missing_frames_are_told_once(world, small_camera):
     (warning,) = one.warnings()
     assert "no transform from gravity_frame 'map' to 'lens'" in warning
     assert "there is no frame 'map'; there are: lens, world" in warning
-    assert one.node._session.state.faults == {'no transform': 2}
+    assert one.session.state.faults == {'no transform': 2}
 
 
 def test_no_value_is_an_empty_list_and_the_parameter_stays(world):
@@ -125,7 +125,7 @@ def test_no_value_is_an_empty_list_and_the_parameter_stays(world):
     given = [Parameter(name='gravity', value=nothing), Parameter(name='flow_weight', value=nothing)]
     emptied, refused = one.call(SetParameters, 'set_parameters', parameters=given).results
     assert (emptied.successful, refused.successful) == (True, False)
-    assert one.node._settings.gravity == ()
+    assert one.session.parameters.gravity == ()
     names = one.call(ListParameters, 'list_parameters').result.names
     assert {'gravity', 'flow_weight'} <= set(names)
     (value,) = one.call(GetParameters, 'get_parameters', names=['gravity']).values

@@ -78,9 +78,7 @@ def test_people_come_and_go(installed, world_of, small_camera, likelihoods):
         found[name] = []
         qos = latched if name == 'urdf' else 100
         one.listen(kind, f'/humans/bodies/p1_1/{name}', found[name], qos)
-    one.spin_until(
-        lambda: all(one.node._is_wanted(f'/humans/bodies/p1_1/{name}') for name in kinds)
-    )
+    one.spin_until(lambda: all(one.is_heard(f'/humans/bodies/p1_1/{name}') for name in kinds))
     one.send('image', small_camera.image(1))
     one.send(source, mixture(likelihoods, 1), TOPIC)
     one.spin_until(lambda: all(found.values()), 'all topics of a body')
@@ -153,8 +151,8 @@ def test_namespaces_that_are_named(installed, world_of, likelihoods):
     one.spin_until(one.publishers['pose_mixture'].get_subscription_count, 'a subscription')
     ids = []
     one.listen(IdsList, '/humans/bodies/tracked', ids)
-    one.spin_until(lambda: one.node._is_wanted('/humans/bodies/tracked'))
-    one.spin_until(lambda: one.node._handled.get_subscription_count() == 1)
+    one.spin_until(lambda: one.is_heard('/humans/bodies/tracked'))
+    one.spin_until(lambda: one.is_heard('hri_node/handled'))
     one.send('pose_mixture of /', mixture(likelihoods, 0), 'pose_mixture')
     one.spin_until(lambda: ids)
     assert list(ids[0].ids) == ['body_1']

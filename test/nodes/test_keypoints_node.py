@@ -39,11 +39,7 @@ def listening(one):
     from hmt_msgs.msg import Keypoints2D, Keypoints3D
     from sensor_msgs.msg import Image
 
-    found = {'keypoints': [], 'keypoints_3d': [], 'mask': []}
-    for kind, topic in zip((Keypoints2D, Keypoints3D, Image), found, strict=True):
-        one.listen(kind, topic, found[topic])
-        one.spin_until(lambda topic=topic: one.node._is_wanted(topic))
-    return found
+    return one.hear({'keypoints': Keypoints2D, 'keypoints_3d': Keypoints3D, 'mask': Image})
 
 
 def stamp_of(message):

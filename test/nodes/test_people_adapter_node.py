@@ -26,9 +26,7 @@ def test_people(world_of, likelihoods, package):
         'people_msgs': ('People', 'people'),
         'vision_msgs': ('Detection3DArray', 'detections'),
     }[package]
-    found = []
-    one.listen(getattr(import_module(f'{package}.msg'), kind), topic, found)
-    one.spin_until(lambda: one.node._is_wanted(topic))
+    found = one.hear({topic: getattr(import_module(f'{package}.msg'), kind)})[topic]
     one.send('pose_mixture', likelihoods.message(0))
     one.spin_until(lambda: found)
     assert len(getattr(found[0], topic)) == 1

@@ -63,6 +63,15 @@ def spin_until(executor, done, what):
         executor.spin_once(timeout_sec=0.05)
 
 
+def state_of(node):
+    return node._session.state
+
+
+def subscribed(node):
+    """Topics that a node gets over DDS."""
+    return {one.topic_name for one in node.subscriptions}
+
+
 def test_what_one_publishes_the_next_gets_without_dds(together, small_camera):
     from hmt_msgs.msg import PoseMixture
     from sensor_msgs.msg import CameraInfo, Image
@@ -86,20 +95,20 @@ def test_what_one_publishes_the_next_gets_without_dds(together, small_camera):
     publishers['camera_info'].publish(serialise(small_camera.info()))
     spin_until(
         executor,
-        lambda: nodes['filter_node']._session._camera and nodes['bme_node']._session._camera,
+        lambda: (
+            not any(
+                'camera_info' in state_of(nodes[name]).wants for name in ('filter_node', 'bme_node')
+            )
+        ),
         'the calibration',
     )
     for index in range(4):
         publishers['image'].publish(serialise(small_camera.image(index)))
         spin_until(executor, lambda n=index: len(came) > n, 'a mixture')
     assert [len(message.components) for message in came] == [2] * 4
-    spin_until(
-        executor, lambda: nodes['smoother_node']._session.state.counts['smoothed'] == 4, 'smoothing'
-    )
-    counts = {
-        name: node._subscribers(PREDICTION) for name, node in nodes.items() if name == 'bme_node'
-    }
-    assert counts == {'bme_node': 1}
+    smoother = nodes['smoother_node']
+    spin_until(executor, lambda: state_of(smoother).counts['smoothed'] == 4, 'smoothing')
+    assert nodes['bme_node']._subscribers(PREDICTION) == 1
 
 
 def test_parameters_follow_from_who_is_there():
@@ -126,9 +135,7 @@ def test_a_node_that_is_deactivated_leaves_the_images_to_the_others(together, sm
     for publisher in (info, image):
         spin_until(executor, lambda p=publisher: p.get_subscription_count() == 1, 'a subscription')
     owner = next(
-        node
-        for node in nodes.values()
-        if any('image' in s.topic_name for s in getattr(node, '_connected', ()))
+        node for node in nodes.values() if node is not other and '/image' in subscribed(node)
     )
     (left,) = {'filter_node', 'bme_node'} - {owner.get_name()}
     owner.trigger_deactivate()
@@ -136,9 +143,9 @@ def test_a_node_that_is_deactivated_leaves_the_images_to_the_others(together, sm
     time.sleep(0.2)
     info.publish(serialise(small_camera.info()))
     image.publish(serialise(small_camera.image(0)))
-    spin_until(executor, lambda: nodes[left]._session.state.counts['received'] == 1, 'the image')
-    assert nodes[left]._connected
-    assert not owner._connected
+    spin_until(executor, lambda: state_of(nodes[left]).counts['received'] == 1, 'the image')
+    assert {'/image', '/camera_info'} <= subscribed(nodes[left])
+    assert subscribed(owner).isdisjoint({'/image', '/camera_info'})
 
 
 def run(*words, stop_at=''):

@@ -90,15 +90,15 @@ def test_what_is_not_met_is_told(monkeypatch, capsys):
 
 
 def test_arrays_that_lie_about_their_size_are_refused(tmp_path):
-    path = write_arrays(tmp_path / 'model', read_arrays(disk._MODEL))
+    path = write_arrays(tmp_path / 'model', read_arrays(disk.MODEL))
     lying = tmp_path / 'lying.npz'
-    lying.write_bytes(files._with_member(path.read_bytes(), ['x'], np.random.default_rng(0)))
+    lying.write_bytes(files.with_member(path.read_bytes(), ['x'], np.random.default_rng(0)))
     with pytest.raises(ValueError, match='not a model file'):
         read_arrays(lying)
 
 
 def test_models_with_numbers_that_are_none_are_refused(tmp_path):
-    arrays = read_arrays(disk._MODEL)
+    arrays = read_arrays(disk.MODEL)
     name = next(name for name, values in arrays.items() if values.dtype.kind == 'f')
     arrays[name] = np.full_like(arrays[name], np.nan)
     with pytest.raises(ValueError, match=f'{name} has values that are not finite'):

@@ -47,17 +47,14 @@ def listen_to_everything(one):
     from sensor_msgs.msg import JointState
     from visualization_msgs.msg import MarkerArray
 
-    kinds = {
-        'trajectory_mixture': TrajectoryMixture,
-        'trajectory_markers': MarkerArray,
-        'smoothed_pose_mixture': PoseMixture,
-        'smoothed_joint_states': JointState,
-    }
-    found = {topic: [] for topic in kinds}
-    for topic, kind in kinds.items():
-        one.listen(kind, topic, found[topic])
-    one.spin_until(lambda: all(one.node._is_wanted(topic) for topic in kinds))
-    return found
+    return one.hear(
+        {
+            'trajectory_mixture': TrajectoryMixture,
+            'trajectory_markers': MarkerArray,
+            'smoothed_pose_mixture': PoseMixture,
+            'smoothed_joint_states': JointState,
+        }
+    )
 
 
 def test_mixtures_become_smoothed_poses(running, likelihoods):
@@ -82,7 +79,7 @@ def test_mixtures_become_smoothed_poses(running, likelihoods):
     running.connect()
     handled = running.send('likelihood_mixture', likelihoods.message(5))
     assert handled.faults == ()
-    assert running.node._session.state.window == 1
+    assert running.session.state.window == 1
 
 
 def test_parameters_are_those_of_the_file(running):
@@ -94,8 +91,8 @@ def test_parameters_are_those_of_the_file(running):
         ({'autostart': False}, 'read-only'),
     )
     assert running.set(queue_size=3, max_hypotheses=2) == (True, '')
-    assert running.node._session.parameters.max_hypotheses == 2
-    assert running.node._thread.queue._limits['likelihood_mixture'] == 3
+    assert running.session.parameters.max_hypotheses == 2
+    assert running.limit('likelihood_mixture') == 3
 
 
 def test_one_warning_for_each_kind_and_the_node_lives(running, likelihoods):
@@ -168,7 +165,7 @@ def test_windows_are_smoothed_on_demand(running, likelihoods, monkeypatch):
     monkeypatch.setattr(SmootherSession, 'smooth_span', slow)
     assert len(running.call(SmoothWindow, 'smooth_window').trajectories.stamps) == 4
     running.spin_until(lambda: len(running.handled) == count + 20, 'all that had come')
-    assert running.node._session.state.counts['smoothed'] == 24
+    assert running.session.state.counts['smoothed'] == 24
 
 
 def test_lifecycle(world, likelihoods):
@@ -184,13 +181,13 @@ def test_lifecycle(world, likelihoods):
     assert one.send('likelihood_mixture', likelihoods.message(0)).faults == ()
     assert one.change_state('deactivate')
     assert one.change_state('cleanup')
-    assert one.node._session is None
+    assert one.session is None
     assert one.state == 'unconfigured'
 
 
 def test_queue_holds_what_was_published(running, likelihoods):
     """Mixtures that come while one is smoothed wait."""
-    thread = running.node._thread
+    thread = running.thread
     data = serialise(likelihoods.message(0))
     count = len(running.handled)
     thread.put('likelihood_mixture', data[:60], 0.0)

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,9 @@ OTHERS = ('run_node', 'session_node', 'tracking_node', 'person_node', 'camera_no
 NODES = [name for name in NODES if name not in OTHERS]
 
 
+@cache
 def helped(node, *arguments):
+    """What a node says of itself; the same words are not said twice."""
     done = subprocess.run(
         [sys.executable, '-m', f'hmt_ros.nodes.{node}', *arguments],
         cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,

@@ -71,11 +71,11 @@ class StubTracker:
         self.masks: list[Any] = []
         self.depths: list[Any] = []
         self.nobody_predicted: list[bool] = []
-        self._start = None
+        self.start = None
         StubTracker.made.append(self)
 
     def reset(self, start=None, *, box=None):
-        self._start, self._box = start, box
+        self.start, self.box = start, box
 
     def set_gravity(self, up, camera_height=None):
         self.gravities.append(up)
@@ -111,7 +111,7 @@ class StubTracker:
 
     @property
     def point_estimate(self):
-        start = self._start
+        start = self.start
         return self.body.prior_mean if isinstance(start, Subject) else start.means[0]
 
     def step(
@@ -121,12 +121,10 @@ class StubTracker:
         assert image.shape == (self.camera.height, self.camera.width, 3)
         if self.fault is not None:
             raise self.fault
-        if self._start is None and prediction is not None:
-            self._start = prediction.mixture
+        if self.start is None and prediction is not None:
+            self.start = prediction.mixture
             self.started_from = Source.PREDICTION
-        if self._start is None or (
-            isinstance(self._start, Subject) and stamp < self._start.stamp_ns
-        ):
+        if self.start is None or (isinstance(self.start, Subject) and stamp < self.start.stamp_ns):
             return None, None
         self.seen.append((stamp, keypoints))
         self.predictions.append(prediction)

@@ -184,10 +184,10 @@ def test_who_is_silent_is_not_tracked(session, outputs, people, small_camera):
     assert one.identities == set()
 
 
-def test_the_end_of_the_stream(session, outputs, people):
+def test_the_end_of_the_stream(session, outputs, people, likelihoods):
     one = session()
     one.take(P1, people(0))
-    assert one.finish().published == ((TRACKED, one._now),)
+    assert one.finish().published == ((TRACKED, likelihoods.stamp(0)),)
     assert tracked(outputs) == [['p1_1'], []]
     assert one.finish().published == ()
 

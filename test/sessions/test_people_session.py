@@ -67,7 +67,7 @@ class Follower(StubTracker):
             away = 4.0 if middle[0] < 32 else 5.0
             ray = self.camera.rays(middle[None])[0]
             self.pose[:3] = away * ray / ray[2]
-        self._start = SimpleNamespace(means=self.pose[None])
+        self.start = SimpleNamespace(means=self.pose[None])
         return super().step(image, stamp, keypoints, *args, **inputs)
 
 

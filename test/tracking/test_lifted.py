@@ -40,13 +40,14 @@ def walk():
 
 def observed(tracker, monkeypatch):
     """Keypoints that a tracker sees, image by image."""
-    seen, view = [], tracker._observer.view
+    seen, observer = [], tracker._observer
+    view = observer.view
 
     def spy(image, keypoints, *arguments, **named):
         seen.append(keypoints)
         return view(image, keypoints, *arguments, **named)
 
-    monkeypatch.setattr(tracker._observer, 'view', spy)
+    monkeypatch.setattr(observer, 'view', spy)
     return seen
 
 

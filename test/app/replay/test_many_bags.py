@@ -182,14 +182,15 @@ def test_what_can_not_be_begun(archive, tmp_path, monkeypatch, capsys):
 
 
 def test_bags_in_a_folder(archive, tmp_path):
-    found = dict(many_bags._bags_in(archive, None))
+    bags_in = many_bags._bags_in
+    found = dict(bags_in(archive, None))
     assert found == {'a': archive / 'a', 'day/b': archive / 'day' / 'b'}
-    assert list(many_bags._bags_in(archive, archive / 'day')) == [('a', archive / 'a')]
+    assert list(bags_in(archive, archive / 'day')) == [('a', archive / 'a')]
     for name in ('x.mcap', 'y.db3.zstd', '.hidden.mcap', 'z.txt'):
         (tmp_path / name).write_bytes(b'')
     (tmp_path / '.partial').mkdir()
     (tmp_path / '.partial' / 'metadata.yaml').write_text('')
-    assert [name for name, _ in many_bags._bags_in(tmp_path, None)] == ['x', 'y']
+    assert [name for name, _ in bags_in(tmp_path, None)] == ['x', 'y']
 
 
 def test_through_dask_the_bags_are_the_same(archive, tracked, tmp_path, capfd):

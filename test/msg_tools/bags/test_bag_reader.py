@@ -137,7 +137,9 @@ def test_split_bag_is_merged_by_time(tmp_path: Path, messages: RosbagsMessages) 
         assert bag.message_count() == 66
 
 
-def test_files_compressed_as_a_whole(tmp_path: Path, messages: RosbagsMessages) -> None:
+def test_files_compressed_as_a_whole(
+    tmp_path: Path, messages: RosbagsMessages, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / 'packed'
     folder.mkdir()
     for part in range(2):
@@ -149,10 +151,13 @@ def test_files_compressed_as_a_whole(tmp_path: Path, messages: RosbagsMessages) 
     assert values(folder) == [(10 * p + i, f'{p}.{i}') for p in range(2) for i in range(5)]
     single = folder / 'packed_1.mcap.zstd'
     assert values(single) == [(10 + i, f'1.{i}') for i in range(5)]
-    with BagReader(single) as bag:
-        scratch = Path(bag._scratch.name)  # type: ignore[union-attr]
-        assert scratch.is_dir()
-    assert not scratch.exists()
+    scratch = tmp_path / 'scratch'
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, 'tempdir', str(scratch))
+    with BagReader(single):
+        (unpacked,) = scratch.iterdir()
+        assert unpacked.is_dir()
+    assert list(scratch.iterdir()) == []
 
 
 def test_compressed_file_that_was_cut(tmp_path: Path, small_bag: Path) -> None:

@@ -21,8 +21,10 @@ LIMBS = {'left_arm', 'right_arm', 'left_leg', 'right_leg'}
 SHAPE = {'edges': object()}
 
 
-def jumps(settings=None):
-    return KinematicJumps(Posterior(BODY, CAMERA, settings or TrackerSettings()))
+def searched_for(observation, *, surprising=False, settings=None):
+    """Limbs that an image is searched for."""
+    jumps = KinematicJumps(Posterior(BODY, CAMERA, settings or TrackerSettings()))
+    return set(jumps._not_shown(observation, surprising))
 
 
 def seen(*names):
@@ -50,19 +52,19 @@ LEGS = [f'{side}_{name}' for side in ('left', 'right') for name in ('knee', 'ank
 )
 def test_an_image_is_searched_for_limbs_that_no_keypoints_show(keypoints, searched):
     observation = Observation(keypoints=keypoints, evidence=SHAPE)
-    assert set(jumps()._not_shown(observation, False)) == searched
+    assert searched_for(observation) == searched
 
 
 def test_keypoints_that_are_not_believed_show_nothing():
     every = Observation(keypoints=seen(*BODY.joint_names), evidence=SHAPE)
     observation = replace(every, beliefs=Beliefs(1.0, np.array([1.0, 0.1, 0.9]), 1.0))
-    assert set(jumps()._not_shown(observation, False)) == {'left_arm', 'right_arm'}
+    assert searched_for(observation) == {'left_arm', 'right_arm'}
     # Nor are they where an image is surprising.
-    assert set(jumps()._not_shown(every, True)) == LIMBS
+    assert searched_for(every, surprising=True) == LIMBS
     usual = TrackerSettings()
     off = replace(usual.likelihood, keypoints=TermSettings(0.0, 1.0, 3.0))
-    assert set(jumps(replace(usual, likelihood=off))._not_shown(every, False)) == LIMBS
+    assert searched_for(every, settings=replace(usual, likelihood=off)) == LIMBS
 
 
 def test_without_shapes_nothing_is_searched_for():
-    assert jumps()._not_shown(Observation(keypoints=seen()), True) == []
+    assert searched_for(Observation(keypoints=seen()), surprising=True) == set()
