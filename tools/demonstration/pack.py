@@ -1,4 +1,4 @@
-"""Writes the bag of the demonstration from rendered images, with the keypoints of MediaPipe Pose in them.
+"""Writes the bag of the demonstration from rendered images, with what MediaPipe Pose sees in them.
 
     python pack.py MOTION.npz FOLDER BAG
 
