@@ -31,13 +31,19 @@ progress.INTERVAL = 3600.0
 # process waits for another that has just begun a long one.
 LONGEST = (
     'app/replay/test_live_node.py',
-    'tracking/test_bad_input.py',
     'test_benchmarks.py',
-    'test_tracking_benchmark.py',
+    'tracking/test_bad_input.py',
+    'app/report/test_command.py',
+    'smoothing/test_sliding_window.py',
     'test_docs.py',
+    'test_tracking_benchmark.py',
     'test_launch.py',
+    'app/replay/test_many_bags.py',
+    'app/report/test_page.py',
     'tracking/test_absence.py',
+    'smoothing/test_smoothing_benchmark.py',
     'nodes/test_filter_node.py',
+    'app/replay/test_transforms.py',
     'nodes/test_robustness.py',
     'nodes/test_usage.py',
 )

@@ -222,7 +222,7 @@ def test_an_endless_lag_keeps_all_poses_open(modes, walk):
 
 
 def test_neighbours_are_smoothed_together(modes):
-    mixtures = modes(2.0, times=40)
+    mixtures = modes(2.0, times=18)
     stamps = [round(33_333_333.3 * t) for t in range(len(mixtures))]
 
     def final(every):
@@ -235,7 +235,7 @@ def test_neighbours_are_smoothed_together(modes):
 
     count, always = final(0.0)
     fewer, rarely = final(0.1)
-    assert (count, fewer) == (40, 14)
+    assert (count, fewer) == (18, 6)
     assert [pose.stamp_ns for _, pose in rarely] == stamps
     assert [pose.stamp_ns for _, pose in always] == stamps
     ages = [(stamps[t] - pose.stamp_ns) / 1e9 for t, pose in rarely]
