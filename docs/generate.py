@@ -1,10 +1,11 @@
-"""Writes the tables of parameters, and the results of benchmarks.
+"""Writes the tables and files of parameters, and the results of benchmarks.
 
     python docs/generate.py NAME [NAME ...]
 
 The name of a node, such as filter_node, writes the table of its parameters in NAME.md, between
-`<!-- begin NAME -->` and `<!-- end -->`. The name of a benchmark runs it and writes
-benchmarks/results/NAME.md (minutes; soak ten, experts fifteen, tracking thirty or more).
+`<!-- begin NAME -->` and `<!-- end -->`, and hmt_ros/config/NAME.yaml. The name of a benchmark
+runs it and writes benchmarks/results/NAME.md (minutes; soak ten, experts fifteen, tracking thirty
+or more).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
@@ -35,11 +37,13 @@ _EFFECTS = {
 }
 _MARKS = [*_EFFECTS.values()]
 RESULTS = DOCS.parent / 'benchmarks' / 'results'
+CONFIG = DOCS.parent / 'hmt_ros' / 'config'
 
 
 def main(argv: list[str]) -> int:
     """Writes what is named."""
     from benchmarks import BENCHMARKS
+    from hmt_ros.sessions.parameter_file import parameter_file_text
 
     if not argv or any(name not in (*NODES, *BENCHMARKS) for name in argv):
         sys.stderr.write(f'generate.py: wanted some of {", ".join((*NODES, *BENCHMARKS))}\n')
@@ -50,6 +54,8 @@ def main(argv: list[str]) -> int:
             page.write_text(
                 with_part(page.read_text('utf-8'), name, parameter_table(name)), 'utf-8'
             )
+            text = parameter_file_text(name, settings_of(name))
+            (CONFIG / f'{name}.yaml').write_text(text, 'utf-8')
         else:
             (RESULTS / f'{name}.md').write_text(results(name), 'utf-8')
     return 0
@@ -83,14 +89,9 @@ def results(name: str) -> str:
     return f'{head}\n\n{table}\n\n{machine}\n'
 
 
-def parameter_table(node: str) -> str:
-    """The parameters of a node, as it declares them.
-
-    Parameters that filter_node has with the same default, description and effect are named below
-    the table, or only counted for people_node, which has nearly all.
-    """
+def settings_of(node: str) -> Any:
+    """The parameters of a node with their defaults."""
     from hmt_ros.sessions.bme_parameters import BmeParameters
-    from hmt_ros.sessions.declared_parameters import declared_parameters
     from hmt_ros.sessions.filter_parameters import FilterParameters
     from hmt_ros.sessions.hri_parameters import HriParameters
     from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
@@ -98,17 +99,28 @@ def parameter_table(node: str) -> str:
     from hmt_ros.sessions.people_parameters import PeopleParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
 
-    settings = {
-        'filter_node': FilterParameters(),
-        'smoother_node': SmootherParameters(),
-        'bme_node': BmeParameters(),
-        'keypoints_node': KeypointsParameters(),
-        'hri_node': HriParameters(),
-        'people_adapter_node': PeopleAdapterParameters(),
-        'people_node': PeopleParameters(),
+    kinds = {
+        'filter_node': FilterParameters,
+        'smoother_node': SmootherParameters,
+        'bme_node': BmeParameters,
+        'keypoints_node': KeypointsParameters,
+        'hri_node': HriParameters,
+        'people_adapter_node': PeopleAdapterParameters,
+        'people_node': PeopleParameters,
     }
-    declared = declared_parameters(settings[node])
-    known = [] if node == 'filter_node' else declared_parameters(settings['filter_node'])
+    return kinds[node]()
+
+
+def parameter_table(node: str) -> str:
+    """The parameters of a node, as it declares them.
+
+    Parameters that filter_node has with the same default, description and effect are named below
+    the table, or only counted for people_node, which has nearly all.
+    """
+    from hmt_ros.sessions.declared_parameters import declared_parameters
+
+    declared = declared_parameters(settings_of(node))
+    known = [] if node == 'filter_node' else declared_parameters(settings_of('filter_node'))
     shared = [f'`{parameter.name}`' for parameter in declared if parameter in known]
     declared = [parameter for parameter in declared if parameter not in known]
     rest = ''

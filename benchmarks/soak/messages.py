@@ -16,7 +16,8 @@ from benchmarks.soak.faults import place, warnings_as_errors
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import Scene, scenes, stamped
 from hmt_ros.body import load_body
-from hmt_ros.sessions.filter_session import PREDICTION, FilterSession
+from hmt_ros.sessions.filter_session import FilterSession
+from hmt_ros.sessions.image_inputs import PREDICTION
 from hmt_ros.sessions.session import Session
 from hmt_ros.sessions.smoother_session import SmootherSession
 from hmt_ros.sessions.track_start import prepare_start

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.mutations import damaged
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.watched_node import SHORT, Silent, Watched
-from hmt_ros.sessions.filter_session import PREDICTION
+from hmt_ros.sessions.image_inputs import PREDICTION
 from msg_tools.messages.cdr import canonical, serialise
 
 

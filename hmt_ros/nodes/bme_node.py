@@ -6,9 +6,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from hmt_msgs.msg import PoseMixture
 from hmt_msgs.srv import PredictPose
-from rclpy.serialization import deserialize_message
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
@@ -22,8 +20,6 @@ from hmt_ros.nodes.subscribed_topic import (
 )
 from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS, BmeParameters
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
-from msg_tools.files.error_line import error_line
-from msg_tools.messages.cdr import serialise
 
 
 class BmeNode(SessionNode[BmeSession, BmeParameters]):
@@ -49,28 +45,19 @@ class BmeNode(SessionNode[BmeSession, BmeParameters]):
         if self._settings.predict_from != FROM_KEYPOINTS:
             yield image_topic(self._settings.image_transport)
 
-    def _on_predict_pose(
-        self, request: PredictPose.Request, response: PredictPose.Response
-    ) -> PredictPose.Response:
-        session = self._session
-        if session is None:
-            response.success, response.message = False, 'the node is not configured'
-            return response
+    def _on_predict_pose(self, request: PredictPose.Request, response: PredictPose.Response) -> Any:
         image = request.image if len(request.image.data) else request.compressed_image
-        try:
+
+        def predict(session: BmeSession) -> Any:
             if not len(image.data):
                 raise ValueError('the request has no image: fill image or compressed_image')
-            data = serialise(session.predict_once(image))
-        except (ValueError, ArithmeticError) as error:
-            response.success, response.message = False, error_line(error)
-            return response
-        response.success = True
-        response.mixture = deserialize_message(data, PoseMixture)
-        return response
+            return session.predict_once(image)
+
+        return self._answer(response, 'mixture', predict)
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the node until a signal stops it; returns 0, or 1 if it could not start."""
+    """See `run`."""
     return run(BmeNode, args)
 
 

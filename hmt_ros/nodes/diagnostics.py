@@ -53,9 +53,6 @@ class Rates:
 
         Args:
             counts: 'received', 'dropped', 'faults', 'lost' and those used, since the start.
-            latencies: of the period, s.
-            durations: of the computations in the period.
-            waiting: messages that wait to be handled.
         """
         self._waiting, self._stages = waiting, (math.nan, math.nan)
         if durations:
@@ -116,11 +113,7 @@ def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -
 
 
 class MiddlewareEvents:
-    """Counts lost messages and partners that do not fit, and warns of the first of each kind.
-
-    Args:
-        warn: takes the text of a warning.
-    """
+    """Counts lost messages and partners that do not fit, and warns of the first of each kind."""
 
     def __init__(self, warn: Callable[[str], None]) -> None:
         self._warn = warn
@@ -131,73 +124,57 @@ class MiddlewareEvents:
         self._lock = threading.Lock()
 
     def of_subscription(self, topic: str) -> SubscriptionEventCallbacks:
-        """Callbacks for a subscription.
-
-        Args:
-            topic: its full name.
-        """
-
-        def incompatible(event: Any) -> None:
-            policy = _policy(event)
-            with self._lock:
-                self._policies[topic] = policy
-            self._count(
-                f'publishers of {topic} with another {policy}',
-                event.total_count_change,
-                f'{topic}: a publisher offers another {policy} than is asked for, none of its '
-                f'messages will arrive; see "ros2 topic info --verbose {topic}"',
-            )
-
-        def other_type(event: Any) -> None:
-            self._count(
-                f'publishers of {topic} with another type',
-                event.total_count_change,
-                f'{topic}: a publisher has another type, none of its messages will arrive',
-            )
+        """Callbacks for a subscription to a topic, by its full name."""
 
         def lost(event: Any) -> None:
             count = event.total_count_change
             with self._lock:
                 self._lost[topic] += count
-            self._count(
-                f'messages lost of {topic}',
-                count,
-                f'{topic}: {count} messages were lost on their way',
-            )
+            text = f'{topic}: {count} messages were lost on their way'
+            self._count(f'messages lost of {topic}', count, text)
 
-        return SubscriptionEventCallbacks(
-            incompatible_qos=incompatible, incompatible_type=other_type, message_lost=lost
-        )
+        callbacks = self._misfits(
+            topic, 'publishers of', ('a publisher offers', 'asked for', 'a publisher has'),
+            'none of its messages will arrive',
+        )  # fmt: skip
+        return SubscriptionEventCallbacks(**callbacks, message_lost=lost)
 
     def of_publisher(self, topic: str) -> PublisherEventCallbacks:
-        """Callbacks for a publisher.
+        """Callbacks for a publisher of a topic, by its full name."""
+        callbacks = self._misfits(
+            topic, 'subscriptions to', ('a subscription asks for', 'offered', 'a subscription has'),
+            'it will get no messages',
+        )  # fmt: skip
+        return PublisherEventCallbacks(**callbacks)
 
-        Args:
-            topic: its full name.
-        """
+    def _misfits(
+        self, topic: str, partners: str, words: tuple[str, str, str], effect: str
+    ) -> dict[str, Callable[[Any], None]]:
+        """Callbacks for partners of another quality of service, or of another type."""
+        wants, than, has = words
 
         def incompatible(event: Any) -> None:
             policy = _policy(event)
+            with self._lock:
+                self._policies[f'{partners} {topic}'] = policy
             self._count(
-                f'subscriptions to {topic} with another {policy}',
+                f'{partners} {topic} with another {policy}',
                 event.total_count_change,
-                f'{topic}: a subscription asks for another {policy} than is offered, it will get '
-                f'no messages; see "ros2 topic info --verbose {topic}"',
+                f'{topic}: {wants} another {policy} than is {than}, {effect}; '
+                f'see "ros2 topic info --verbose {topic}"',
             )
 
         def other_type(event: Any) -> None:
-            self._count(
-                f'subscriptions to {topic} with another type',
-                event.total_count_change,
-                f'{topic}: a subscription has another type, it will get no messages',
-            )
+            what = f'{partners} {topic} with another type'
+            text = f'{topic}: {has} another type, {effect}'
+            self._count(what, event.total_count_change, text)
 
-        return PublisherEventCallbacks(incompatible_qos=incompatible, incompatible_type=other_type)
+        return {'incompatible_qos': incompatible, 'incompatible_type': other_type}
 
     def refused_policy(self, topic: str) -> str:
         """The policy of the last publisher that did not fit; '' where all fit."""
         with self._lock:
-            return self._policies.get(topic, '')
+            return self._policies.get(f'publishers of {topic}', '')
 
     def deaf_topic(self, subscriptions: Iterable[Any]) -> str:
         """A topic whose publishers all have a quality of service that does not fit, and why."""

@@ -171,7 +171,6 @@ class EstimatingThread:
 
     Args:
         session: used by this thread alone, until `stop` has returned True.
-        inputs: where messages come from.
         tell: takes the report on each message.
         tell_change: called when status or kinds of faults of the session have changed.
         inner_faults: counts errors that the session should not have raised.

@@ -7,9 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
-from hmt_msgs.msg import PoseMixture
 from hmt_msgs.srv import ForecastPose, Reset
-from rclpy.serialization import deserialize_message
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.tracking_node import TrackingNode
@@ -17,8 +15,6 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from msg_tools import RosbagsMessages
-from msg_tools.files.error_line import error_line
-from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.pose_mixtures import pose_mixture_message
 
@@ -56,24 +52,16 @@ class FilterNode(TrackingNode[FilterSession, FilterParameters]):
 
     def _on_forecast_pose(
         self, request: ForecastPose.Request, response: ForecastPose.Response
-    ) -> ForecastPose.Response:
-        session = self._session
-        if session is None:
-            response.success, response.message = False, 'the node is not configured'
-            return response
-        try:
+    ) -> Any:
+        def forecast(session: FilterSession) -> Any:
             content = session.robot.forecast(time_ns(request.stamp))
-            data = serialise(pose_mixture_message(RosbagsMessages(), content))
-        except ValueError as error:
-            response.success, response.message = False, error_line(error)
-            return response
-        response.success = True
-        response.mixture = deserialize_message(data, PoseMixture)
-        return response
+            return pose_mixture_message(RosbagsMessages(), content)
+
+        return self._answer(response, 'mixture', forecast)
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the node until a signal stops it; returns 0, or 1 if it could not start."""
+    """See `run`."""
     return run(FilterNode, args)
 
 

@@ -7,7 +7,7 @@ looks for mixtures in namespaces that it does not know yet, and leaves those tha
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
@@ -63,9 +63,6 @@ class HriNode(SessionNode[HriSession, HriParameters]):
 
     def _messages_of_others(self, settings: HriParameters) -> Mapping[str, str]:
         return {IDS: 'hri_node'}
-
-    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
-        return ()
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         p = self._settings
@@ -174,7 +171,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the node until a signal stops it; returns 0, or 1 if it could not start."""
+    """See `run`."""
     return run(HriNode, args)
 
 

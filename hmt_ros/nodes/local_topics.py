@@ -7,7 +7,7 @@ processes is subscribed to once, by the first node that listens, which hands it 
 from __future__ import annotations
 
 import threading
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +18,8 @@ from msg_tools.messages.images import decode_image
 
 # Messages that are shared, the newest, and their least size, bytes: small ones are read again.
 SHARED, LARGE = 4, 10_000
+# Messages that may be on their way back; those of a middleware that returns none are forgotten.
+_MOST_OWN = 1000
 
 
 @dataclass(eq=False)
@@ -105,3 +107,41 @@ class LocalTopics:
     def listeners(self, topic: str) -> int:
         """How many nodes of this process listen to a topic."""
         return len(self._listeners.get(topic, ()))
+
+
+class OwnMessages:
+    """What was published on a topic to which the publisher subscribes, too; for any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: Counter[bytes] = Counter()
+        self._order: deque[bytes] = deque()
+
+    def sent(self, data: bytes) -> None:
+        """Notes a message, before it is published; CDR bytes."""
+        key = _key(data)
+        with self._lock:
+            self._waiting[key] += 1
+            self._order.append(key)
+            while len(self._order) > _MOST_OWN:
+                self._forget(self._order.popleft())
+
+    def is_own(self, data: bytes) -> bool:
+        """Whether a message that was received is one of those; each comes back once."""
+        key = _key(data)
+        with self._lock:
+            if key not in self._waiting:
+                return False
+            self._forget(key)
+            self._order.remove(key)
+            return True
+
+    def _forget(self, key: bytes) -> None:
+        self._waiting[key] -= 1
+        if not self._waiting[key]:
+            del self._waiting[key]
+
+
+def _key(data: bytes) -> bytes:
+    """The message without its head, and without what the middleware pads its end with."""
+    return bytes(data[4:]).rstrip(b'\0')

@@ -59,7 +59,6 @@ def with_empty_lists(parameters: Iterable[Parameter], names: Set[str]) -> list[P
     ROS tools write an empty list as no value, and rclpy takes away a parameter that has none.
 
     Args:
-        parameters: that are to be set.
         names: of those that are lists of numbers.
     """
     return [
@@ -75,7 +74,6 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
 
     Args:
         given: names from the command line and from parameter files.
-        known: names that the node has.
     """
     names = sorted(known)
     texts = []
@@ -93,8 +91,6 @@ def next_step(node: Node, error: ValueError, checked: Iterable[str]) -> str:
     """What to do after a configuration that failed.
 
     Args:
-        node: that was configured.
-        error: why it failed.
         checked: names of parameters that may be the cause.
     """
     values = {name: node.get_parameter(name).value for name in checked}
@@ -113,7 +109,6 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
     A file for other nodes is none: one file may serve many nodes.
 
     Args:
-        arguments: of the command line.
         node: its full name.
     """
     words, texts = list(arguments), []

@@ -6,9 +6,8 @@ It publishes what is installed: people_msgs/People, vision_msgs/Detection3DArray
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
-from typing import Any
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
@@ -44,9 +43,6 @@ class PeopleAdapterNode(SessionNode[PeopleAdapterSession, PeopleAdapterParameter
             )
         return {one.msgtype: 'people_adapter_node' for one in self.SESSION.TOPICS.values()}
 
-    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
-        return ()
-
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         if not self._settings.named:
             yield mixture_topic(MIXTURE, MIXTURE)
@@ -56,7 +52,7 @@ class PeopleAdapterNode(SessionNode[PeopleAdapterSession, PeopleAdapterParameter
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the node until a signal stops it; returns 0, or 1 if it could not start."""
+    """See `run`."""
     return run(PeopleAdapterNode, args)
 
 

@@ -98,7 +98,7 @@ class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the node until a signal stops it; returns 0, or 1 if it could not start."""
+    """See `run`."""
     return run(PeopleNode, args)
 
 

@@ -17,10 +17,9 @@ from hmt_ros.nodes.bme_node import BmeNode
 from hmt_ros.nodes.filter_node import FilterNode
 from hmt_ros.nodes.keypoints_node import KeypointsNode
 from hmt_ros.nodes.local_topics import LocalTopics
-from hmt_ros.nodes.run_node import run_together
+from hmt_ros.nodes.run_node import run_together, wants_help
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.smoother_node import SmootherNode
-from hmt_ros.nodes.usage import wants_help
 
 NAME = 'person_node'
 NODES: Mapping[str, type[SessionNode[Any, Any]]] = {
@@ -61,7 +60,6 @@ def nodes_together(names: Sequence[str], **options: Any) -> list[SessionNode[Any
     """Nodes that hand their messages to each other.
 
     Args:
-        names: of the nodes.
         options: of all of them, see `SessionNode`.
     """
     local, values = LocalTopics(), used_of_each_other(names)

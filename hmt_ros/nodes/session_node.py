@@ -24,11 +24,12 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 
 from hmt_ros.compiled_code import prepare
 from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, trouble_of_period
 from hmt_ros.nodes.estimating_thread import EstimatingThread, InnerFaults
-from hmt_ros.nodes.local_topics import Listener, LocalTopics
+from hmt_ros.nodes.local_topics import Listener, LocalTopics, OwnMessages
 from hmt_ros.nodes.node_parameters import (
     QOS_OVERRIDES,
     as_in_ros,
@@ -52,7 +53,6 @@ from hmt_ros.sessions.declared_parameters import (
     with_values,
 )
 from hmt_ros.sessions.handled import HANDLED, Handled, Output, handled_message
-from hmt_ros.sessions.own_messages import OwnMessages
 from hmt_ros.sessions.session import SUBSCRIBERS, Session, SessionState
 from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
@@ -145,9 +145,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """Default values of the parameters in the namespace of the node."""
         return defaults
 
-    @abstractmethod
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         """Types, names and callbacks of the services."""
+        return ()
 
     @abstractmethod
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
@@ -192,6 +192,19 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         session: AnySession = self.SESSION(settings, *functions)
         session.decode_image = self._local.decode
         return session
+
+    def _answer(self, response: Any, field: str, make: Callable[[AnySession], Any]) -> Any:
+        """A response with the message that a session makes in a field, or why there is none."""
+        try:
+            if self._session is None:
+                raise ValueError('the node is not configured')
+            data = serialise(make(self._session))
+        except (ValueError, ArithmeticError) as error:
+            response.success, response.message = False, error_line(error)
+            return response
+        response.success = True
+        setattr(response, field, deserialize_message(data, type(getattr(response, field))))
+        return response
 
     def _new_publisher(self, topic: str, msgtype: str, qos: QoSProfile) -> Any:
         events = self._events.of_publisher(self.resolve_topic_name(topic))

@@ -45,10 +45,6 @@ class Publication(NamedTuple):
 class SilentTopics:
     """Watches the topics that a node subscribes to.
 
-    Args:
-        node: that subscribes.
-        warn: takes the text of a warning.
-
     Attributes:
         texts: of the silent topics, as the last look has found them: the topics, and why.
     """
@@ -73,7 +69,6 @@ class SilentTopics:
         """Begins anew with other subscriptions; without any, nothing is silent.
 
         Args:
-            inputs: the subscriptions.
             pace: source of the messages that are estimated from.
         """
         self._pace = pace
@@ -139,13 +134,7 @@ class SilentTopics:
 def why_silent(
     wanted: list[SubscribedTopic], names: list[str], published: list[Publication]
 ) -> str:
-    """Why nothing arrives on topics any of which is enough, and what to do.
-
-    Args:
-        wanted: the topics.
-        names: their full names.
-        published: what others publish.
-    """
+    """Why nothing arrives on topics any of which is enough, and what to do."""
     topics = ' or '.join(
         f'{name} ({_short(one.msgtype)})' for one, name in zip(wanted, names, strict=True)
     )

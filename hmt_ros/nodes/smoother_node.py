@@ -10,17 +10,13 @@ import sys
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from hmt_msgs.msg import TrajectoryMixture
 from hmt_msgs.srv import SmoothWindow
-from rclpy.serialization import deserialize_message
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic, mixture_topic
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
-from msg_tools.files.error_line import error_line
-from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
 
 
@@ -40,25 +36,14 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
 
     def _on_smooth_window(
         self, request: SmoothWindow.Request, response: SmoothWindow.Response
-    ) -> SmoothWindow.Response:
-        session = self._session
-        if session is None:
-            response.success, response.message = False, 'the node is not configured'
-            return response
+    ) -> Any:
         # Mixtures that come meanwhile wait, in the middleware or in the queue.
         span = time_ns(request.from_time), time_ns(request.to_time)
-        try:
-            data = serialise(session.smooth_span(*span))
-        except ValueError as error:
-            response.success, response.message = False, error_line(error)
-            return response
-        response.success = True
-        response.trajectories = deserialize_message(data, TrajectoryMixture)
-        return response
+        return self._answer(response, 'trajectories', lambda session: session.smooth_span(*span))
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the node until a signal stops it; returns 0, or 1 if it could not start."""
+    """See `run`."""
     return run(SmootherNode, args)
 
 

@@ -124,7 +124,6 @@ def read_installed_messages(msgtype: str, needed_by: str) -> None:
     """Reads the definitions of a package of messages, as it is installed.
 
     Args:
-        msgtype: one of the messages.
         needed_by: what needs it, for the error.
 
     Raises:

@@ -1,13 +1,7 @@
-"""Parameters of the BME node, which are the settings of offline replay as well.
-
-`hmt_ros/config/bme_node.yaml` lists them with their defaults; it is written by
-
-    python -m hmt_ros.sessions.bme_parameters > hmt_ros/config/bme_node.yaml
-"""
+"""Parameters of the BME node, which are the settings of offline replay as well."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 
 from hmt_ros.experts.lifter import SHIPPED as LIFTER
@@ -17,11 +11,11 @@ from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_CONFIGURE,
     CameraNodeParameters,
+    check_choices,
     nested_parameters,
     parameter_field,
 )
 from hmt_ros.sessions.filter_parameters import BACKGROUND
-from hmt_ros.sessions.parameter_file import parameter_file_text
 
 # What a prediction is from.
 FROM_SILHOUETTES, FROM_KEYPOINTS, FROM_BOTH = 'silhouettes', 'keypoints', 'both'
@@ -75,17 +69,6 @@ class BmeParameters(CameraNodeParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.propagation not in PROPAGATIONS:
-            raise ValueError(
-                f'propagation is {self.propagation!r}, wanted one of {", ".join(PROPAGATIONS)}'
-            )
-        if self.predict_from not in CUES:
-            raise ValueError(
-                f'predict_from is {self.predict_from!r}, wanted one of {", ".join(CUES)}'
-            )
+        check_choices(self, propagation=PROPAGATIONS, predict_from=CUES)
         if self.predict_from != FROM_SILHOUETTES and not self.lifter:
             raise ValueError(f"predict_from {self.predict_from!r} needs a lifter, saw ''")
-
-
-if __name__ == '__main__':
-    sys.stdout.write(parameter_file_text('bme_node', BmeParameters()))

@@ -1,7 +1,6 @@
 """The prediction of poses from single images behind its topics.
 
-The node and offline replay give their messages to a `BmeSession`; the same messages in the same
-order give the same bytes. The rules, besides those of `CameraSession`:
+The rules, besides those of `CameraSession`:
 
 - Every image that can be used gets one prediction. One without components says that nobody was
   seen: the background is still being learned, or no silhouette has the height of a person.
@@ -14,8 +13,6 @@ order give the same bytes. The rules, besides those of `CameraSession`:
 - The silhouette of every image is published if somebody subscribes to it: that of the background
   subtraction, empty while the background is being learned. An image that is left to the track has
   one, too. With `use_mask` there is none besides the mask.
-- An image that is not younger than the one before is skipped, or is the first of a new sequence
-  with `reset_on_time_jump`.
 - With `propagation` a prediction takes the one before into account, unless this is older than
   `longest_interval`, comes from another calibration, or from before a jump in time.
 - With `predict_from` 'keypoints' every message of keypoints gets one prediction, from them and
@@ -23,14 +20,12 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   fewer than five landmarks are seen. With 'both' an image waits for the keypoints of exactly its
   stamp, for those of a later stamp, or for an image that is `input_timeout` younger; its silhouette
   counts where keypoints show nobody. (The product of both predictions errs as that from keypoints.)
-- What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -63,21 +58,19 @@ from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
     CAMERA_MOVED,
     FRAME_ID,
-    IMAGE,
     CameraSession,
     WaitingImage,
     check_size,
     read_picture,
 )
-from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK_INPUT, ImageInput
+from hmt_ros.sessions.handled import Fault
+from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK_INPUT, PREDICTION, ImageInput
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input, known_lifter
 from hmt_ros.sessions.session import (
     NeededInput,
     Order,
     PublishedTopic,
     SessionState,
-    everything,
     frame_id_of,
 )
 from hmt_ros.sessions.warm_up import film
@@ -91,9 +84,6 @@ from msg_tools.messages.pose_mixtures import (
     pose_mixture_message,
 )
 
-__all__ = ['CAMERA_INFO', 'IMAGE', 'PREDICTION', 'TOPICS', 'TRACK', 'BmeSession', 'BmeState']
-
-PREDICTION = 'pose_prediction'
 TRACK, SILHOUETTE = 'pose_mixture', 'silhouette'
 TOPICS = {PREDICTION: PublishedTopic('hmt_msgs/msg/PoseMixture')}
 # Silhouettes are large: bags have none.
@@ -161,19 +151,15 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     ESTIMATE = 'the sequence'
     CHECKED = ('model_file', 'background_file', 'stature', 'lifter')
 
-    def __init__(
-        self,
-        parameters: BmeParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        super().__init__(parameters, publish, wanted)
-        self._predictor, self._size_spread = _predictor_of(parameters)
-        self._background = BackgroundModel(parameters.background)
+    def _set_up(self) -> None:
+        super()._set_up()
+        p = self.parameters
+        self._predictor, self._size_spread = _predictor_of(p)
+        self._background = BackgroundModel(p.background)
         self._given: NDArray[np.uint8] | None = None
-        if parameters.background_file:
-            self._given = read_picture(parameters.background_file)
-            self._background = BackgroundModel.from_image(self._given, parameters.background)
+        if p.background_file:
+            self._given = read_picture(p.background_file)
+            self._background = BackgroundModel.from_image(self._given, p.background)
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
         self._previous: _Previous | None = None
@@ -182,12 +168,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._tracked: int | None = None
         self._height, self._support = 0, math.nan
         # Whether the last prediction needed no background.
-        self._without_background = parameters.predict_from == FROM_KEYPOINTS
+        self._without_background = p.predict_from == FROM_KEYPOINTS
         self._lifter = None
-        if parameters.predict_from != FROM_SILHOUETTES:
-            self._lifter = known_lifter(parameters.lifter)
-        self._cue = parameters.predict_from
-        self._keypoints = KeypointReader(parameters.source, self._log)
+        if p.predict_from != FROM_SILHOUETTES:
+            self._lifter = known_lifter(p.lifter)
+        self._cue = p.predict_from
+        self._keypoints = KeypointReader(p.source, self._log)
         self._by_keypoints: KeypointPredictor | None = None
         self.state = self._present_state()
 

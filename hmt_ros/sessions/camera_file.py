@@ -51,7 +51,6 @@ def read_camera(path: Path, size: tuple[int, int]) -> Camera:
     """The camera that a calibration file describes.
 
     Args:
-        path: of the file.
         size: width and height of the images, px; the file must be for the same.
 
     Raises:

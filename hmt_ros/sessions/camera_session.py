@@ -25,7 +25,7 @@ from hmt_ros.image.background import BackgroundModel, SceneWatch
 from hmt_ros.inference.arrays import Image, Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters
-from hmt_ros.sessions.handled import Fault, Handled, Output
+from hmt_ros.sessions.handled import Fault, Handled
 from hmt_ros.sessions.image_inputs import (
     DEPTH,
     DETECTIONS,
@@ -37,8 +37,7 @@ from hmt_ros.sessions.image_inputs import (
     StampedInputs,
     Taken,
 )
-from hmt_ros.sessions.named_frames import NamedFrames
-from hmt_ros.sessions.session import NeededInput, Order, Session, State, everything
+from hmt_ros.sessions.session import NeededInput, Order, Session, State
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, UncalibratedError, camera_from_info
 from msg_tools.messages.detections import stamp_of_floats
@@ -47,6 +46,7 @@ from msg_tools.messages.images import ImageError, decode_picture
 
 CAMERA_INFO, IMAGE = 'camera_info', 'image'
 CAMERA_MOVED = 'the camera has moved since the background was taken'
+IN_BACKGROUND = 'the background was learned with the person in it'
 FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
 
 CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
@@ -54,6 +54,8 @@ CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 # Images that may wait for other inputs: half a second of a usual camera.
 MOST_INCOMPLETE = 16
 _LARGEST_PICTURE_FILE = 2**28  # bytes
+# Frames that are remembered; a camera has one.
+_MOST_FRAMES = 8
 
 
 class WaitingImage(NamedTuple):
@@ -88,6 +90,47 @@ class WaitingImage(NamedTuple):
         return depth
 
 
+class NamedFrames:
+    """The frames that the messages of a camera name: they are to be one.
+
+    Two publishers on one topic, or the camera_info of another camera, else go unnoticed.
+
+    Args:
+        image, info: what sessions call the sources of images and of camera_info.
+    """
+
+    def __init__(self, image: str, info: str) -> None:
+        self._image, self._info = image, info
+        self._seen: dict[str, list[str]] = {image: [], info: []}
+
+    def see(self, source: str, frame_id: str, naming: Callable[[str], str]) -> list[str]:
+        """Takes the frame of a message; returns what is to be warned of, once for each frame.
+
+        Args:
+            frame_id: may be empty.
+            naming: names a source for the user.
+        """
+        seen, other = self._seen[source], self._info if source == self._image else self._image
+        if not frame_id or frame_id in seen or len(seen) == _MOST_FRAMES:
+            return []
+        texts = []
+        if seen:
+            texts.append(
+                f'{naming(source)} has messages of the frames {seen[-1]!r} and {frame_id!r}: '
+                'wanted those of one camera; stop or remap one of the publishers'
+            )
+        elif self._seen[other] and frame_id not in self._seen[other]:
+            frames = {source: frame_id, other: self._seen[other][-1]}
+            texts.append(
+                f'{naming(self._image)} has frame_id {frames[self._image]!r}, '
+                f'{naming(self._info)} has {frames[self._info]!r}: results are in that of the '
+                'image; if both are of one camera, set one frame_id in its driver, else remap '
+                'camera_info'
+            )
+        seen.append(frame_id)
+        return texts
+
+
 class CameraSession(Session[CameraParameters, State]):
     """A session that estimates from images; see `Session` for arguments and attributes.
 
@@ -98,13 +141,7 @@ class CameraSession(Session[CameraParameters, State]):
     COUNTED = IMAGE
     UNIT = 'image'
 
-    def __init__(
-        self,
-        parameters: CameraParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        super().__init__(parameters, publish, wanted)
+    def _set_up(self) -> None:
         self._camera: Camera | None = None
         self._frame = ''
         self._frames = NamedFrames(IMAGE, CAMERA_INFO)
@@ -112,10 +149,10 @@ class CameraSession(Session[CameraParameters, State]):
         self._watch = SceneWatch()
         self._waiting: deque[WaitingImage] = deque()
         self._newest: int | None = None
-        self.rows = self.inputs_of(parameters)
+        self.rows = self.inputs_of(self.parameters)
         self._inputs = ImageInputs(self.rows, self._log)
         # Messages of `floats` may have no stamp: then it is that of the newest camera_info.
-        self._floats, self._info_stamp = parameters.source == 'floats', 0
+        self._floats, self._info_stamp = self.parameters.source == 'floats', 0
         # Images that have come since the last estimate; whether some were left when it was
         # interrupted; and stamps of those that were dropped.
         self._fresh = 0
@@ -362,7 +399,6 @@ def camera_moved_fault(shift: float, stamp_ns: int, remedy: str) -> str:
 
     Args:
         shift: of the scene, px; NaN: unknown.
-        stamp_ns: of the image.
         remedy: how a new background is taken.
     """
     far = 'elsewhere' if math.isnan(shift) else f'{shift:.0f} px away'

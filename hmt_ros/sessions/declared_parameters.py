@@ -118,6 +118,27 @@ def nested_parameters(
     return {_EFFECT: effect, _LIMITS: parameters, _PREFIX: prefix}
 
 
+def check_choices(settings: Any, **choices: tuple[str, ...]) -> None:
+    """Raises ValueError where a field of settings has none of the values that it may have."""
+    for name, values in choices.items():
+        if (value := getattr(settings, name)) not in values:
+            raise ValueError(f'{name} must be one of {values}, saw {value!r}')
+
+
+def namespaces_in(text: str) -> tuple[str, ...]:
+    """The namespaces in a text, which blanks separate, each once.
+
+    Raises:
+        ValueError: a name that no namespace can have.
+    """
+    for namespace in text.split():
+        if not re.fullmatch(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+', namespace):
+            raise ValueError(
+                f'namespaces: wanted names such as /humans/bodies/anna, saw {namespace!r}'
+            )
+    return tuple(dict.fromkeys(text.split()))
+
+
 @dataclass(frozen=True)
 class NodeParameters:
     """Parameters that all nodes have.
@@ -151,10 +172,7 @@ class ImageNodeParameters(NodeParameters):
     image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
 
     def __post_init__(self) -> None:
-        if self.image_transport not in TRANSPORTS:
-            raise ValueError(
-                f'image_transport must be one of {TRANSPORTS}, saw {self.image_transport!r}'
-            )
+        check_choices(self, image_transport=TRANSPORTS)
 
 
 @dataclass(frozen=True)
@@ -187,13 +205,7 @@ class CameraNodeParameters(ImageNodeParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        known = {
-            'source': self.SOURCES,
-            'keypoint_scheme': (AUTO, JOINTS, *schemes()),
-        }
-        for name, values in known.items():
-            if (value := getattr(self, name)) not in values:
-                raise ValueError(f'{name} must be one of {values}, saw {value!r}')
+        check_choices(self, source=self.SOURCES, keypoint_scheme=(AUTO, JOINTS, *schemes()))
 
     @property
     def order(self) -> Scheme:

@@ -1,13 +1,7 @@
-"""Parameters of the filter node, which are the settings of offline replay as well.
-
-`hmt_ros/config/filter_node.yaml` lists them with their defaults; it is written by
-
-    python -m hmt_ros.sessions.filter_parameters > hmt_ros/config/filter_node.yaml
-"""
+"""Parameters of the filter node, which are the settings of offline replay as well."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 
 from hmt_ros.image.background import BackgroundSettings
@@ -22,7 +16,6 @@ from hmt_ros.sessions.declared_parameters import (
     nested_parameters,
     parameter_field,
 )
-from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.evaluation_plan import LIVE
 from hmt_ros.tracking.ground import KnownGround
@@ -160,7 +153,3 @@ class FilterParameters(CameraNodeParameters):
         """What the parameters tell of gravity and of the floor, without transforms."""
         up = -unit_vector(self.gravity, 'gravity') if self.gravity else None
         return KnownGround(up, self.camera_height or None)
-
-
-if __name__ == '__main__':
-    sys.stdout.write(parameter_file_text('filter_node', FilterParameters()))

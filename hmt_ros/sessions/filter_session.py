@@ -1,23 +1,19 @@
 """The filter behind its topics.
 
-The node and offline replay give their messages to a `FilterSession`; the same messages in the same
-order give the same bytes. The rules, besides those of `TrackingSession`:
+The rules, besides those of `TrackingSession`:
 
-- An image that is not younger than the one before is skipped, or starts the track anew with
-  `reset_on_time_jump`.
 - An image waits for the inputs that are used (`image_inputs`); keypoints without names, and
   mixtures without components, say that nobody was seen.
 - When the person is no longer in view one mixture without components of either kind goes out, with
   markers that remove those before, and then nothing until a new track starts.
-- What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,29 +22,28 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
-from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, WaitingImage
+from hmt_ros.sessions.camera_session import (
+    CAMERA_MOVED,
+    IN_BACKGROUND,
+    WaitingImage,
+)
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_state import FilterState
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.image_inputs import (
-    COMPRESSED_MASK,
-    DEPTH,
     INPUTS,
     KEYPOINTS,
     KEYPOINTS_3D,
     KEYPOINTS_INPUT,
-    MASK,
     PREDICTION,
     PREDICTION_INPUT,
     ImageInput,
 )
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input
 from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
-from hmt_ros.sessions.session import everything
+from hmt_ros.sessions.session import SessionState
 from hmt_ros.sessions.track_messages import (
     TOPICS_OF_NODE,
-    Presentation,
     TrackedImage,
     nobody_messages,
     robot_messages,
@@ -64,19 +59,6 @@ from msg_tools.messages.cdr import serialise
 from msg_tools.messages.keep_out import KeepOutState
 from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_of
 
-__all__ = [
-    'CAMERA_INFO',
-    'COMPRESSED_MASK',
-    'DEPTH',
-    'IMAGE',
-    'KEYPOINTS',
-    'KEYPOINTS_3D',
-    'MASK',
-    'PREDICTION',
-    'FilterSession',
-    'FilterState',
-]
-
 # Change of a length above which a body is described anew, m.
 RESHAPED = 0.005
 _STATES = {
@@ -85,6 +67,66 @@ _STATES = {
     Status.LOST: KeepOutState.LOST,
     Status.NOBODY: KeepOutState.NOBODY,
 }
+
+
+@dataclass(frozen=True)
+class FilterState(SessionState):
+    """State of the filter: its status is 'no camera', or a value of `Status`.
+
+    Attributes:
+        body: of the present track; None: there is none.
+        modes: components of the posterior.
+        misfit: share of the image that no mode explains.
+        evaluations: of the likelihood in the last image.
+        background: what is known of it, in a few words.
+        doubted: whether it was learned with the person in it, and is not known again.
+        moved: whether the camera has moved since it was taken.
+        track_id: number of the present track, or of the last one; 0 before the first.
+        started_from: what that track began from; '' before the first.
+        existence: probability that a person is in view; NaN: no image yet.
+        beliefs: probability that each cue shows the person, and that the track has the person.
+    """
+
+    body: Body | None = None
+    modes: int = 0
+    misfit: float = 0.0
+    evaluations: int = 0
+    background: str = 'unknown'
+    doubted: bool = False
+    moved: bool = False
+    track_id: int = 0
+    started_from: str = ''
+    existence: float = math.nan
+    beliefs: Mapping[str, float] = field(default_factory=dict)
+
+    def summary(self) -> str:
+        """The present estimate in a few words."""
+        return f'{self.modes} modes'
+
+    def trouble(self) -> str:
+        """Whether the track is lost, nobody is in view, or the background is of no use."""
+        if self.status == Status.NOBODY.value:
+            return 'nobody in view'
+        if self.status == Status.LOST.value:
+            lost = f'lost: misfit {self.misfit:.2f}, existence {self.existence:.2f}'
+            return f'{lost}; {CAMERA_MOVED}' if self.moved else lost
+        if self.moved:
+            return CAMERA_MOVED
+        return f'{IN_BACKGROUND}; {self.background}' if self.doubted else ''
+
+    def values(self) -> list[tuple[str, str]]:
+        """Keys and values of the diagnostics."""
+        return [
+            ('track', str(self.track_id)),
+            ('started from', self.started_from),
+            ('probability that a person is in view', f'{self.existence:.3f}'),
+            ('modes', str(self.modes)),
+            ('entropy of the weights, nats', f'{self.entropy:.3f}'),
+            ('misfit', f'{self.misfit:.3f}'),
+            *((f'belief in {cue}', f'{p:.2f}') for cue, p in self.beliefs.items()),
+            ('background', self.background),
+            ('evaluations of the likelihood', str(self.evaluations)),
+        ]
 
 
 class FilterSession(TrackingSession[FilterParameters, FilterState]):
@@ -98,18 +140,13 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
     ESTIMATE = 'the track'
     CHECKED = ('subject_file', 'background_file', 'body_model', 'lifter')
 
-    def __init__(
-        self,
-        parameters: FilterParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        super().__init__(parameters, publish, wanted)
+    def _set_up(self) -> None:
+        super()._set_up()
         self._tracker: Tracker | None = None
         self._tracks, self._turn = 0, 0.0
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
-        self._keypoints = KeypointReader(parameters.source, self._log)
+        self._keypoints = KeypointReader(self.parameters.source, self._log)
         # Of an image that was left out since the last estimate.
         self._late_prediction: PosePrediction | None = None
         self.robot = RobotOutputs()
@@ -263,7 +300,6 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         starts = shown is None or not _looks_like(tracker.body, shown)
         if starts:
             self._shown_body = tracker.body
-        frame = waiting.frame_id
         fixed = None
         if p.publish_in_fixed_frame:
             if self.frames.pose is None:
@@ -275,47 +311,14 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                 return
             fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
             self._turn = fixed.turn_of(tracker.body, posterior.means[0])
+        shown_frames = (waiting.frame_id, p.frame_prefix)
         track = TrackedImage(
-            image=waiting.image,
-            stamp_ns=waiting.stamp_ns,
-            frame_id=frame,
-            body=tracker.body,
-            camera=tracker.camera,
-            posterior=posterior,
-            likelihood=likelihood,
-            log_likelihoods=tracker.modes.log_likelihoods,
-            likelihood_values=tracker.log_likelihoods,
-            likelihood_errors=tracker.likelihood_errors,
-            shape_covariance=tracker.shape_covariance,
-            point=tracker.point_estimate,
-            ground=tracker.ground,
-            contacts=tracker.contacts,
-            starts=starts,
-            state=TrackState.LOST if tracker.status is Status.LOST else TrackState.TRACKING,
-            track_id=tracker.track_id,
-            existence_probability=tracker.existence_probability,
-            cue_probabilities=tracker.validity.shown,
-            identities=tracker.modes.identities,
-            velocities=tracker.velocities,
-            up=tracker.vertical,
-            fixed=fixed,
-        )
-        presentation = Presentation(
-            tracker.settings.max_hypotheses,
-            p.overlay_modes,
-            p.publish_tf,
-            p.frame_prefix,
-            describe=starts or self._shown_frames != (frame, p.frame_prefix),
-        )
-
-        track_messages(
-            self._messages,
-            track,
-            presentation,
-            self._wanted,
-            lambda topic, message: self._publish(topic, waiting.stamp_ns, message),
-        )
-        self._shown_frames = (frame, p.frame_prefix)
+            waiting, tracker, posterior, likelihood, p,
+            starts=starts, describe=starts or self._shown_frames != shown_frames, fixed=fixed,
+        )  # fmt: skip
+        for topic, message in track_messages(track, self._wanted):
+            self._publish(topic, waiting.stamp_ns, message)
+        self._shown_frames = shown_frames
         self._weights = posterior.weights
         self._log.counts['tracked'] += 1
 
@@ -328,7 +331,6 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         """Publishes what a robot acts on; of every image, whatever it shows.
 
         Args:
-            waiting: the image.
             tracker: after the image; None: it could not be tracked.
             posterior: of the image; None: there is no track.
         """
@@ -354,38 +356,22 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         existence = math.nan if tracker is None else tracker.existence_probability
         with self._telling:
             self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen)
-            robot_messages(self._messages, self.robot, p, self._wanted, self._publish)
+            for made in robot_messages(self.robot, p, self._wanted):
+                self._publish(*made)
             self.answered += 1
 
     def stale(self, silence: float, answered: int) -> list[Output]:
         """See `TrackingSession`."""
         with self._telling:
-            return self._stale(silence) if answered == self.answered else []
-
-    def _stale(self, silence: float) -> list[Output]:
-        found: list[Output] = []
-
-        def publish(topic: str, stamp: int, message: Any) -> None:
-            found.append(Output(topic, stamp, serialise(message)))
-
-        robot_messages(self._messages, self.robot, self.parameters, self._wanted, publish, silence)
-        return found
+            if answered != self.answered:
+                return []
+            made = robot_messages(self.robot, self.parameters, self._wanted, silence)
+            return [Output(topic, stamp, serialise(message)) for topic, stamp, message in made]
 
     def _publish_nobody(self, tracker: Tracker, waiting: WaitingImage) -> None:
         """The end of a track whose person is no longer in view."""
-        p = self.parameters
-        nobody_messages(
-            self._messages,
-            tracker.body,
-            tracker.track_id,
-            tracker.existence_probability,
-            tracker.settings.max_hypotheses,
-            waiting.stamp_ns,
-            f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id,
-            waiting.image if p.overlay_modes else None,
-            self._wanted,
-            lambda topic, message: self._publish(topic, waiting.stamp_ns, message),
-        )
+        for topic, message in nobody_messages(tracker, waiting, self.parameters, self._wanted):
+            self._publish(topic, waiting.stamp_ns, message)
         self._weights = np.empty(0)
 
     # State.

@@ -165,9 +165,7 @@ class HandlingLog:
         """Reports a message that waited here in vain and is dropped.
 
         Args:
-            kind: of the fault.
             held_up: what it waited for.
-            text: of the fault.
         """
         self.counts['dropped'] += 1
         self.held_up = held_up

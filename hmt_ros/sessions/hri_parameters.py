@@ -1,14 +1,7 @@
-"""Parameters of the node that speaks REP 155.
-
-`hmt_ros/config/hri_node.yaml` lists them with their defaults; it is written by
-
-    python -m hmt_ros.sessions.hri_parameters > hmt_ros/config/hri_node.yaml
-"""
+"""Parameters of the node that speaks REP 155."""
 
 from __future__ import annotations
 
-import re
-import sys
 from dataclasses import dataclass
 
 from hmt_ros.sessions.declared_parameters import (
@@ -16,9 +9,10 @@ from hmt_ros.sessions.declared_parameters import (
     NEXT_CONFIGURE,
     TRANSPORTS,
     NodeParameters,
+    check_choices,
+    namespaces_in,
     parameter_field,
 )
-from hmt_ros.sessions.parameter_file import parameter_file_text
 
 MIXTURES = ('pose_mixture', 'smoothed_pose_mixture')
 
@@ -58,23 +52,10 @@ class HriParameters(NodeParameters):
     queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
 
     def __post_init__(self) -> None:
-        if self.image_transport not in TRANSPORTS:
-            raise ValueError(
-                f'image_transport must be one of {TRANSPORTS}, saw {self.image_transport!r}'
-            )
-        if self.mixture_topic not in MIXTURES:
-            raise ValueError(f'mixture_topic must be one of {MIXTURES}, saw {self.mixture_topic!r}')
-        for namespace in self.named:
-            if not re.fullmatch(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+', namespace):
-                raise ValueError(
-                    f'namespaces: wanted names such as /humans/bodies/anna, saw {namespace!r}'
-                )
+        check_choices(self, image_transport=TRANSPORTS, mixture_topic=MIXTURES)
+        namespaces_in(self.namespaces)
 
     @property
     def named(self) -> tuple[str, ...]:
         """The namespaces, each once."""
-        return tuple(dict.fromkeys(self.namespaces.split()))
-
-
-if __name__ == '__main__':
-    sys.stdout.write(parameter_file_text('hri_node', HriParameters()))
+        return namespaces_in(self.namespaces)

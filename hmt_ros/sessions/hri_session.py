@@ -1,6 +1,6 @@
 """REP 155 behind its topics: mixtures of people in, bodies as robots expect them out.
 
-The rules:
+The rules, besides those of `Session`:
 
 - A track of a person is a body. Its identity is the name of the person, the namespace without
   /humans/bodies/, and the number of the track: p1_2 is the second track in /humans/bodies/p1. A
@@ -12,14 +12,10 @@ The rules:
   with twice its weight.
 - Regions, landmarks and cropped images need the calibrated camera_info of the frame of the mixture,
   frames and joint states do not. A cropped image needs the image of the stamp of the mixture.
-- A mixture that is not younger than the one before of that person is skipped, or ends all bodies
-  with `reset_on_time_jump`.
-- What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,7 +25,7 @@ from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import Joint, ReferenceHuman, fit_reference_human
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, camera_info_fault
-from hmt_ros.sessions.handled import Fault, Output
+from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.session import (
     NeededInput,
@@ -37,7 +33,6 @@ from hmt_ros.sessions.session import (
     PublishedTopic,
     Session,
     SessionState,
-    everything,
 )
 from msg_tools import MessageError
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
@@ -174,13 +169,7 @@ class HriSession(Session[HriParameters, HriState]):
     ESTIMATE = 'every body'
     CHECKED = ()
 
-    def __init__(
-        self,
-        parameters: HriParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        super().__init__(parameters, publish, wanted)
+    def _set_up(self) -> None:
         self._camera: Camera | None = None
         self._frame = ''
         self._now = 0

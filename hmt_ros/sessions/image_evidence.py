@@ -13,7 +13,7 @@ from hmt_ros.smoothing.likelihood import counted, merged_modes, or_missed
 from msg_tools import MessageError
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.message_error import MessageFault
-from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, TrackState
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 
 # Time of the free motion that tells how far a pose may be from where an image shows it, s.
 ASTRAY = 1.0
@@ -55,20 +55,6 @@ class Evidence(NamedTuple):
 
     def _interval(self, before: int | None) -> float:
         return math.inf if before is None else (self.stamp - before) / SECOND_NS
-
-
-class OpenPose(NamedTuple):
-    """What is told of an image besides its poses.
-
-    Attributes:
-        state: of the track in the filter.
-        existence: probability that a person is in view, in the filter.
-        shape: as of `Evidence`.
-    """
-
-    state: TrackState
-    existence: float
-    shape: Array | None
 
 
 class KeptMixtures(NamedTuple):

@@ -138,9 +138,6 @@ class StampedInputs(Generic[T]):
     """Inputs that belong to the image of exactly their stamp; of several the last counts.
 
     None stands for an input that says nothing, as of a detector that saw nobody.
-
-    Args:
-        most: number of inputs that are remembered.
     """
 
     def __init__(self, most: int = REMEMBERED) -> None:
@@ -194,12 +191,7 @@ class Taken(NamedTuple):
 
 
 class ImageInputs:
-    """What has come for the images of a session.
-
-    Args:
-        rows: of the table that the session has.
-        log: takes faults.
-    """
+    """What has come for the images of a session."""
 
     def __init__(self, rows: Iterable[ImageInput], log: HandlingLog) -> None:
         self._log = log
@@ -220,9 +212,6 @@ class ImageInputs:
         """Reads a message and keeps its content for its image.
 
         Args:
-            source: of the message.
-            message: of the type of the source.
-            stamp_ns: of the message.
             read: as `ImageInput.read`.
         """
         row, content = self._rows[source], None
@@ -236,8 +225,6 @@ class ImageInputs:
         """What has come for an image; tells of what is missing, and of what belongs to none.
 
         Args:
-            row: the input.
-            stamp_ns: of the image.
             image: (H, W, 3).
             dropped: stamps of images that were dropped, whose inputs are not missed.
         """

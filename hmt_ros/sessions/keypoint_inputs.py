@@ -14,6 +14,7 @@ stamp by name.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +24,6 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.experts.lifter import Lifter, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO, JOINTS
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions.chosen_person import ChosenPerson
 from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, CameraNodeParameters
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS_INPUT, SOURCES, ImageInput
@@ -31,14 +31,20 @@ from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,
+    DetectedPerson,
     people_of_floats,
     people_of_yolo,
     person_of_skeleton,
 )
+from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keypoints import Positions, keypoints_of
 
 # Time without the person after which the largest one is chosen anew, s.
 LONGEST_ABSENCE = 1.0
+# A person moves less between two images, in sizes of the person.
+_FARTHEST = 1.0
+# What remains from image to image of the size of a person of whom less is seen now.
+_SIZE_KEPT = 0.95
 # Sets of unknown names that are warned of, each once; a detector has one.
 _MOST_WARNINGS = 20
 
@@ -62,13 +68,66 @@ def keypoints_input(source: str) -> ImageInput:
     return replace(KEYPOINTS_INPUT, types={DETECTIONS: SOURCES[source]})
 
 
-class KeypointReader:
-    """Reads the keypoints of the person who is tracked.
+class ChosenPerson:
+    """The person who is followed: at first the largest, then the nearest to the last place.
 
-    Args:
-        source: as the parameter.
-        log: takes remarks.
+    The place is that of the detections themselves, so that the choice does not depend on the
+    tracker, which may be lost.
     """
+
+    def __init__(self) -> None:
+        self._last: Keypoints | None = None
+        self._stamp = 0
+        self._size = 0.0
+
+    def forget(self) -> None:
+        """The next choice is the largest person."""
+        self._last = None
+
+    def choose(
+        self, people: Sequence[DetectedPerson], stamp_ns: int, longest_absence: float
+    ) -> Keypoints | None:
+        """The person among those who were seen in an image.
+
+        Args:
+            longest_absence: time after which the largest person is chosen anew, s.
+
+        Returns:
+            The keypoints; None: the person is not among them.
+        """
+        seen = [person.keypoints for person in people if person.keypoints.seen.any()]
+        if not seen:
+            return None
+        last = self._last
+        if last is None or stamp_ns - self._stamp > longest_absence * SECOND_NS:
+            chosen = max(seen, key=_size)
+            self._size = 0.0
+        else:
+            chosen = min(seen, key=lambda keypoints: _distance(keypoints, last))
+            if _distance(chosen, last) > _FARTHEST * self._size:
+                return None
+        self._last, self._stamp = chosen, stamp_ns
+        self._size = max(_size(chosen), _SIZE_KEPT * self._size)
+        return chosen
+
+
+def _size(keypoints: Keypoints) -> float:
+    """Diagonal of the box around a person, px."""
+    pixels = keypoints.pixels[keypoints.seen]
+    return float(np.hypot(*np.ptp(pixels, axis=0)))
+
+
+def _distance(one: Keypoints, other: Keypoints) -> float:
+    """Median distance of the landmarks that both have; else that of their middles, px."""
+    both = one.seen & other.seen
+    if both.any():
+        return float(np.median(np.hypot(*(one.pixels - other.pixels)[both].T)))
+    middles = [each.pixels[each.seen].mean(0) for each in (one, other)]
+    return float(np.hypot(*(middles[0] - middles[1])))
+
+
+class KeypointReader:
+    """Reads the keypoints of the person who is tracked."""
 
     def __init__(self, source: str, log: HandlingLog) -> None:
         self._source, self._log = source, log
@@ -82,10 +141,6 @@ class KeypointReader:
         """The keypoints in a message.
 
         Args:
-            message: of the source.
-            stamp: of the message, ns.
-            parameters: how.
-            body: whose joints they may name.
             camera: that took the image; None: it is not known yet.
             sigma_px: standard deviation of keypoints without one, px; 0: as is learned.
 
@@ -137,9 +192,6 @@ class KeypointReader:
         Args:
             found: as read; None: none have come.
             positions: of the same landmarks in space; None: none have come.
-            body: whose joints they become.
-            scheme: what their names mean.
-            stamp_ns: of the image.
         """
         if found is None or not found.names:
             return found

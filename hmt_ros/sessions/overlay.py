@@ -32,7 +32,6 @@ def draw_modes(
 
     Args:
         image: (H, W, 3) BGR.
-        camera: that took it.
         joints: (K, J, 3) joint positions of the modes, camera frame, m.
         bones: pairs of joints that are connected.
         weights: (K,).

@@ -24,12 +24,7 @@ _LARGEST_FILE = 1_000_000  # bytes
 
 
 def parameter_file_text(node: str, settings: Any) -> str:
-    """A parameter file with all parameters, each under a comment that describes it.
-
-    Args:
-        node: name of the node.
-        settings: dataclass whose values are written.
-    """
+    """A parameter file with all parameters, each under a comment that describes it."""
     declared = declared_parameters(settings)
     used = {parameter.effect for parameter in declared}
     lines = [
@@ -86,8 +81,6 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     sections.
 
     Args:
-        path: of the file.
-        node: its name.
         by_name: whether only sections count that name the node, not those for all nodes.
 
     Raises:

@@ -3,21 +3,16 @@
 - Every mixture gets one people_msgs/People and one vision_msgs/Detection3DArray with its stamp and
   frame, which hold all people of that frame whose last mixture is not older than `longest_silence`.
 - A person whose track is lost, and a mixture without components, are left out.
-- A mixture that is not younger than the one before of its person is skipped, or everything starts
-  anew with `reset_on_time_jump`.
-- What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from hmt_ros.body import named_body
-from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
-from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
+from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
@@ -76,13 +71,7 @@ class PeopleAdapterSession(Session[PeopleAdapterParameters, PeopleAdapterState])
     ESTIMATE = 'the list of people'
     CHECKED = ()
 
-    def __init__(
-        self,
-        parameters: PeopleAdapterParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        super().__init__(parameters, publish, wanted)
+    def _set_up(self) -> None:
         self._last: dict[str, _Last] = {}
         self._people = 0
         self.state = self._present_state()

@@ -50,7 +50,6 @@ class PeopleReader:
 
     Args:
         parameters: `source` and `keypoint_scheme` say how.
-        log: takes faults.
     """
 
     def __init__(self, parameters: PeopleParameters, log: HandlingLog) -> None:
@@ -62,8 +61,6 @@ class PeopleReader:
         """The people in a message.
 
         Args:
-            message: of the type of `source`.
-            stamp: of its image, ns.
             sigma_px: standard deviation of keypoints without covariances, px; 0: as is learned.
 
         Raises:
@@ -98,9 +95,6 @@ class PeopleReader:
         """The people of whom something was seen.
 
         Args:
-            people: as detected.
-            body: whose joints the keypoints become.
-            scheme: what the names of the keypoints mean.
             use_keypoints: whether they are used for more than boxes.
         """
         result = []

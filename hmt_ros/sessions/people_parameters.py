@@ -1,19 +1,12 @@
-"""Parameters of the people node: those of the filter node, for each person, and its own.
-
-`hmt_ros/config/people_node.yaml` lists them with their defaults; it is written by
-
-    python -m hmt_ros.sessions.people_parameters > hmt_ros/config/people_node.yaml
-"""
+"""Parameters of the people node: those of the filter node, for each person, and its own."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import ClassVar
 
 from hmt_ros.sessions.declared_parameters import AT_ONCE, NEXT_CONFIGURE, parameter_field
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.parameter_file import parameter_file_text
 
 # Inputs of one person, of whom a topic can not say who it is.
 _OF_ONE = {
@@ -52,7 +45,3 @@ class PeopleParameters(FilterParameters):
                     f'{name} is {getattr(self, name)!r}, but people_node takes no input of one '
                     f'person: wanted {unused!r}, or filter_node'
                 )
-
-
-if __name__ == '__main__':
-    sys.stdout.write(parameter_file_text('people_node', PeopleParameters()))

@@ -16,7 +16,7 @@ The rules, besides those of `TrackingSession`:
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -26,7 +26,7 @@ from hmt_ros.body import Camera
 from hmt_ros.image.background import BackgroundModel, SceneWatch
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
-from hmt_ros.sessions.camera_session import IMAGE, WaitingImage
+from hmt_ros.sessions.camera_session import CAMERA_MOVED, WaitingImage
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.image_inputs import (
     DEPTH_INPUT,
@@ -38,9 +38,8 @@ from hmt_ros.sessions.image_inputs import (
 )
 from hmt_ros.sessions.people_inputs import Found, PeopleReader
 from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.people_state import PeopleState
 from hmt_ros.sessions.person_session import BODIES, PersonSession, person_of
-from hmt_ros.sessions.session import PublishedTopic, everything
+from hmt_ros.sessions.session import PublishedTopic, SessionState
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
 from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking.association import (
@@ -63,7 +62,6 @@ from msg_tools.messages.detections import (
 from msg_tools.messages.headers import SECOND_NS
 
 PEOPLE = 'people'
-__all__ = ['DETECTIONS', 'IMAGE', 'PEOPLE', 'PeopleSession', 'PeopleState']
 
 
 def published_topic(topic: str) -> PublishedTopic:
@@ -77,6 +75,35 @@ def published_topic(topic: str) -> PublishedTopic:
 SMALLEST = 4
 # Somebody who is detected no more, and of whom no track has started, is forgotten after so long, s.
 UNSTARTED = 0.5
+
+
+@dataclass(frozen=True)
+class PeopleState(SessionState):
+    """State of the node: its status is 'no camera', 'waiting', 'nobody' or 'tracking'.
+
+    Attributes:
+        people: identities of those who are tracked.
+        followed: identities of those who are tracked, or about to be.
+        detected: number of people in the last detections.
+        moved: whether the camera has moved since the background was taken.
+    """
+
+    people: tuple[str, ...] = ()
+    followed: tuple[str, ...] = ()
+    detected: int = 0
+    moved: bool = False
+
+    def summary(self) -> str:
+        """The present estimate in a few words."""
+        return f'{len(self.people)} of {self.detected} people'
+
+    def trouble(self) -> str:
+        """Whether the background is of no use."""
+        return CAMERA_MOVED if self.moved else ''
+
+    def values(self) -> list[tuple[str, str]]:
+        """Keys and values of the diagnostics."""
+        return [('people', ' '.join(self.people)), ('people detected', str(self.detected))]
 
 
 @dataclass(eq=False)
@@ -107,14 +134,10 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
     ESTIMATE = 'every track'
     CHECKED = ('background_file', 'body_model', 'lifter')
 
-    def __init__(
-        self,
-        parameters: PeopleParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        super().__init__(parameters, publish, wanted)
-        self._reader, self._used = PeopleReader(parameters, self._log), parameters
+    def _set_up(self) -> None:
+        super()._set_up()
+        self._used = self.parameters
+        self._reader = PeopleReader(self._used, self._log)
         self._forget()
         self.state = self._present_state()
 

@@ -53,12 +53,9 @@ class PersonSession(FilterSession):
 
     Args:
         person: identity, which is part of topics and frames.
-        parameters: of the filter.
         publish, wanted: as for `Session`, of topics with the identity.
         start: what all people start from.
-        background: of all people.
         frames: that transforms lead to from the camera, looked up by the caller.
-        log: of all people.
     """
 
     def __init__(
@@ -124,8 +121,6 @@ class PersonSession(FilterSession):
         """Takes an image.
 
         Args:
-            waiting: the image.
-            camera: that took it.
             keypoints: of this person; without any that was seen: the detector does not see the
                 person. None: it has not answered.
             others: (H, W) pixels that other people cover; None: none.

@@ -102,8 +102,6 @@ class RobotOutputs:
 
         Args:
             stamp_ns, frame_id: of the image; the frame is the one that is published in.
-            state: of the track.
-            track_id: its number.
             existence: probability that a person is in view; NaN: unknown.
             seen: the track, in an image that shows the person; None: as in the image before.
         """

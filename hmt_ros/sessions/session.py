@@ -1,4 +1,10 @@
-"""A session stands behind the topics of a node: messages in, messages out, without ROS."""
+"""A session stands behind the topics of a node: messages in, messages out, without ROS.
+
+The node and offline replay give their messages to one; the same messages in the same order give the
+same bytes. A message that is not younger than the one before is skipped, or starts the estimate
+anew with `reset_on_time_jump`. What can not be used is skipped. The first fault of each kind is
+logged; all are counted.
+"""
 
 from __future__ import annotations
 
@@ -172,6 +178,10 @@ class Session(ABC, Generic[Parameters, State]):
         self.topic_names: Mapping[str, str] = {}
         self.decode_image: Callable[[Any], Image] = decode_image
         self.publishing = 0.0
+        self._set_up()
+
+    def _set_up(self) -> None:
+        """Makes what a kind of session keeps; raises ValueError as the class says."""
 
     def prepare(self) -> None:
         """Compiles, or loads, what the messages will need; nothing is estimated or published.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,10 +13,9 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.reduction import led
 from hmt_ros.sessions.session import PublishedTopic
-from hmt_ros.sessions.track_messages import links_of
+from hmt_ros.sessions.track_messages import MESSAGES, links_of
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
 from hmt_ros.smoothing.path_hypotheses import SAME_MOTION
-from msg_tools import MessageFactory
 from msg_tools.messages.markers import trajectory_markers
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
@@ -56,18 +55,27 @@ class SmoothedBody:
     track_id: int = 0
 
 
+class OpenPose(NamedTuple):
+    """What is told of an image besides its poses.
+
+    Attributes:
+        state: of the track in the filter.
+        existence: probability that a person is in view, in the filter; NaN: unknown.
+        shape: (d, d) covariance of what poses of all images err by alike; None: unknown.
+    """
+
+    state: TrackState
+    existence: float
+    shape: Array | None
+
+
 def trajectory_content(
-    found: TrajectoryMixture,
-    of: SmoothedBody,
-    *,
-    covariances: bool,
-    shapes: Mapping[int, Array],
+    found: TrajectoryMixture, of: SmoothedBody, *, covariances: bool, shapes: Mapping[int, Array]
 ) -> TrajectoryContent:
     """The content of a message on a mixture over trajectories.
 
     Args:
         found: trajectories, with stamps.
-        of: person of the poses.
         covariances: whether they are part of the message.
         shapes: (d, d) by stamp, added to covariances: what poses of all images err by alike.
     """
@@ -89,75 +97,29 @@ def trajectory_content(
 
 
 def window_messages(
-    messages: MessageFactory,
-    found: TrajectoryMixture,
-    of: SmoothedBody,
-    *,
-    covariances: bool,
-    shapes: Mapping[int, Array],
-    wanted: Callable[[str], bool],
-    publish: Callable[[str, Any], None],
-) -> None:
-    """Makes the messages of a window.
-
-    Args:
-        messages: factory.
-        found: trajectories, with stamps.
-        of: person of the poses.
-        covariances, shapes: as for `trajectory_content`.
-        wanted: whether a topic is to be made.
-        publish: takes the topic and the message, one after the other.
-    """
+    found: TrajectoryMixture, of: SmoothedBody, wanted: Callable[[str], bool], *,
+    covariances: bool, shapes: Mapping[int, Array],
+) -> Iterator[tuple[str, Any]]:  # fmt: skip
+    """Topics and messages of a window; arguments as of `trajectory_content`."""
     if wanted('trajectory_mixture'):
         content = trajectory_content(found, of, covariances=covariances, shapes=shapes)
-        publish('trajectory_mixture', trajectory_mixture_message(messages, content))
+        yield 'trajectory_mixture', trajectory_mixture_message(MESSAGES, content)
     if wanted('trajectory_markers'):
         assert found.stamps_ns is not None
-        body = of.body
         chosen = np.argsort(-found.weights, kind='stable')[:DRAWN]
-        names = body.joint_names
-        publish(
-            'trajectory_markers',
-            trajectory_markers(
-                messages,
-                _joints(found.means[chosen], body),
-                names,
-                TRACED,
-                [(names[a], names[b]) for a, b in body.skeleton.bones],
-                found.weights[chosen],
-                found.stamps_ns[-1],
-                of.frame_id,
-                ranks=DRAWN,
-            ),
-        )
+        joints, stamp = _joints(found.means[chosen], of.body), found.stamps_ns[-1]
+        yield 'trajectory_markers', _markers(of, joints, found.weights[chosen], stamp)
 
 
 def final_messages(
-    messages: MessageFactory,
-    pose: FinalPose,
-    of: SmoothedBody,
-    *,
-    shape: Array | None,
-    state: TrackState,
-    existence_probability: float,
-    components: int,
-    frame_prefix: str | None,
-    wanted: Callable[[str], bool],
-    publish: Callable[[str, Any], None],
-) -> None:
-    """Makes the messages of a pose that will not be revised.
+    pose: FinalPose, of: SmoothedBody, told: OpenPose, wanted: Callable[[str], bool], *,
+    components: int, frame_prefix: str | None,
+) -> Iterator[tuple[str, Any]]:  # fmt: skip
+    """Topics and messages of a pose that will not be revised.
 
     Args:
-        messages: factory.
-        pose: its density.
-        of: whose pose it is.
-        shape: (d, d) added to covariances: what poses of all images err by alike; None: nothing.
-        state: of the track at that time.
-        existence_probability: that a person was in view, in the filter at that time; NaN: unknown.
         components: maximum number of components of the message.
         frame_prefix: of the names of the links on /tf; None: there are no transforms.
-        wanted: whether a topic is to be made.
-        publish: takes the topic and the message, one after the other.
 
     Raises:
         MessageError: a mixture that a message must not have.
@@ -165,33 +127,29 @@ def final_messages(
     shows_links = frame_prefix is not None and wanted('/tf')
     if not (wanted('smoothed_pose_mixture') or wanted('smoothed_joint_states') or shows_links):
         return
-    mixture, motions = poses_apart(pose.trajectories, pose.t, of.body, components, shape)
+    mixture, motions = poses_apart(pose.trajectories, pose.t, of.body, components, told.shape)
     content = PoseMixture.of_body(
         of.body,
         replace(mixture, covariances=_symmetric(mixture.covariances)),
         MixtureKind.SMOOTHED,
         pose.stamp_ns,
         of.frame_id,
-        state=state,
+        state=told.state,
         track_id=of.track_id,
-        existence_probability=existence_probability,
+        existence_probability=told.existence,
         identities=np.array(pose.identities)[motions],
         velocities=None if pose.velocities is None else pose.velocities[motions],
     )
     if wanted('smoothed_pose_mixture'):
-        publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
+        yield 'smoothed_pose_mixture', pose_mixture_message(MESSAGES, content)
     if wanted('smoothed_joint_states'):
-        publish('smoothed_joint_states', heaviest_joint_state(messages, content))
+        yield 'smoothed_joint_states', heaviest_joint_state(MESSAGES, content)
     if shows_links:
-        names, rotations, origins = links_of(
-            of.body, mixture.means[int(np.argmax(mixture.weights))]
-        )
+        heaviest = mixture.means[int(np.argmax(mixture.weights))]
+        names, rotations, origins = links_of(of.body, heaviest)
         children = [f'{frame_prefix}{name}' for name in names]
-        parents = [of.frame_id] * len(names)
-        publish(
-            '/tf',
-            transforms_message(messages, parents, children, rotations, origins, pose.stamp_ns),
-        )
+        parents, stamp = [of.frame_id] * len(names), pose.stamp_ns
+        yield '/tf', transforms_message(MESSAGES, parents, children, rotations, origins, stamp)
 
 
 def poses_apart(
@@ -200,10 +158,6 @@ def poses_apart(
     """The poses of motions that are apart at index t, and the indices of their trajectories.
 
     Args:
-        found: M trajectories.
-        t: index of the time.
-        body: of the poses.
-        components: at most.
         shape: (d, d) added to covariances: what poses of all images err by alike; None: nothing.
     """
     points = body.relative_joints(found.means[:, t])
@@ -215,43 +169,32 @@ def poses_apart(
 
 
 def nobody_messages(
-    messages: MessageFactory,
-    of: SmoothedBody,
-    stamp_ns: int,
-    *,
-    existence_probability: float,
-    wanted: Callable[[str], bool],
-    publish: Callable[[str, Any], None],
-) -> None:
-    """Makes the messages of a time from which on nobody is in view.
+    of: SmoothedBody, stamp_ns: int, existence: float, wanted: Callable[[str], bool]
+) -> Iterator[tuple[str, Any]]:
+    """Topics and messages of a time from which on nobody is in view.
 
     Args:
-        messages: factory.
         of: person of the poses before.
-        stamp_ns: the time.
-        existence_probability: that a person is in view; NaN: unknown.
-        wanted, publish: as for `window_messages`.
+        existence: probability that a person is in view; NaN: unknown.
     """
-    body, frame = of.body, of.frame_id
     if wanted('trajectory_markers'):
-        names = body.joint_names
-        nothing = np.empty((0, 0, len(names), 3))
-        markers = trajectory_markers(
-            messages, nothing, names, TRACED, [], np.empty(0), stamp_ns, frame, ranks=DRAWN
-        )
-        publish('trajectory_markers', markers)
+        nothing = np.empty((0, 0, len(of.body.joint_names), 3))
+        yield 'trajectory_markers', _markers(of, nothing, np.empty(0), stamp_ns)
     if wanted('smoothed_pose_mixture'):
         content = PoseMixture.of_body(
-            body,
-            None,
-            MixtureKind.SMOOTHED,
-            stamp_ns,
-            frame,
-            state=TrackState.NOBODY,
-            track_id=of.track_id,
-            existence_probability=existence_probability,
-        )
-        publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
+            of.body, None, MixtureKind.SMOOTHED, stamp_ns, of.frame_id, state=TrackState.NOBODY,
+            track_id=of.track_id, existence_probability=existence,
+        )  # fmt: skip
+        yield 'smoothed_pose_mixture', pose_mixture_message(MESSAGES, content)
+
+
+def _markers(of: SmoothedBody, joints: Array, weights: Array, stamp_ns: int) -> Any:
+    """visualization_msgs/MarkerArray of joint positions (M, T, J, 3); it removes other ranks."""
+    names = of.body.joint_names
+    edges = [(names[a], names[b]) for a, b in of.body.skeleton.bones]
+    return trajectory_markers(
+        MESSAGES, joints, names, TRACED, edges, weights, stamp_ns, of.frame_id, ranks=DRAWN
+    )
 
 
 def _joints(means: Array, body: Body) -> Array:

@@ -1,13 +1,7 @@
-"""Parameters of the smoother node, which are the settings of offline replay as well.
-
-`hmt_ros/config/smoother_node.yaml` lists them with their defaults; it is written by
-
-    python -m hmt_ros.sessions.smoother_parameters > hmt_ros/config/smoother_node.yaml
-"""
+"""Parameters of the smoother node, which are the settings of offline replay as well."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,9 +12,9 @@ from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_WINDOW,
     NodeParameters,
+    check_choices,
     parameter_field,
 )
-from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.smoothing import LinearGaussianDynamics
 
 MODELS = ('random_walk', 'constant_velocity', 'learned')
@@ -115,9 +109,4 @@ class SmootherParameters(NodeParameters):
     dynamics: SmootherDynamics = field(default_factory=SmootherDynamics)
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise ValueError(f'method must be one of {METHODS}, saw {self.method!r}')
-
-
-if __name__ == '__main__':
-    sys.stdout.write(parameter_file_text('smoother_node', SmootherParameters()))
+        check_choices(self, method=METHODS)

@@ -1,15 +1,12 @@
 """The smoother behind its topics.
 
-The node and offline replay give their messages to a `SmootherSession`; the same messages in the
-same order give the same bytes. The rules:
+The rules, besides those of `Session`:
 
 - Mixtures are smoothed in the order of their stamps, in a sliding window, ten times a second at
   most: neighbours tell nearly the same. A pose is published as smoothed before it is older than the
   newest by more than `fixed_lag` and a fifth of it; those that are still open when the window ends
   are published then: at the end of the stream (`finish`), where time jumps
   back, at a new body.
-- A mixture that is not younger than the one before is skipped, or starts a new window with
-  `reset_on_time_jump`.
 - A mixture names its body and carries the segment lengths of the person; without lengths it is
   about the model at its own lengths. Another body, lengths that jump, another frame or another
   track_id are a new track, and start a new window; lengths that change slowly are estimated better
@@ -26,7 +23,6 @@ same order give the same bytes. The rules:
 - Angles that go round are taken from mixture to mixture without whole turns, each mode from the
   nearest one before: to the dynamics a turn more would be a jump.
 - The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
-- What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
@@ -41,16 +37,12 @@ from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.body.mirror import free_limits, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.image_evidence import (
-    Evidence,
-    KeptMixtures,
-    OpenPose,
-    evidence_of,
-)
-from hmt_ros.sessions.session import Order, Session, SessionState, everything
+from hmt_ros.sessions.handled import Fault
+from hmt_ros.sessions.image_evidence import Evidence, KeptMixtures, evidence_of
+from hmt_ros.sessions.session import Order, Session, SessionState
 from hmt_ros.sessions.smoothed_messages import (
     TOPICS,
+    OpenPose,
     SmoothedBody,
     final_messages,
     nobody_messages,
@@ -136,15 +128,9 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     ESTIMATE = 'the window'
     CHECKED = ('body_model',)
 
-    def __init__(
-        self,
-        parameters: SmootherParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        if parameters.body_model:
-            known_body(parameters.body_model)
-        super().__init__(parameters, publish, wanted)
+    def _set_up(self) -> None:
+        if self.parameters.body_model:
+            known_body(self.parameters.body_model)
         self._of: SmoothedBody | None = None
         self._resolved: tuple[Any, SmoothedBody] | None = None
         self._window: SlidingWindow | None = None
@@ -233,15 +219,12 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self.kept = KeptMixtures(of, (*self.kept.items, evidence)[-p.window_length :])
         if update.trajectories is not None:
             self._weights = update.trajectories.weights
-            window_messages(
-                self._messages,
-                update.trajectories,
-                of,
-                covariances=p.publish_covariances,
-                shapes=_shapes((at, one.shape) for at, one in self._open.items()),
-                wanted=self._wanted,
-                publish=lambda topic, made: self._publish(topic, stamp, made),
-            )
+            shapes = _shapes((at, one.shape) for at, one in self._open.items())
+            for topic, made in window_messages(
+                update.trajectories, of, self._wanted,
+                covariances=p.publish_covariances, shapes=shapes,
+            ):  # fmt: skip
+                self._publish(topic, stamp, made)
         for pose in update.final:
             self._publish_final(pose, of)
 
@@ -267,14 +250,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._nobody = True
         if of is not None and smooths:
             self._log.tell(f'nobody in view at the mixture of {stamp} ns: the window ends')
-            nobody_messages(
-                self._messages,
-                of,
-                stamp,
-                existence_probability=existence,
-                wanted=self._wanted,
-                publish=lambda topic, made: self._publish(topic, stamp, made),
-            )
+            for topic, made in nobody_messages(of, stamp, existence, self._wanted):
+                self._publish(topic, stamp, made)
 
     def _whose(self, content: PoseMixture) -> SmoothedBody:
         """The person that a mixture is about; the same object while that does not change.
@@ -352,19 +329,12 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     # Outputs.
 
     def _publish_final(self, pose: FinalPose, of: SmoothedBody) -> None:
-        told = self._open.pop(pose.stamp_ns)
-        final_messages(
-            self._messages,
-            pose,
-            of,
-            shape=told.shape,
-            state=told.state,
-            existence_probability=told.existence,
-            components=self.parameters.max_hypotheses,
-            frame_prefix=self.parameters.frame_prefix if self.parameters.publish_tf else None,
-            wanted=self._wanted,
-            publish=lambda topic, made: self._publish(topic, pose.stamp_ns, made),
-        )
+        p = self.parameters
+        for topic, made in final_messages(
+            pose, of, self._open.pop(pose.stamp_ns), self._wanted,
+            components=p.max_hypotheses, frame_prefix=p.frame_prefix if p.publish_tf else None,
+        ):  # fmt: skip
+            self._publish(topic, pose.stamp_ns, made)
 
     def smooth_span(self, from_ns: int = 0, to_ns: int = 0) -> Any:
         """Smooths the kept mixtures of a span of time, all at once.

@@ -1,31 +1,30 @@
 """Messages about a tracked image.
 
-`TOPICS` holds names and types; the functions make the messages from arrays. A message depends on
-the track and the image alone.
+`TOPICS` holds names and types; the functions make the messages one after the other, each when it is
+asked for. A message depends on the track and the image alone.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hmt_ros.body import Body, Camera
+from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.inference.arrays import Array
+from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.robot_outputs import RobotOutputs
 from hmt_ros.sessions.session import PublishedTopic
-from hmt_ros.tracking.ground import Ground
-from msg_tools import MessageFactory
+from hmt_ros.tracking import Status, Tracker
+from msg_tools import RosbagsMessages
 from msg_tools.messages.bodies import description_message, message_of_body
 from msg_tools.messages.ground import GROUND, GroundState, ground_message
 from msg_tools.messages.images import compressed_image_message
@@ -65,105 +64,53 @@ TOPICS_OF_NODE = {
 
 # Frame at the camera with x forward and z up, where gravity is known; a prefix stands before it.
 UPRIGHT = 'camera_upright'
+MESSAGES = RosbagsMessages()
+
+
+class Made(NamedTuple):
+    """A message that is to be published on a topic, with the stamp that it is about, ns."""
+
+    topic: str
+    stamp_ns: int
+    message: Any
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedImage:
-    """An image, and the track in it.
+    """An image, the track in it, and how it is shown.
 
     Attributes:
-        image: (H, W, 3) BGR.
-        stamp_ns, frame_id: of the image.
-        body, camera: of the track.
+        waiting: the image.
+        tracker: after the image.
         posterior, likelihood: mixtures over poses, heaviest first.
-        log_likelihoods: (K,) of the image at the means of the posterior.
-        likelihood_values: (L,) the same at the means of the likelihood.
-        likelihood_errors: how the errors of the likelihood last, which is undiscounted.
-        shape_covariance: (d, d) of what poses of all images err by alike, see `Tracker`.
-        point: (d,) the point estimate, for those who want one pose.
-        ground: gravity and the floor, as far as they are known.
-        contacts: probabilities that the feet stand on the floor, by name.
+        parameters: of the node.
         starts: whether the body is a new one, with other lengths than the image before.
-        state: of the track.
-        track_id: number of the track.
-        existence_probability: that a person is in view; NaN: unknown.
-        cue_probabilities: that each cue of the images shows the person, by its name, and that the
-            track has the person; empty: unknown.
-        identities: (K,) of the components of the posterior.
-        velocities: (K, d) of the components of the posterior, per second; None: unknown.
-        up: (3,) unit vector against gravity in the camera frame; None: it is not known, at most
-            guessed.
+        describe: whether the URDF is due: a new body, or other names of its frames.
         fixed: frame that mixtures, markers and the pose of the person are published in; None: the
             frame of the camera.
     """
 
-    image: NDArray[np.uint8]
-    stamp_ns: int
-    frame_id: str
-    body: Body
-    camera: Camera
+    waiting: WaitingImage
+    tracker: Tracker
     posterior: GaussianMixture
     likelihood: GaussianMixture
-    log_likelihoods: Array
-    likelihood_values: Array
-    likelihood_errors: CueErrors
-    shape_covariance: Array
-    point: Array
-    ground: Ground
-    contacts: Mapping[str, float]
+    parameters: FilterParameters
     starts: bool
-    state: TrackState = TrackState.UNKNOWN
-    track_id: int = 0
-    existence_probability: float = math.nan
-    cue_probabilities: Mapping[str, float] = field(default_factory=dict)
-    identities: Index | None = None
-    velocities: Array | None = None
-    up: Array | None = None
+    describe: bool
     fixed: FixedFrame | None = None
 
 
-@dataclass(frozen=True)
-class Presentation:
-    """How a track is shown.
-
-    Attributes:
-        max_hypotheses: maximum number of modes of a track.
-        overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
-        publish_tf: whether there are transforms.
-        frame_prefix: of the names of the frames of the links.
-        describe: whether the URDF is due: a new body, or other names of its frames.
-    """
-
-    max_hypotheses: int
-    overlay_modes: int
-    publish_tf: bool
-    frame_prefix: str
-    describe: bool
-
-
-def track_messages(
-    messages: MessageFactory,
-    track: TrackedImage,
-    presentation: Presentation,
-    wanted: Callable[[str], bool],
-    publish: Callable[[str, Any], None],
-) -> None:
-    """Makes the messages of a tracked image.
-
-    Args:
-        messages: factory.
-        track: the image and its track.
-        presentation: how it is shown.
-        wanted: whether a topic is to be made; mixtures come first, pictures last.
-        publish: takes the topic and the message, one after the other.
+def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Any]]:
+    """Topics and messages of a tracked image; mixtures come first, pictures last.
 
     Raises:
         MessageError: a mixture that a message must not have.
     """
-    stamp, frame = track.stamp_ns, track.frame_id
-    skeleton = track.body.skeleton
-    frames = forward(skeleton, track.posterior.means)
-    joints = frames.joints().transpose(2, 0, 1)
+    stamp, frame = track.waiting.stamp_ns, track.waiting.frame_id
+    tracker, p = track.tracker, track.parameters
+    body, point = tracker.body, tracker.point_estimate
+    skeleton, posterior = body.skeleton, track.posterior
+    joints = forward(skeleton, posterior.means).joints().transpose(2, 0, 1)
     ground = _ground_state(track)
     # Both are made before anything is published: either may be one that a message must not have.
     made = {
@@ -172,190 +119,160 @@ def track_messages(
     }
     mixtures = {topic: make() for topic, make in made.items() if wanted(topic)}
     if track.starts:
-        publish('body', message_of_body(messages, track.body, stamp, frame))
-    if presentation.describe:
-        prefix = presentation.frame_prefix
-        publish('human_description', description_message(messages, track.body, frame, prefix))
+        yield 'body', message_of_body(MESSAGES, body, stamp, frame)
+    if track.describe:
+        yield 'human_description', description_message(MESSAGES, body, frame, p.frame_prefix)
     for topic, mixture in mixtures.items():
-        publish(topic, pose_mixture_message(messages, mixture))
+        yield topic, pose_mixture_message(MESSAGES, mixture)
     if wanted('person_pose'):
-        pose, its_frame = person_pose(track.body, track.posterior), frame
+        pose, its_frame = person_pose(body, posterior), frame
         if track.fixed is not None:
             pose, its_frame = pose.seen_from(*track.fixed.camera), track.fixed.name
-        publish('person_pose', person_pose_message(messages, pose, stamp, its_frame))
+        yield 'person_pose', person_pose_message(MESSAGES, pose, stamp, its_frame)
     if wanted('ground'):
-        publish('ground', ground_message(messages, ground))
+        yield 'ground', ground_message(MESSAGES, ground)
     if wanted('human_joint_states'):
-        names = track.body.dof_names
-        publish(
-            'human_joint_states', joint_state_message(messages, names, track.point, stamp, frame)
-        )
-    if presentation.publish_tf and wanted('/tf'):
-        publish('/tf', _link_transforms(messages, track, presentation.frame_prefix))
+        state = joint_state_message(MESSAGES, body.dof_names, point, stamp, frame)
+        yield 'human_joint_states', state
+    if p.publish_tf and wanted('/tf'):
+        yield '/tf', _link_transforms(track)
     if wanted('markers'):
-        names = track.body.joint_names
+        names = body.joint_names
         shown, its_frame = joints, frame
         if track.fixed is not None:
             rotation, translation = track.fixed.camera
             shown, its_frame = joints @ rotation.T + translation, track.fixed.name
+        edges = [(names[a], names[b]) for a, b in skeleton.bones]
+        ranks = max(tracker.settings.max_hypotheses, len(posterior))
         array = skeleton_markers(
-            messages,
-            shown,
-            names,
-            [(names[a], names[b]) for a, b in skeleton.bones],
-            track.posterior.weights,
-            stamp,
-            its_frame,
-            ranks=max(presentation.max_hypotheses, len(track.posterior)),
+            MESSAGES, shown, names, edges, posterior.weights, stamp, its_frame, ranks=ranks
         )
-        stands = forward(skeleton, track.point[None]).joints()[..., 0]
-        array.markers += ground_markers(messages, ground, stands, names)
-        publish('markers', array)
-    if presentation.overlay_modes and wanted('overlay/compressed'):
+        stands = forward(skeleton, point[None]).joints()[..., 0]
+        array.markers += ground_markers(MESSAGES, ground, stands, names)
+        yield 'markers', array
+    if p.overlay_modes and wanted('overlay/compressed'):
         drawn = draw_modes(
-            track.image,
-            track.camera,
-            joints,
-            skeleton.bones,
-            track.posterior.weights,
-            presentation.overlay_modes,
-        )
-        publish('overlay/compressed', compressed_image_message(messages, drawn, stamp, frame))
+            track.waiting.image, tracker.camera, joints, skeleton.bones, posterior.weights,
+            p.overlay_modes,
+        )  # fmt: skip
+        yield 'overlay/compressed', compressed_image_message(MESSAGES, drawn, stamp, frame)
 
 
 def nobody_messages(
-    messages: MessageFactory,
-    body: Body,
-    track_id: int,
-    existence_probability: float,
-    ranks: int,
-    stamp_ns: int,
-    frame_id: str,
-    image: NDArray[np.uint8] | None,
-    wanted: Callable[[str], bool],
-    publish: Callable[[str, Any], None],
-) -> None:
-    """Makes the messages of an image that ends a track: nobody is in view any more.
+    tracker: Tracker, waiting: WaitingImage, p: FilterParameters, wanted: Callable[[str], bool]
+) -> Iterator[tuple[str, Any]]:
+    """Topics and messages of an image that ends a track: nobody is in view any more.
 
-    Args:
-        messages: factory.
-        body: of the track.
-        track_id: its number.
-        existence_probability: that a person is in view.
-        ranks: maximum number of modes of the track, whose markers are removed.
-        stamp_ns, frame_id: of the image.
-        image: (H, W, 3) BGR, shown without modes; None: no overlay.
-        wanted, publish: as for `track_messages`.
+    The overlay shows the image without modes; markers of all ranks are removed.
     """
+    body, stamp = tracker.body, waiting.stamp_ns
+    frame = f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id
     kinds = {'pose_mixture': MixtureKind.POSTERIOR, 'likelihood_mixture': MixtureKind.LIKELIHOOD}
     for topic, kind in kinds.items():
         if wanted(topic):
             content = PoseMixture.of_body(
-                body, None, kind, stamp_ns, frame_id, state=TrackState.NOBODY, track_id=track_id,
-                existence_probability=existence_probability,
+                body, None, kind, stamp, frame, state=TrackState.NOBODY, track_id=tracker.track_id,
+                existence_probability=tracker.existence_probability,
             )  # fmt: skip
-            publish(topic, pose_mixture_message(messages, content))
+            yield topic, pose_mixture_message(MESSAGES, content)
     if wanted('markers'):
-        names = body.joint_names
+        names, ranks = body.joint_names, tracker.settings.max_hypotheses
         nothing = np.empty((0, len(names), 3))
         markers = skeleton_markers(
-            messages, nothing, names, [], np.empty(0), stamp_ns, frame_id, ranks=ranks
+            MESSAGES, nothing, names, [], np.empty(0), stamp, frame, ranks=ranks
         )
-        markers.markers += removed_ground(messages, stamp_ns, frame_id)
-        publish('markers', markers)
-    if image is not None and wanted('overlay/compressed'):
-        picture = compressed_image_message(messages, image, stamp_ns, frame_id)
-        publish('overlay/compressed', picture)
+        markers.markers += removed_ground(MESSAGES, stamp, frame)
+        yield 'markers', markers
+    if p.overlay_modes and wanted('overlay/compressed'):
+        picture = compressed_image_message(MESSAGES, waiting.image, stamp, frame)
+        yield 'overlay/compressed', picture
 
 
 def robot_messages(
-    messages: MessageFactory,
-    robot: RobotOutputs,
-    parameters: FilterParameters,
-    wanted: Callable[[str], bool],
-    publish: Callable[[str, int, Any], None],
+    robot: RobotOutputs, parameters: FilterParameters, wanted: Callable[[str], bool],
     silence: float | None = None,
-) -> None:
-    """Makes the messages that robots act on.
+) -> Iterator[Made]:  # fmt: skip
+    """Topics, stamps and messages that robots act on.
 
     Args:
-        messages: factory.
-        robot: knows the newest image.
-        parameters: how.
-        wanted: whether a topic is to be made.
-        publish: takes topic, stamp and message, one after the other.
         silence: time since the newest image was answered, s, where none comes any more; None: it
             is being answered.
     """
     if wanted('keep_out') or wanted('keep_out_markers'):
         content = robot.keep_out(parameters.keep_out_probability, silence)
         if wanted('keep_out'):
-            publish('keep_out', content.stamp_ns, keep_out_message(messages, content))
+            yield Made('keep_out', content.stamp_ns, keep_out_message(MESSAGES, content))
         if wanted('keep_out_markers'):
-            publish('keep_out_markers', content.stamp_ns, keep_out_markers(messages, content))
+            yield Made('keep_out_markers', content.stamp_ns, keep_out_markers(MESSAGES, content))
     if silence is None and wanted('pose_forecast'):
         for stamp in robot.due(parameters.forecast_rate, parameters.forecast_horizon):
-            made = pose_mixture_message(messages, robot.forecast(stamp))
-            publish('pose_forecast', stamp, made)
+            forecast = pose_mixture_message(MESSAGES, robot.forecast(stamp))
+            yield Made('pose_forecast', stamp, forecast)
 
 
 def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
     """The posterior, with joints (K, J, 3) in the camera frame."""
-    posterior, velocities = track.posterior, track.velocities
-    frame, positions = track.frame_id, joints
+    tracker, posterior, velocities = track.tracker, track.posterior, track.tracker.velocities
+    frame, positions = track.waiting.frame_id, joints
     if (fixed := track.fixed) is not None:
-        posterior, velocities = fixed.placed(track.body, posterior, velocities)
+        posterior, velocities = fixed.placed(tracker.body, posterior, velocities)
         frame, positions = fixed.optical, fixed.motion.points(joints)
     return PoseMixture.of_body(
-        track.body,
+        tracker.body,
         posterior,
         MixtureKind.POSTERIOR,
-        track.stamp_ns,
+        track.waiting.stamp_ns,
         frame,
         joint_positions=positions,
-        log_likelihoods=track.log_likelihoods,
-        state=track.state,
-        track_id=track.track_id,
-        existence_probability=track.existence_probability,
-        cue_probabilities=_in_range(track.cue_probabilities),
-        identities=track.identities,
+        log_likelihoods=tracker.modes.log_likelihoods,
+        state=_state(tracker),
+        track_id=tracker.track_id,
+        existence_probability=tracker.existence_probability,
+        cue_probabilities=_in_range(tracker.validity.shown),
+        identities=tracker.modes.identities,
         velocities=velocities,
     )
 
 
 def _likelihood(track: TrackedImage) -> PoseMixture:
-    likelihood, frame, shape = track.likelihood, track.frame_id, track.shape_covariance
+    """The likelihood, which is undiscounted, with how its errors last."""
+    tracker, likelihood, frame = track.tracker, track.likelihood, track.waiting.frame_id
+    shape, errors = tracker.shape_covariance, tracker.likelihood_errors
     if (fixed := track.fixed) is not None:
-        likelihood, _ = fixed.placed(track.body, likelihood)
+        likelihood, _ = fixed.placed(tracker.body, likelihood)
         at_best = GaussianMixture(np.ones(1), track.posterior.means[:1], shape[None])
-        shape, frame = fixed.placed(track.body, at_best)[0].covariances[0], fixed.optical
+        shape, frame = fixed.placed(tracker.body, at_best)[0].covariances[0], fixed.optical
     return PoseMixture.of_body(
-        track.body,
+        tracker.body,
         likelihood,
         MixtureKind.LIKELIHOOD,
-        track.stamp_ns,
+        track.waiting.stamp_ns,
         frame,
-        state=track.state,
-        track_id=track.track_id,
-        existence_probability=track.existence_probability,
-        log_likelihoods=track.likelihood_values,
-        error_share=track.likelihood_errors.independent,
-        error_time=track.likelihood_errors.time,
+        state=_state(tracker),
+        track_id=tracker.track_id,
+        existence_probability=tracker.existence_probability,
+        log_likelihoods=tracker.log_likelihoods,
+        error_share=errors.independent,
+        error_time=errors.time,
         shape_covariance=shape,
     )
 
 
+def _state(tracker: Tracker) -> TrackState:
+    return TrackState.LOST if tracker.status is Status.LOST else TrackState.TRACKING
+
+
 def _ground_state(track: TrackedImage) -> GroundState:
     """What is known of gravity and of the floor, as a message holds it."""
-    ground = track.ground
+    ground = track.tracker.ground
     return GroundState(
-        track.stamp_ns,
-        track.frame_id,
+        track.waiting.stamp_ns,
+        track.waiting.frame_id,
         ground.up,
         ground.up_sigma,
         ground.height,
         math.nan if ground.height is None else ground.height_sigma,
-        _in_range(track.contacts),
+        _in_range(track.tracker.contacts),
     )
 
 
@@ -364,20 +281,23 @@ def _in_range(probabilities: Mapping[str, float]) -> dict[str, float]:
     return {name: min(max(float(p), 0.0), 1.0) for name, p in probabilities.items()}
 
 
-def _link_transforms(messages: MessageFactory, track: TrackedImage, prefix: str) -> Any:
+def _link_transforms(track: TrackedImage) -> Any:
     """Every link of the URDF in the point estimate, and frames with z up, from the camera."""
-    names, rotations, origins = links_of(track.body, track.point)
-    parents = [track.frame_id] * len(names)
+    tracker, camera, prefix = track.tracker, track.waiting.frame_id, track.parameters.frame_prefix
+    names, rotations, origins = links_of(tracker.body, tracker.point_estimate)
+    parents = [camera] * len(names)
     children = [f'{prefix}{name}' for name in names]
-    if track.up is not None:
-        parents, children = [*parents, track.frame_id], [*children, f'{prefix}{UPRIGHT}']
-        rotations = np.concatenate([rotations, upright(track.up)[None]])
-        origins = np.concatenate([origins, np.zeros((1, 3))])
+    more = []
+    if tracker.vertical is not None:
+        more.append((camera, f'{prefix}{UPRIGHT}', upright(tracker.vertical)))
     if track.fixed is not None:
-        parents, children = [*parents, track.fixed.name], [*children, track.fixed.optical]
-        rotations = np.concatenate([rotations, FROM_OPTICAL[None]])
+        more.append((track.fixed.name, track.fixed.optical, FROM_OPTICAL))
+    for parent, child, rotation in more:
+        parents, children = [*parents, parent], [*children, child]
+        rotations = np.concatenate([rotations, rotation[None]])
         origins = np.concatenate([origins, np.zeros((1, 3))])
-    return transforms_message(messages, parents, children, rotations, origins, track.stamp_ns)
+    stamp = track.waiting.stamp_ns
+    return transforms_message(MESSAGES, parents, children, rotations, origins, stamp)
 
 
 def links_of(body: Body, pose: Array) -> tuple[list[str], Array, Array]:

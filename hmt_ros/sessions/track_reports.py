@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions.camera_session import camera_moved_fault
-from hmt_ros.sessions.filter_state import IN_BACKGROUND
+from hmt_ros.sessions.camera_session import IN_BACKGROUND, camera_moved_fault
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.tracking import Status, Subject, Tracker
 from hmt_ros.tracking.existence import PRESENT
@@ -58,11 +57,7 @@ def report_change(
     """Tells what has changed with an image.
 
     Args:
-        log: takes the texts.
-        before: the condition before the image.
-        tracker: after the image.
         initial: what the track was given to start from.
-        stamp_ns: of the image.
     """
     now = TrackCondition.of(tracker)
     if now.doubted and not before.doubted:

@@ -68,7 +68,6 @@ class TrackStart:
         """A tracker that waits for its first image.
 
         Args:
-            camera: calibrated.
             ground: what is known of gravity and of the floor; None: what the parameters tell.
             shared: background of several people, which somebody else learns; None: an own one.
 
@@ -113,7 +112,6 @@ def prepare_start(
     """Reads the files that the parameters name.
 
     Args:
-        parameters: of the track.
         mixture: hmt_msgs/PoseMixture to start from; without components or None: the subject file.
         present: body of the present track, if any: a mixture without segment lengths is about it.
         region: sensor_msgs/RegionOfInterest in which the person is; None, or of no width: unknown.

@@ -10,14 +10,13 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, TypeVar
 
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import CameraSession, WaitingImage
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.session import NeededInput, SessionState, everything
+from hmt_ros.sessions.session import NeededInput, SessionState
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from hmt_ros.sessions.warm_up import warm_up_tracking
@@ -38,15 +37,10 @@ class TrackingSession(CameraSession[Parameters, State]):
 
     DONE = 'tracked'
 
-    def __init__(
-        self,
-        parameters: Parameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        super().__init__(parameters, publish, wanted)
-        self.start = prepare_start(parameters)
-        p = parameters
+    def _set_up(self) -> None:
+        super()._set_up()
+        p = self.parameters
+        self.start = prepare_start(p)
         self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
         self.answered = 0
 

@@ -54,7 +54,6 @@ class BagFolder:
     Args:
         path: folder to write, `<name>`; the file in it is `<name>.mcap`.
         overwrite: replace a bag that is there. Anything else that is there is never touched.
-        profile: of the MCAP file.
 
     Raises:
         BagError: the folder exists, can not be created or written.
@@ -94,7 +93,6 @@ class BagFolder:
         """Announces messages.
 
         Args:
-            channel: what they are.
             offered_qos: quality of service that their publishers offered, as in metadata.yaml.
             type_hash: RIHS01 hash of the type, or ''.
 
@@ -294,7 +292,7 @@ class _Topic(NamedTuple):
     channel: int
 
 
-class BagWriter(AbstractContextManager['BagWriter']):
+class BagWriter(BagFolder, AbstractContextManager['BagWriter']):
     """A bag that is open for writing; a context manager, which closes it, or drops it on an error.
 
     Args:
@@ -309,8 +307,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     def __init__(
         self, path: str | os.PathLike[str], *, overwrite: bool = False, namespace: str = ''
     ) -> None:
-        self._folder = BagFolder(path, overwrite=overwrite)
-        self.path = self._folder.path
+        super().__init__(path, overwrite=overwrite)
         self._namespace = namespace
         self._topics: dict[str, _Topic] = {}
 
@@ -337,7 +334,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         if name in self._topics:
             raise BagError(f'{self.path}: topic {name} is there already')
         definition, _ = store.generate_msgdef(msgtype, ros_version=2)
-        channel = self._folder.add_channel(
+        channel = self.add_channel(
             Channel(name, msgtype, 'cdr', 'ros2msg', definition.encode()),
             quality_of_service(latched),
             store.hash_rihs01(msgtype),
@@ -380,16 +377,4 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise BagError(
                 f'{self.path}: stamp {stamp_ns} ns of a message of {topic} is not a time'
             )
-        self._folder.add_message(known.channel, stamp_ns, data, stamp_ns)
-
-    def close(self) -> None:
-        """Completes the bag and moves it to its place; does nothing when that has been done.
-
-        Raises:
-            BagError: the disk is full, or the place is taken meanwhile; nothing is left behind.
-        """
-        self._folder.close()
-
-    def abort(self) -> None:
-        """Drops everything that was written."""
-        self._folder.abort()
+        self.add_message(known.channel, stamp_ns, data, stamp_ns)

@@ -68,10 +68,6 @@ class _Pass:
 class McapFile:
     """An MCAP file.
 
-    Args:
-        path: the file, not compressed as a whole.
-        name: of the bag, for the texts of errors.
-
     Raises:
         BagError: not an MCAP file.
 

@@ -54,9 +54,7 @@ def decompress(data: bytes | memoryview, compression: str, size: int) -> bytes:
     """Bytes of a chunk.
 
     Args:
-        data: compressed bytes.
         compression: '', 'zstd' or 'lz4', as MCAP names them.
-        size: of the result.
 
     Raises:
         DecompressionError: unknown compression, damaged data, another size.
@@ -80,7 +78,6 @@ def decompress_zstd(data: bytes | memoryview, size: int | None = None) -> bytes:
     """Bytes of one zstd frame.
 
     Args:
-        data: the frame.
         size: of the result, where it is known from elsewhere.
 
     Raises:
@@ -247,7 +244,6 @@ def chunk_records(body: bytes, offset: int) -> memoryview:
     """The records of a chunk, decompressed and compared with its checksum.
 
     Args:
-        body: of the record of the chunk.
         offset: by which texts of errors name the chunk.
     """
     fields = Fields(body, offset)
@@ -266,7 +262,6 @@ def records_in(data: memoryview, offset: int) -> Iterator[tuple[int, int, int]]:
     """Type, start and end of the body of records that follow each other, those of a chunk say.
 
     Args:
-        data: the records.
         offset: by which texts of errors name the chunk.
     """
     place = f'the chunk at byte {offset}'

@@ -108,10 +108,6 @@ Saved = SavedChannel | SavedMessage | SavedMetadata | SavedAttachment
 class McapSalvage:
     """A file that may be damaged.
 
-    Args:
-        path: the file, not compressed as a whole.
-        name: for the texts of errors.
-
     Raises:
         BagError: not an MCAP file.
 

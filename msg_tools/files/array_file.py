@@ -47,7 +47,6 @@ def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, 
     """The arrays of an archive by name.
 
     Args:
-        path: of the file.
         largest: bytes that they may have together.
 
     Raises:

@@ -29,7 +29,6 @@ class FolderKind:
         """Raises ValueError where a folder can not come to its place.
 
         Args:
-            target: the place.
             overwrite: whether a folder of this kind that is there may be replaced.
         """
         if not os.path.lexists(target):

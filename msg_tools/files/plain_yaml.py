@@ -41,7 +41,6 @@ def read_plain_yaml(path: str | Path, largest: int) -> Any:
     """The document in a file.
 
     Args:
-        path: of the file.
         largest: bytes that it may have.
 
     Raises:

@@ -13,15 +13,13 @@ from msg_tools.messages.message_error import MessageError, MessageFault, check_n
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.pose_mixtures import PoseMixture
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
-from msg_tools.messages.urdf import body_urdf, segments_of
+from msg_tools.messages.urdf import body_urdf
 
 
 def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_id: str) -> Any:
     """hmt_msgs/Body of a body at its present lengths.
 
     Args:
-        messages: factory of messages.
-        body: the person.
         stamp_ns: of the image that fixed the body.
         frame_id: optical frame of the camera; the root link of the URDF in the message.
     """
@@ -35,7 +33,7 @@ def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_i
         joint_names=list(body.joint_names),
         segment_names=list(body.segment_lengths),
         segment_lengths=np.array(list(body.segment_lengths.values()), dtype=np.float64),
-        urdf=body_urdf(body.name, segments_of(body.skeleton), frame_id),
+        urdf=body_urdf(body.skeleton, frame_id),
     )
 
 
@@ -62,8 +60,6 @@ def body_of(
     be about the model at its own lengths.
 
     Args:
-        content: the mixture.
-        model: of the person.
         any_name: whether the message may call the model by another name.
 
     Raises:
@@ -87,5 +83,5 @@ def description_message(
     """
     return messages.create(
         'std_msgs/msg/String',
-        data=body_urdf(body.name, segments_of(body.skeleton), frame_id, link_prefix=link_prefix),
+        data=body_urdf(body.skeleton, frame_id, link_prefix=link_prefix),
     )

@@ -73,7 +73,6 @@ def person_of_skeleton(message: Any, width: int, height: int) -> DetectedPerson:
     """The person in an hri_msgs/Skeleton2D.
 
     Args:
-        message: the message.
         width, height: size of the image, px.
 
     Raises:
@@ -94,7 +93,6 @@ def people_of_message(message: Any, sigma_px: float) -> list[DetectedPerson]:
     """The people in an hmt_msgs/People2D.
 
     Args:
-        message: the message.
         sigma_px: as for `keypoints_of`.
 
     Raises:
@@ -177,7 +175,6 @@ def people_of_yolo(message: Any, scheme: Scheme) -> list[DetectedPerson]:
     """The people with keypoints in a yolo_msgs/DetectionArray.
 
     Args:
-        message: the message.
         scheme: whose order the numbers of the keypoints follow.
 
     Raises:

@@ -21,7 +21,7 @@ from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.states import joint_state_message, transforms_message
-from msg_tools.messages.urdf import add_rod, xml_numbers
+from msg_tools.messages.urdf import add_limit, add_rod, xml_numbers
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,6 @@ def region_in_image(camera: Camera, positions: Array) -> Array | None:
     """Left, top, right and bottom (4,) of a person in an image, px from its upper left corner.
 
     Args:
-        camera: of the image.
         positions: (J, 3) of the joints in the frame of the camera, m.
 
     Returns:
@@ -77,13 +76,10 @@ def region_message(
     """hri_msgs/NormalizedRegionOfInterest2D.
 
     Args:
-        messages: factory of messages.
-        camera: of the image.
         region: (4,) of the mode that is shown, see `region_in_image`.
         others: (K) regions of all modes.
         weights: (K,) of the modes. The confidence is the probability that each corner is within a
             tenth of the region's height.
-        stamp_ns, frame_id: of the image.
     """
     near = _AGREE * (region[3] - region[1])
     agree = [other is not None and np.abs(other - region).max() <= near for other in others]
@@ -112,12 +108,9 @@ def skeleton_message(
     landmarks of where they are shown.
 
     Args:
-        messages: factory of messages.
-        camera: of the image.
         landmarks: (K, 18, 3) in all modes, see `landmarks_in_space`.
         shown: index of the mode whose landmarks are told.
         weights: (K,) of the modes.
-        stamp_ns, frame_id: of the image.
     """
     # (0, 0) is the centre of the first pixel.
     pixels = camera.project(landmarks) + 0.5
@@ -194,10 +187,6 @@ def human_transforms(
     """tf2_msgs/TFMessage: the body, seen from the camera, and all links, seen from the body.
 
     Args:
-        messages: factory of messages.
-        human: the model.
-        body_id: identity of the body.
-        stamp_ns, frame_id: of the image.
         links: whether the links are told, or the body alone.
     """
     root = f'body_{body_id}'
@@ -232,13 +221,6 @@ def human_urdf(human: ReferenceHuman, body_id: str, rod_radius: float = 0.03) ->
         ET.SubElement(element, 'origin', xyz=xml_numbers(joint.origin), rpy='0 0 0')
         if joint.axis is not None:
             ET.SubElement(element, 'axis', xyz=xml_numbers(joint.axis))
-            ET.SubElement(
-                element,
-                'limit',
-                lower=repr(-np.pi),
-                upper=repr(np.pi),
-                effort='1000.0',
-                velocity='100.0',
-            )
+            add_limit(element, -np.pi, np.pi)
     ET.indent(robot)
     return ET.tostring(robot, encoding='unicode', xml_declaration=False) + '\n'

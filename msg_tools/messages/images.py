@@ -126,18 +126,18 @@ def _decode_raw(message: Any) -> Picture:
     return np.array(image, dtype=np.uint8, order='C')
 
 
-def _rows_of(message: Any, rows: int, row_bytes: int) -> Picture:
+def _rows_of(message: Any, rows: int, row_bytes: int, what: str = 'image') -> Picture:
     """The bytes (rows, row_bytes) of an Image, without what fills up its rows."""
     width, height, step = int(message.width), int(message.height), int(message.step)
-    _check_size(width, height)
+    _check_size(width, height, what)
     if step < row_bytes:
         raise ImageError(
-            f'image step is {step}, wanted at least {row_bytes} for {width} {message.encoding}'
+            f'{what} step is {step}, wanted at least {row_bytes} for {width} {message.encoding}'
         )
     data = _bytes_of(message.data)
     if len(data) != rows * step:
         raise ImageError(
-            f'image has {len(data)} bytes, wanted {rows * step}: {rows} rows with a step of {step}'
+            f'{what} has {len(data)} bytes, wanted {rows * step}: {rows} rows with a step of {step}'
         )
     return np.ascontiguousarray(data.reshape(rows, step)[:, :row_bytes])
 
@@ -187,7 +187,6 @@ def decode_picture(
     The size in the header of the file is checked before anything is decoded.
 
     Args:
-        content: of the file.
         form: what it is said to be, for messages.
         colours: flag of OpenCV for the channels of the picture.
 
@@ -220,11 +219,17 @@ def decode_picture(
     return np.array(image, dtype=np.uint8, order='C')
 
 
-def _check_size(width: int, height: int) -> None:
+def _check_size(width: int, height: int, what: str = 'image') -> None:
     if width < 1 or height < 1:
-        raise ImageError(f'image has size {width}x{height}, wanted at least one pixel')
+        raise ImageError(f'{what} has size {width}x{height}, wanted at least one pixel')
     if width * height > MAX_PIXELS:
-        raise ImageError(f'image has size {width}x{height}, the limit is {MAX_PIXELS} pixels')
+        raise ImageError(f'{what} has size {width}x{height}, the limit is {MAX_PIXELS} pixels')
+
+
+def _check_picture(image: NDArray[np.uint8]) -> None:
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+        raise ImageError(f'image is {image.dtype} {image.shape}, wanted uint8 (H, W, 3) or (H, W)')
+    _check_size(image.shape[1], image.shape[0])
 
 
 def _bytes_of(data: Any) -> Picture:
@@ -287,9 +292,7 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int = 90) -> bytes:
     Raises:
         ImageError: not a picture.
     """
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
-        raise ImageError(f'image is {image.dtype} {image.shape}, wanted uint8 (H, W, 3) or (H, W)')
-    _check_size(image.shape[1], image.shape[0])
+    _check_picture(image)
     done, encoded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise ImageError(f'image of {image.shape[1]}x{image.shape[0]} can not be encoded as jpeg')
@@ -321,20 +324,9 @@ def image_message(
     messages: MessageFactory, image: NDArray[np.uint8], stamp_ns: int, frame_id: str
 ) -> Any:
     """sensor_msgs/Image of a picture, bgr8 for (H, W, 3) or mono8 for (H, W)."""
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
-        raise ImageError(f'image is {image.dtype} {image.shape}, wanted uint8 (H, W, 3) or (H, W)')
-    height, width = image.shape[:2]
-    _check_size(width, height)
-    return messages.create(
-        'sensor_msgs/msg/Image',
-        header=header_message(messages, stamp_ns, frame_id),
-        height=height,
-        width=width,
-        encoding='bgr8' if image.ndim == 3 else 'mono8',
-        is_bigendian=0,
-        step=width * (3 if image.ndim == 3 else 1),
-        data=np.ascontiguousarray(image).reshape(-1),
-    )
+    _check_picture(image)
+    encoding = 'bgr8' if image.ndim == 3 else 'mono8'
+    return _raw_message(messages, image, encoding, stamp_ns, frame_id)
 
 
 def decode_depth(message: Any) -> Depth:
@@ -347,18 +339,8 @@ def decode_depth(message: Any) -> Depth:
     if encoding not in _DEPTH_ENCODINGS:
         raise ImageError(f'depth has encoding {encoding!r}, wanted 16UC1 in mm or 32FC1 in m')
     kind, units = _DEPTH_ENCODINGS[encoding]
-    height, width, step = int(message.height), int(message.width), int(message.step)
     dtype = np.dtype(kind).newbyteorder('>' if message.is_bigendian else '<')
-    row_bytes = width * dtype.itemsize
-    if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise ImageError(f'depth has size {width}x{height}, wanted 1 to {MAX_PIXELS} pixels')
-    data = np.frombuffer(message.data, dtype=np.uint8) if len(message.data) else np.zeros(0, 'u1')
-    if step < row_bytes or len(data) != height * step:
-        raise ImageError(
-            f'depth has {len(data)} bytes and a step of {step}, wanted {height} rows of at least '
-            f'{row_bytes} for {width} {encoding}'
-        )
-    rows = np.ascontiguousarray(data.reshape(height, step)[:, :row_bytes])
+    rows = _rows_of(message, int(message.height), int(message.width) * dtype.itemsize, 'depth')
     result: Depth = rows.view(dtype).astype(np.float32) / np.float32(units)
     return result
 
@@ -377,13 +359,22 @@ def depth_message(
             f'depth is {depth.dtype} {depth.shape}, wanted uint16 in mm or float32 in m, (H, W)'
         )
     little = np.ascontiguousarray(depth).astype(depth.dtype.newbyteorder('<'), copy=False)
+    return _raw_message(messages, little, encoding, stamp_ns, frame_id)
+
+
+def _raw_message(
+    messages: MessageFactory, values: NDArray[Any], encoding: str, stamp_ns: int, frame_id: str
+) -> Any:
+    """sensor_msgs/Image of little-endian values (H, W) or (H, W, C)."""
+    rows = np.ascontiguousarray(values)
+    height, width = rows.shape[:2]
     return messages.create(
         'sensor_msgs/msg/Image',
         header=header_message(messages, stamp_ns, frame_id),
-        height=depth.shape[0],
-        width=depth.shape[1],
+        height=height,
+        width=width,
         encoding=encoding,
         is_bigendian=0,
-        step=depth.shape[1] * depth.dtype.itemsize,
-        data=little.view(np.uint8).reshape(-1),
+        step=rows.nbytes // height,
+        data=rows.view(np.uint8).reshape(-1),
     )

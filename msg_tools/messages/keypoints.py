@@ -54,7 +54,6 @@ def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
     """The content of an hmt_msgs/Keypoints2D, of `rosbags` or of ROS.
 
     Args:
-        message: the message.
         sigma_px: standard deviation where the message has no covariance, px; 0: unknown.
 
     Returns:
@@ -135,9 +134,7 @@ def keypoints_message(
     """hmt_msgs/Keypoints2D of an image with a stamp, in the optical frame of its camera.
 
     Args:
-        messages: makes the message.
         keypoints: maybe none: nobody was seen. A message has no covariances if one is unknown, NaN.
-        stamp_ns: of the image.
         frame_id: optical frame of the camera.
     """
     known = bool(np.isfinite(keypoints.covariances).all())

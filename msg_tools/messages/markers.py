@@ -64,14 +64,10 @@ def skeleton_markers(
     """visualization_msgs/MarkerArray of K modes.
 
     Args:
-        messages: factory of messages.
         joint_positions: (K, J, 3) m.
-        joint_names: (J,).
         edges: bones, as the names of the joints that they join.
         weights: (K,) of the modes, in any order.
-        stamp_ns, frame_id: of the header.
         ranks: most modes that ever are shown; the lightest beyond are left out.
-        namespace: first part of the namespaces.
         bone_width, joint_diameter: m.
 
     Raises:
@@ -145,15 +141,11 @@ def trajectory_markers(
     as marker 0 and the newest pose as marker 1.
 
     Args:
-        messages: factory of messages.
         joint_positions: (M, T, J, 3) m, in the order of time.
-        joint_names: (J,).
         traced: joints whose paths are drawn; those that are no joints are left out.
         edges: bones, as the names of the joints that they join.
         weights: (M,) of the trajectories, in any order.
-        stamp_ns, frame_id: of the header.
         ranks: most trajectories that ever are shown; the lightest beyond are left out.
-        namespace: first part of the namespaces.
         line_width: m.
 
     Raises:
@@ -247,8 +239,6 @@ def ground_markers(
     """visualization_msgs/Marker of the floor and of the contacts of one pose.
 
     Args:
-        messages: factory of messages.
-        content: gravity, the floor, contacts.
         joint_positions: (J, 3) m, in the frame of the content; the floor is drawn under their
             middle.
         joint_names: (J,); feet without joints of their side are left out.

@@ -63,9 +63,6 @@ def freeze_arrays(
     """Makes the attributes of a frozen dataclass read-only arrays of floats, in a shape each.
 
     Args:
-        record: the dataclass.
-        shapes: of its attributes, by name.
-        what: the record is, for messages.
         optional: names of attributes that may be None, and stay so.
 
     Raises:
@@ -120,7 +117,6 @@ def check_covariances(covariances: Array, what: str, *, singular: bool = False) 
 
     Args:
         covariances: (..., d, d).
-        what: they are of, for messages.
         singular: whether they may be positive semidefinite.
     """
     check_finite(covariances, f'covariance of {what}')
@@ -173,6 +169,33 @@ def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str)
     )
 
 
+def array_of_all(
+    components: Sequence[Any], name: str, shape: tuple[int, ...], what: str
+) -> Array | None:
+    """A field (K, *shape) that all components have or none has; None: none.
+
+    An older definition may lack it.
+
+    Raises:
+        MessageError: some have it and others not, or another number of values.
+    """
+    values = [getattr(component, name, ()) for component in components]
+    if not any(len(value) for value in values):
+        return None
+    for k, value in enumerate(values):
+        if len(value) == 0:
+            text = f'{what}: component {k} has no {name}, others have one'
+            raise MessageError(text, MessageFault.COVARIANCES)
+    return np.array(
+        [numbers(value, shape, f'{what}: component {k}: {name}') for k, value in enumerate(values)]
+    )
+
+
+def flat(values: Array | None, component: int) -> Array:
+    """Row-major values of a component; empty: unknown."""
+    return np.empty(0) if values is None else values[component].reshape(-1)
+
+
 def lengths_of(message: Any, what: str) -> dict[str, float]:
     """Segment lengths of a message by name, m; see `named_numbers`."""
     return named_numbers(message, 'segment_names', 'segment_lengths', what)
@@ -182,11 +205,6 @@ def named_numbers(message: Any, names: str, values: str, what: str) -> dict[str,
     """The numbers in a field of a message, by the names in another; empty where it has none.
 
     Bags older than the fields carry a definition without them: such a message has none, either.
-
-    Args:
-        message: has the fields.
-        names, values: their names.
-        what: the message is, for errors.
 
     Raises:
         MessageError: a name that is there twice, another number of values than of names.

@@ -52,10 +52,6 @@ def typestore() -> Typestore:
 def register_definitions(package: str, folder: Path) -> None:
     """Adds the messages of another package to `typestore()`.
 
-    Args:
-        package: its name.
-        folder: with its .msg files.
-
     Raises:
         ValueError: a file that can not be understood.
     """

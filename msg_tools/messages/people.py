@@ -141,9 +141,7 @@ class SeenPerson:
         """The person of a mixture.
 
         Args:
-            name: of the person.
             content: with components and covariances.
-            body: of the person.
 
         Raises:
             MessageError: no components, or no covariances.

@@ -21,11 +21,13 @@ from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import (
     MessageError,
     MessageFault,
+    array_of_all,
     check_covariances,
     check_finite,
     check_lengths,
     check_names,
     check_weights,
+    flat,
     freeze_arrays,
     identities_of,
     lengths_of,
@@ -218,7 +220,6 @@ class PoseMixture:
         and those relative to the pelvis, which is the first joint, have J - J_pelvis for J.
 
         Args:
-            body: the person.
             mixture: K Gaussians over its poses; None: nobody was seen.
             joint_positions: (K, J, 3) m, of the means; None: computed here.
             kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
@@ -285,7 +286,6 @@ def _joint_covariances(body: Body, jacobians: Array, covariances: Array) -> Arra
     """Covariances (K, J, 3, 3) of joints: of the poses, and what the body errs by in every pose.
 
     Args:
-        body: whose joints they are.
         jacobians: (K, J, 3, d) of the positions.
         covariances: (K, d, d) of the poses.
     """
@@ -301,19 +301,20 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
     assert content.log_likelihoods is not None
     assert content.degrees_of_freedom is not None
     assert content.identities is not None
+    shape = content.shape_covariance
     components = [
         messages.create(
             'hmt_msgs/msg/PoseComponent',
             id=int(content.identities[k]),
             weight=float(content.weights[k]),
             mean=content.means[k],
-            covariance=_flat(content.covariances, k),
+            covariance=flat(content.covariances, k),
             log_likelihood=float(content.log_likelihoods[k]),
             degrees_of_freedom=float(content.degrees_of_freedom[k]),
             joint_positions=messages.points(content.joint_positions[k]),
-            joint_covariances=_flat(content.joint_covariances, k),
-            joint_covariances_relative=_flat(content.joint_covariances_relative, k),
-            joint_velocities=_flat(content.joint_velocities, k),
+            joint_covariances=flat(content.joint_covariances, k),
+            joint_covariances_relative=flat(content.joint_covariances_relative, k),
+            joint_velocities=flat(content.joint_velocities, k),
         )
         for k in np.argsort(-content.weights, kind='stable')
     ]
@@ -331,20 +332,11 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
         cue_probabilities=np.array(list(content.cue_probabilities.values()), dtype=np.float64),
         error_share=content.error_share,
         error_time=content.error_time,
-        shape_covariance=(
-            np.empty(0)
-            if content.shape_covariance is None
-            else content.shape_covariance.reshape(-1)
-        ),
+        shape_covariance=np.empty(0) if shape is None else shape.reshape(-1),
         components=components,
         segment_names=list(content.segment_lengths),
         segment_lengths=np.array(list(content.segment_lengths.values()), dtype=np.float64),
     )
-
-
-def _flat(values: Array | None, component: int) -> Array:
-    """Row-major values of a component; empty: unknown."""
-    return np.empty(0) if values is None else values[component].reshape(-1)
 
 
 def pose_mixture_of(
@@ -358,7 +350,6 @@ def pose_mixture_of(
     (see `PoseMixture`) is understood; `PoseMixture.mixture` wants the first two.
 
     Args:
-        message: the message.
         dof_names, joint_names: what it has to be about, in this order; None: anything.
 
     Raises:
@@ -394,7 +385,7 @@ def pose_mixture_of(
     return PoseMixture(
         weights=np.array([component.weight for component in components]),
         means=np.reshape(means, (n, d)),
-        covariances=_optional(components, 'covariance', (d, d)),
+        covariances=array_of_all(components, 'covariance', (d, d), 'mixture'),
         body_model=str(message.body_model),
         dof_names=names,
         joint_names=joints,
@@ -408,11 +399,13 @@ def pose_mixture_of(
         state=state,
         track_id=int(message.track_id),
         identities=np.array([c.id for c in components], dtype=np.uint32),
-        joint_covariances=_optional(components, 'joint_covariances', (len(joints), 3, 3)),
-        joint_velocities=_optional(components, 'joint_velocities', (len(joints), 3)),
+        joint_covariances=array_of_all(
+            components, 'joint_covariances', (len(joints), 3, 3), 'mixture'
+        ),
+        joint_velocities=array_of_all(components, 'joint_velocities', (len(joints), 3), 'mixture'),
         existence_probability=_existence(message, state),
-        joint_covariances_relative=_optional(
-            components, 'joint_covariances_relative', (len(joints), 3, 3)
+        joint_covariances_relative=array_of_all(
+            components, 'joint_covariances_relative', (len(joints), 3, 3), 'mixture'
         ),
         cue_probabilities=named_numbers(message, 'cue_names', 'cue_probabilities', 'mixture'),
         shape_covariance=_shape_covariance(message, d),
@@ -440,21 +433,3 @@ def _shape_covariance(message: Any, d: int) -> Array | None:
     """The field (d, d); None where a publisher or an older definition lacks it."""
     values = getattr(message, 'shape_covariance', ())
     return numbers(values, (d, d), 'mixture: shape_covariance') if len(values) else None
-
-
-def _optional(components: Sequence[Any], name: str, shape: tuple[int, ...]) -> Array | None:
-    """A field (K, *shape) that all components have or none has; None: none.
-
-    An older definition may lack it.
-    """
-    values = [getattr(component, name, ()) for component in components]
-    if not any(len(value) for value in values):
-        return None
-    for k, value in enumerate(values):
-        if len(value) == 0:
-            raise MessageError(
-                f'mixture: component {k} has no {name}, others have one', MessageFault.COVARIANCES
-            )
-    return np.array(
-        [numbers(value, shape, f'mixture: component {k}: {name}') for k, value in enumerate(values)]
-    )

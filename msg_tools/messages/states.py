@@ -65,7 +65,6 @@ def joint_trajectory(
     Args:
         messages: factory; one for ROS has the classes JointTrajectory, JointTrajectoryPoint,
             Duration, Header and Time.
-        content: the trajectories.
         identity: of the motion; None: the heaviest.
 
     Returns:
@@ -146,11 +145,9 @@ def transforms_message(
     """tf2_msgs/TFMessage.
 
     Args:
-        messages: factory of messages.
         parents, children: (N,) names of frames.
         rotations: (N, 3, 3) and
         translations: (N, 3), m: p_parent = R p_child + t.
-        stamp_ns: of the pose.
 
     Raises:
         MessageError: arrays whose lengths contradict each other, values that are not finite.

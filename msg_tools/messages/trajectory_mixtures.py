@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from msg_tools.messages.headers import EARLIEST_NS, header_message, time_message, time_ns
 from msg_tools.messages.message_error import (
     MessageError,
+    array_of_all,
     check_covariances,
     check_finite,
     check_lengths,
     check_names,
     check_weights,
+    flat,
     freeze_arrays,
     identities_of,
     lengths_of,
@@ -106,7 +108,6 @@ class TrajectoryMixture:
 
 def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixture) -> Any:
     """hmt_msgs/TrajectoryMixture; components heaviest first, of equal weights in their order."""
-    covariances, joints = content.marginal_covariances, content.joint_positions
     assert content.identities is not None
     components = [
         messages.create(
@@ -116,8 +117,8 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
             log_joint=float(content.log_joint[m]),
             inflation=float(content.inflation[m]),
             means=content.means[m].reshape(-1),
-            marginal_covariances=np.empty(0) if covariances is None else covariances[m].reshape(-1),
-            joint_positions=np.empty(0) if joints is None else joints[m].reshape(-1),
+            marginal_covariances=flat(content.marginal_covariances, m),
+            joint_positions=flat(content.joint_positions, m),
         )
         for m in np.argsort(-content.weights, kind='stable')
     ]
@@ -143,7 +144,6 @@ def trajectory_mixture_of(
     """The content of an hmt_msgs/TrajectoryMixture, of `rosbags` or of ROS.
 
     Args:
-        message: the message.
         dof_names: what it has to be about, in this order; None: anything.
 
     Raises:
@@ -166,7 +166,9 @@ def trajectory_mixture_of(
                 for m, component in enumerate(components)
             ]
         ),
-        marginal_covariances=_optional(components, 'marginal_covariances', (t, d, d)),
+        marginal_covariances=array_of_all(
+            components, 'marginal_covariances', (t, d, d), 'trajectories'
+        ),
         log_joint=np.array([component.log_joint for component in components]),
         inflation=np.array([component.inflation for component in components]),
         stamps_ns=tuple(time_ns(stamp) for stamp in message.stamps),
@@ -177,20 +179,8 @@ def trajectory_mixture_of(
         frame_id=str(message.header.frame_id),
         segment_lengths=lengths_of(message, 'trajectories'),
         joint_names=joints,
-        joint_positions=_optional(components, 'joint_positions', (t, len(joints), 3)),
+        joint_positions=array_of_all(
+            components, 'joint_positions', (t, len(joints), 3), 'trajectories'
+        ),
         identities=np.array([getattr(component, 'id', 0) for component in components]),
-    )
-
-
-def _optional(components: Sequence[Any], name: str, shape: tuple[int, ...]) -> Array | None:
-    """A field (M, *shape) that all components have or none has; None: none."""
-    values = [getattr(component, name) for component in components]
-    known = {bool(len(value)) for value in values}
-    if len(known) > 1:
-        raise MessageError(f'trajectories: some components have {name}, others have none')
-    if known == {False}:
-        return None
-    what = 'trajectories: component'
-    return np.array(
-        [numbers(value, shape, f'{what} {m}: {name}') for m, value in enumerate(values)]
     )

@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,113 +27,29 @@ Array = NDArray[np.float64]
 
 # URDF wants limits with every joint that has a range; these stand for none.
 _UNLIMITED = 1000.0
-_LETTERS: tuple[Literal['x', 'y', 'z'], ...] = ('x', 'y', 'z')
-_AXES = {'x': '1 0 0', 'y': '0 1 0', 'z': '0 0 1'}
-
-
-@dataclass(frozen=True)
-class Freedom:
-    """A degree of freedom of a segment.
-
-    Attributes:
-        name: of the joint.
-        axis: of the parent's frame for a translation, of the segment's moving frame for a rotation.
-        kind: 'revolute' or 'prismatic'.
-        lower, upper: rad or m; infinite where there is none.
-    """
-
-    name: str
-    axis: Literal['x', 'y', 'z']
-    kind: Literal['revolute', 'prismatic']
-    lower: float
-    upper: float
-
-
-@dataclass(frozen=True, eq=False)
-class Segment:
-    """A rigid part of the body.
-
-    Attributes:
-        name: of the link.
-        parent: index of the parent, which stands before the segment; -1: the root link.
-        offset: (3,) of the origin in the frame of the parent, m.
-        mount: (3, 3) rotation from the segment's frame at rest to its parent's.
-        freedoms: translations first, then rotations, in the order in which they act.
-        points: (P, 3) m, where a viewer shows the segment as rods from its origin.
-    """
-
-    name: str
-    parent: int
-    offset: ArrayLike
-    mount: ArrayLike
-    freedoms: Sequence[Freedom] = ()
-    points: ArrayLike = ()
-
-
-def segments_of(skeleton: Skeleton) -> list[Segment]:
-    """The segments of a skeleton at its present lengths, shown as rods to their ends."""
-    result = []
-    for index, name in enumerate(skeleton.segment_names):
-        freedoms = [
-            Freedom(
-                skeleton.dof_names[i],
-                _LETTERS[int(skeleton.dof_axes[i])],
-                'revolute' if skeleton.dof_is_rotation[i] else 'prismatic',
-                float(skeleton.lower[i]),
-                float(skeleton.upper[i]),
-            )
-            for i in skeleton.segment_dofs[index]
-        ]
-        children = [child for child, parent in enumerate(skeleton.parents) if parent == index]
-        points = [
-            *skeleton.offsets[children],
-            *skeleton.joint_offsets[skeleton.joint_segments == index],
-        ]
-        result.append(
-            Segment(
-                name,
-                skeleton.parents[index],
-                skeleton.offsets[index],
-                skeleton.mounts[index],
-                freedoms,
-                np.unique(np.reshape(points, (-1, 3)), axis=0),
-            )
-        )
-    return result
+_AXES = ('1 0 0', '0 1 0', '0 0 1')
 
 
 def body_urdf(
-    name: str,
-    segments: Sequence[Segment],
-    root_link: str,
-    rod_radius: float = 0.025,
-    link_prefix: str = '',
+    skeleton: Skeleton, root_link: str, rod_radius: float = 0.025, link_prefix: str = ''
 ) -> str:
-    """The URDF; the same text for the same body.
+    """The URDF of a skeleton at its present lengths; the same text for the same body.
 
     Args:
-        name: of the robot.
-        segments: of the body, parents before their children.
+        skeleton: whose segments are shown as rods to their ends.
         root_link: what the segments without parent hang on: the frame of the camera.
-        rod_radius: of the rods that show a segment, m.
+        rod_radius: m.
         link_prefix: stands before the names of all links but the root.
 
     Raises:
-        MessageError: a parent that does not stand before its child, a translation after a rotation,
-            a name that is there twice, a mount that is no rotation.
+        MessageError: a name that is there twice.
     """
-    robot = ET.Element('robot', name=name)
+    robot = ET.Element('robot', name=skeleton.name)
     ET.SubElement(robot, 'link', name=root_link)
     joints: list[ET.Element] = []
-    for index, segment in enumerate(segments):
-        if not -1 <= segment.parent < index:
-            raise MessageError(
-                f'urdf: segment {segment.name} has parent {segment.parent}, wanted one before it'
-            )
-        parent = root_link
-        if segment.parent != -1:
-            parent = f'{link_prefix}{segments[segment.parent].name}'
-        _add_segment(robot, joints, segment, parent, rod_radius, link_prefix)
+    for index, parent in enumerate(skeleton.parents):
+        above = root_link if parent == -1 else f'{link_prefix}{skeleton.segment_names[parent]}'
+        _add_segment(robot, joints, skeleton, index, above, rod_radius, link_prefix)
     robot.extend(joints)
     for kind in ('link', 'joint'):
         seen: set[str] = set()
@@ -148,52 +62,45 @@ def body_urdf(
 
 
 def _add_segment(
-    robot: ET.Element,
-    joints: list[ET.Element],
-    segment: Segment,
-    parent: str,
-    rod_radius: float,
-    link_prefix: str,
-) -> None:
-    offset = np.asarray(segment.offset, dtype=np.float64)
-    mount = np.asarray(segment.mount, dtype=np.float64)
-    if offset.shape != (3,) or mount.shape != (3, 3):
-        raise MessageError(
-            f'urdf: segment {segment.name} has offset {offset.shape} and mount {mount.shape}, '
-            'wanted (3,) and (3, 3)'
-        )
-    if not np.allclose(mount @ mount.T, np.eye(3), atol=1e-6) or np.linalg.det(mount) < 0:
-        raise MessageError(f'urdf: the mount of segment {segment.name} is no rotation')
-    kinds = [freedom.kind for freedom in segment.freedoms]
-    if kinds != sorted(kinds):
-        raise MessageError(f'urdf: segment {segment.name} is translated after it is rotated')
-    # The steps from the parent to the segment: the mount stands before the first rotation.
-    steps: list[Freedom | None] = list(segment.freedoms)
-    if 'revolute' not in kinds:
+    robot: ET.Element, joints: list[ET.Element], skeleton: Skeleton, index: int, parent: str,
+    rod_radius: float, link_prefix: str,
+) -> None:  # fmt: skip
+    """Adds the links and joints that lead from a parent link to a segment."""
+    name, offset = skeleton.segment_names[index], skeleton.offsets[index]
+    # Degrees of freedom; None: a fixed joint. The mount stands before the first rotation.
+    steps: list[int | None] = list(skeleton.segment_dofs[index])
+    if not any(skeleton.dof_is_rotation[i] for i in skeleton.segment_dofs[index]):
         steps.append(None)
-    waiting_offset, waiting_mount = offset, mount
-    for index, step in enumerate(steps):
-        turns = step is None or step.kind == 'revolute'
-        last = index == len(steps) - 1
-        link = f'{link_prefix}{segment.name if last else _within(segment.name, step)}'
-        joints.append(
-            _joint(
-                step, segment.name, parent, link, waiting_offset, waiting_mount if turns else None
-            )
+    mount: Array | None = skeleton.mounts[index]
+    for number, dof in enumerate(steps, 1):
+        last, turns = number == len(steps), dof is None or bool(skeleton.dof_is_rotation[dof])
+        step = 'mount' if dof is None else skeleton.dof_names[dof]
+        link = f'{link_prefix}{name}' if last else f'{link_prefix}{name}.{step}'
+        joint = ET.Element(
+            'joint', name=f'{name}.mount' if dof is None else step, type=_kind(skeleton, dof)
         )
-        waiting_offset = np.zeros(3)
-        if turns:
-            waiting_mount = np.eye(3)
+        angles = roll_pitch_yaw(mount) if turns and mount is not None else np.zeros(3)
+        ET.SubElement(joint, 'origin', xyz=xml_numbers(offset), rpy=xml_numbers(angles))
+        ET.SubElement(joint, 'parent', link=parent)
+        ET.SubElement(joint, 'child', link=link)
+        if dof is not None:
+            ET.SubElement(joint, 'axis', xyz=_AXES[int(skeleton.dof_axes[dof])])
+            lower = max(float(skeleton.lower[dof]), -_UNLIMITED)
+            upper = min(float(skeleton.upper[dof]), _UNLIMITED)
+            add_limit(joint, lower, upper)
+        joints.append(joint)
         element = ET.SubElement(robot, 'link', name=link)
-        if last:
-            for point in np.reshape(np.asarray(segment.points, dtype=np.float64), (-1, 3)):
-                add_rod(element, point, rod_radius)
-        parent = link
+        offset, mount, parent = np.zeros(3), None if turns else mount, link
+    children = [child for child, above in enumerate(skeleton.parents) if above == index]
+    own = skeleton.joint_offsets[skeleton.joint_segments == index]
+    for point in np.unique(np.concatenate([skeleton.offsets[children], own]), axis=0):
+        add_rod(element, point, rod_radius)
 
 
-def _within(segment: str, step: Freedom | None) -> str:
-    """Name of a link between a segment and its parent."""
-    return f'{segment}.{step.name if step else "mount"}'
+def _kind(skeleton: Skeleton, dof: int | None) -> str:
+    if dof is None:
+        return 'fixed'
+    return 'revolute' if skeleton.dof_is_rotation[dof] else 'prismatic'
 
 
 def link_frames(
@@ -202,8 +109,6 @@ def link_frames(
     """Where the links of `body_urdf` are, all but the root, which is the camera.
 
     Args:
-        skeleton: of the body.
-        frames: of its segments.
         pose: (d,) that they belong to.
         index: of the pose among those of the frames.
 
@@ -257,24 +162,10 @@ def _rotations(axes: Array, angles: Array) -> Array:
     return result
 
 
-def _joint(
-    step: Freedom | None, segment: str, parent: str, child: str, offset: Array, mount: Array | None
-) -> ET.Element:
-    joint = ET.Element(
-        'joint', name=step.name if step else f'{segment}.mount', type=step.kind if step else 'fixed'
-    )
-    angles = np.zeros(3) if mount is None else roll_pitch_yaw(mount)
-    ET.SubElement(joint, 'origin', xyz=xml_numbers(offset), rpy=xml_numbers(angles))
-    ET.SubElement(joint, 'parent', link=parent)
-    ET.SubElement(joint, 'child', link=child)
-    if step is not None:
-        ET.SubElement(joint, 'axis', xyz=_AXES[step.axis])
-        lower = max(float(step.lower), -_UNLIMITED)
-        upper = min(float(step.upper), _UNLIMITED)
-        ET.SubElement(
-            joint, 'limit', lower=repr(lower), upper=repr(upper), effort='1000.0', velocity='100.0'
-        )
-    return joint
+def add_limit(joint: ET.Element, lower: float, upper: float) -> None:
+    """Limits a joint, m or rad."""
+    bounds = {'lower': repr(lower), 'upper': repr(upper)}
+    ET.SubElement(joint, 'limit', bounds | {'effort': '1000.0', 'velocity': '100.0'})
 
 
 def add_rod(link: ET.Element, end: Array, radius: float) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.sessions.bme_session import PREDICTION
+from hmt_ros.sessions.image_inputs import PREDICTION
 from msg_tools.messages.cdr import serialise
 from test.nodes.conftest import PATIENCE
 

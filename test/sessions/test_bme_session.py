@@ -8,7 +8,8 @@ import pytest
 from hmt_ros.body import Camera, load_body
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, SILHOUETTE, TOPICS, TRACK, BmeSession
+from hmt_ros.sessions.bme_session import SILHOUETTE, TOPICS, TRACK, BmeSession
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.image_inputs import MASK
@@ -145,7 +146,7 @@ def test_predictions_take_those_before_into_account(session, somebody, stub_pred
 def test_rule_one_needs_a_model_of_it(session, stub_predictor):
     with pytest.raises(ValueError, match='trained with --dynamics'):
         session(propagation='experts')
-    with pytest.raises(ValueError, match="propagation is 'rule', wanted one of dynamics"):
+    with pytest.raises(ValueError, match=r"propagation must be one of .* saw 'rule'"):
         session(propagation='rule')
 
 
@@ -591,7 +592,7 @@ def test_keypoints_that_can_not_be_used_are_told_and_count_as_none(both, outputs
     strange.names = ['antenna', 'wheel']
     one.take(IMAGE, somebody.image(1))
     assert 'antenna' in one.take('keypoints', strange).warnings[0]
-    with pytest.raises(ValueError, match="predict_from is 'all', wanted one of silhouettes"):
+    with pytest.raises(ValueError, match=r"predict_from must be one of .* saw 'all'"):
         BmeParameters(predict_from='all')
     with pytest.raises(ValueError, match="'both' needs a lifter"):
         BmeParameters(predict_from='both', lifter='')

@@ -5,9 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hmt_ros.body.camera import Viewpoint
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS, FilterSession
+from hmt_ros.sessions.filter_session import FilterSession
+from hmt_ros.sessions.image_inputs import KEYPOINTS
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC
 from msg_tools import RosbagsMessages

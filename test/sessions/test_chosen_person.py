@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions.chosen_person import ChosenPerson
+from hmt_ros.sessions.keypoint_inputs import ChosenPerson
 from msg_tools.messages.detections import DetectedPerson
 
 NAMES = ('left_hip', 'right_hip', 'head')

@@ -6,9 +6,10 @@ import pytest
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import DEPTH, FilterSession
+from hmt_ros.sessions.filter_session import FilterSession
+from hmt_ros.sessions.image_inputs import DEPTH, DETECTIONS
 from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.people_session import DETECTIONS, PeopleSession
+from hmt_ros.sessions.people_session import PeopleSession
 from msg_tools.messages.detections import PEOPLE_2D
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import depth_message

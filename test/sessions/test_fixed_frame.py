@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.body import load_body
 from hmt_ros.body.mirror import root_rotations
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import CAMERA_INFO, IMAGE, FilterSession
+from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession

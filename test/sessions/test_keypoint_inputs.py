@@ -8,7 +8,8 @@ import pytest
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D, FilterSession
+from hmt_ros.sessions.filter_session import FilterSession
+from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D
 from test.sessions.conftest import JOINTS
 
 

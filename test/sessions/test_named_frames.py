@@ -2,8 +2,9 @@
 
 import pytest
 
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import CAMERA_INFO, IMAGE, FilterSession
+from hmt_ros.sessions.filter_session import FilterSession
 
 
 @pytest.fixture

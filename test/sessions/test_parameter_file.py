@@ -13,9 +13,7 @@ CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
 
 def test_file_of_the_node_is_what_it_declares():
     wanted = parameter_file_text('filter_node', FilterParameters())
-    assert CONFIG.read_text('utf-8') == wanted, (
-        'write it: python -m hmt_ros.sessions.filter_parameters > hmt_ros/config/filter_node.yaml'
-    )
+    assert CONFIG.read_text('utf-8') == wanted, 'write it: python docs/generate.py filter_node'
     assert max(len(line) for line in wanted.splitlines()) <= 100
     assert read_parameter_file(CONFIG, 'filter_node') == values_of(FilterParameters())
 

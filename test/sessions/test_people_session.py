@@ -11,8 +11,9 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions import track_start
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.image_inputs import DETECTIONS
 from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.people_session import DETECTIONS, PEOPLE, PeopleSession, published_topic
+from hmt_ros.sessions.people_session import PEOPLE, PeopleSession, published_topic
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.beginning import Source
 from msg_tools.messages.cdr import deserialise

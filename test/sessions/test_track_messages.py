@@ -1,5 +1,6 @@
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,10 +11,13 @@ from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.sessions.camera_session import WaitingImage
+from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.overlay import draw_modes
-from hmt_ros.sessions.track_messages import TOPICS, Presentation, TrackedImage, track_messages
+from hmt_ros.sessions.track_messages import TOPICS, TrackedImage, track_messages
+from hmt_ros.tracking import Status
 from hmt_ros.tracking.ground import Ground
-from msg_tools import MessageError, RosbagsMessages
+from msg_tools import MessageError
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.ground import ground_of
 from msg_tools.messages.images import decode_image
@@ -37,25 +41,42 @@ def track(body):
     root = rng.normal(size=(3, body.dimension, body.dimension))
     covariances = root @ root.transpose(0, 2, 1) / body.dimension + 0.1 * np.eye(body.dimension)
     covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
-    return TrackedImage(
-        image=np.full((240, 320, 3), 200, np.uint8),
-        stamp_ns=STAMP,
-        frame_id='lens',
+    posterior = GaussianMixture(np.array([0.5, 0.3, 0.2]), poses, covariances)
+    tracker = SimpleNamespace(
         body=body,
         camera=CAMERA,
-        posterior=GaussianMixture(np.array([0.5, 0.3, 0.2]), poses, covariances),
-        likelihood=GaussianMixture(np.array([0.6, 0.4]), poses[:2], covariances[:2]),
-        log_likelihoods=np.array([-3.0, -2.0, -1.0]),
-        likelihood_values=np.array([-2.5, -1.5]),
+        settings=SimpleNamespace(max_hypotheses=8),
+        status=Status.TRACKING,
+        track_id=1,
+        existence_probability=0.75,
+        modes=SimpleNamespace(
+            log_likelihoods=np.array([-3.0, -2.0, -1.0]), identities=np.arange(1, 4)
+        ),
+        log_likelihoods=np.array([-2.5, -1.5]),
         likelihood_errors=CueErrors(0.25, 0.125),
         shape_covariance=0.01 * np.eye(body.dimension),
-        point=poses[1],
+        point_estimate=poses[1],
         ground=Ground(np.array([0.0, -0.8, -0.6]), 0.05, 1.5, 0.1),
         contacts={'left_foot': 0.75, 'right_foot': 0.25},
-        starts=True,
+        velocities=None,
+        vertical=None,
         # As rounding may leave them.
-        cue_probabilities={'depth': 0.25, 'track': 1.0 + 1e-15},
+        validity=SimpleNamespace(shown={'depth': 0.25, 'track': 1.0 + 1e-15}),
     )
+    return TrackedImage(
+        WaitingImage(np.full((240, 320, 3), 200, np.uint8), STAMP, 'lens'),
+        tracker,
+        posterior,
+        GaussianMixture(np.array([0.6, 0.4]), poses[:2], covariances[:2]),
+        FilterParameters(frame_prefix='anna/'),
+        starts=True,
+        describe=True,
+    )
+
+
+def changed(track, **of_tracker):
+    """The image with another tracker."""
+    return replace(track, tracker=SimpleNamespace(**{**vars(track.tracker), **of_tracker}))
 
 
 def draw(body, poses, weights, count, image):
@@ -63,12 +84,8 @@ def draw(body, poses, weights, count, image):
     return draw_modes(image, CAMERA, joints, body.skeleton.bones, weights, count)
 
 
-SHOWN = Presentation(8, 3, True, 'anna/', True)
-
-
-def made(track, presentation=SHOWN):
-    found = {}
-    track_messages(RosbagsMessages(), track, presentation, lambda topic: True, found.__setitem__)
+def made(track):
+    found = dict(track_messages(track, lambda topic: True))
     assert [topic for topic in TOPICS if topic in found] == list(found)
     for topic, message in found.items():
         assert message.__msgtype__ == TOPICS[topic].msgtype
@@ -98,7 +115,8 @@ def test_mixtures(track, body):
     assert (likelihood.error_share, likelihood.error_time) == (0.25, 0.125)
     assert np.isnan([posterior.error_share, posterior.error_time]).all()
     # So is what all images err by alike.
-    assert np.array_equal(likelihood.shape_covariance, track.shape_covariance.reshape(-1))
+    shape = track.tracker.shape_covariance.reshape(-1)
+    assert np.array_equal(likelihood.shape_covariance, shape)
     assert len(posterior.shape_covariance) == 0
     # The posterior tells what the cues are believed.
     assert (posterior.cue_names, list(posterior.cue_probabilities)) == (
@@ -111,11 +129,11 @@ def test_mixtures(track, body):
 def test_joint_states_are_those_of_the_point_estimate(track, body):
     state = made(track)['human_joint_states']
     assert tuple(state.name) == body.dof_names
-    assert np.array_equal(state.position, track.point)
+    assert np.array_equal(state.position, track.tracker.point_estimate)
 
 
 def test_transforms_lead_from_the_camera_to_the_segments(track, body):
-    frames = forward(body.skeleton, track.point[None])
+    frames = forward(body.skeleton, track.tracker.point_estimate[None])
     transforms = {t.child_frame_id: t for t in made(track)['/tf'].transforms}
     for index, name in enumerate(body.skeleton.segment_names):
         transform = transforms[f'anna/{name}']
@@ -176,20 +194,15 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
     poses[:, :3] = rng.uniform([-1, -1, 2], [1, 1, 6], (2, 3))
     covariances = np.tile(1e-2 * np.eye(body.dimension), (2, 1, 1))
     mixture = GaussianMixture(np.array([0.4, 0.6]), poses, covariances)
-    found = made(
-        TrackedImage(
-            **{
-                **track.__dict__,
-                'body': body,
-                'posterior': mixture,
-                'likelihood': mixture,
-                'log_likelihoods': np.zeros(2),
-                'likelihood_values': np.zeros(2),
-                'shape_covariance': np.zeros((body.dimension, body.dimension)),
-                'point': poses[1],
-            }
-        )
+    other = changed(
+        track,
+        body=body,
+        modes=SimpleNamespace(log_likelihoods=np.zeros(2), identities=np.arange(2)),
+        log_likelihoods=np.zeros(2),
+        shape_covariance=np.zeros((body.dimension, body.dimension)),
+        point_estimate=poses[1],
     )
+    found = made(replace(other, posterior=mixture, likelihood=mixture))
     urdf = found['human_description'].data
     root, frames = forward_kinematics(urdf, found['human_joint_states'])
     assert root == 'lens'
@@ -229,10 +242,16 @@ def test_ground(track, body):
     assert (content.stamp_ns, content.frame_id) == (STAMP, 'lens')
     np.testing.assert_allclose(content.plane, [0.0, -0.8, -0.6, 1.5])
     assert (content.up_sigma, content.height_sigma) == (0.05, 0.1)
-    assert content.contacts == track.contacts
+    assert content.contacts == track.tracker.contacts
     # The feet are those of the point estimate.
     feet = found['markers'].markers[-1]
-    joints = dict(zip(body.joint_names, body.joint_positions(track.point[None])[0], strict=True))
+    joints = dict(
+        zip(
+            body.joint_names,
+            body.joint_positions(track.tracker.point_estimate[None])[0],
+            strict=True,
+        )
+    )
     for point, name in zip(
         feet.points, ('left_ankle', 'left_toe', 'right_ankle', 'right_toe'), strict=True
     ):
@@ -240,7 +259,8 @@ def test_ground(track, body):
 
 
 def test_ground_whose_height_is_unknown(track):
-    unknown = replace(track, ground=Ground(track.ground.up, 0.3, None, np.inf), contacts={})
+    ground = Ground(track.tracker.ground.up, 0.3, None, np.inf)
+    unknown = changed(track, ground=ground, contacts={})
     found = made(unknown)
     content = ground_of(found['ground'])
     assert content.plane is None
@@ -251,9 +271,9 @@ def test_ground_whose_height_is_unknown(track):
 
 def test_body_comes_with_its_first_image_only(track):
     assert next(iter(made(track))) == 'body'
-    again = TrackedImage(**{**track.__dict__, 'starts': False})
+    again = replace(track, starts=False)
     assert 'body' not in made(again)
-    unchanged = made(again, replace(SHOWN, describe=False))
+    unchanged = made(replace(again, describe=False))
     assert 'human_description' in made(again)
     assert 'human_description' not in unchanged
     assert made(track)['body'].header.frame_id == 'lens'
@@ -262,9 +282,9 @@ def test_body_comes_with_its_first_image_only(track):
 def test_overlay_shows_the_modes(track, body):
     message = made(track)['overlay/compressed']
     picture = decode_image(message)
-    drawn = draw(body, track.posterior.means, track.posterior.weights, 3, track.image)
+    drawn = draw(body, track.posterior.means, track.posterior.weights, 3, track.waiting.image)
     assert cv2.absdiff(picture, drawn).mean() < 2.0
-    assert np.all(track.image == 200)
+    assert np.all(track.waiting.image == 200)
     pixels = CAMERA.project(body.joint_positions(track.posterior.means))
     knee = body.joint_names.index('left_knee')
     red = [drawn[round(v), round(u)].astype(int) for u, v in pixels[:, knee]]
@@ -291,10 +311,6 @@ def test_overlay_with_people_partly_outside_and_behind(body):
 def test_impossible_mixtures_are_refused_before_anything_is_published(track):
     covariances = -track.likelihood.covariances
     likelihood = GaussianMixture(track.likelihood.weights, track.likelihood.means, covariances)
-    bad = TrackedImage(**{**track.__dict__, 'likelihood': likelihood})
-    published = []
+    bad = replace(track, likelihood=likelihood)
     with pytest.raises(MessageError, match='not positive definite'):
-        track_messages(
-            RosbagsMessages(), bad, SHOWN, lambda topic: True, lambda *x: published.append(x)
-        )
-    assert published == []
+        next(track_messages(bad, lambda topic: True))

@@ -5,10 +5,9 @@ import re
 import numpy as np
 import pytest
 
-from hmt_ros.sessions.camera_session import MOST_INCOMPLETE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, CAMERA_MOVED, IMAGE, MOST_INCOMPLETE
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import CAMERA_INFO, IMAGE, FilterSession
-from hmt_ros.sessions.filter_state import CAMERA_MOVED
+from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.tracking import Status
 
 

@@ -21,9 +21,9 @@ from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_session import PREDICTION, FilterSession
+from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import Handled, Output
-from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE
+from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE, PREDICTION
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession, published_topic
 from hmt_ros.sessions.session import FINISH

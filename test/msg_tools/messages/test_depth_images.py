@@ -40,11 +40,11 @@ def test_nan_stays_nan():
     ('changes', 'text'),
     [
         ({'encoding': 'mono8'}, "encoding 'mono8', wanted 16UC1 in mm or 32FC1 in m"),
-        ({'step': 5}, 'step of 5, wanted 2 rows of at least 6 for 3 16UC1'),
-        ({'height': 3}, 'has 12 bytes and a step of 6, wanted 3 rows'),
+        ({'step': 5}, 'depth step is 5, wanted at least 6 for 3 16UC1'),
+        ({'height': 3}, 'depth has 12 bytes, wanted 18: 3 rows with a step of 6'),
         ({'encoding': '32FC1'}, 'at least 12 for 3 32FC1'),
-        ({'width': 0}, 'size 0x2, wanted 1 to'),
-        ({'width': 2**16, 'height': 2**16}, 'size 65536x65536, wanted 1 to'),
+        ({'width': 0}, 'depth has size 0x2, wanted at least one pixel'),
+        ({'width': 2**16, 'height': 2**16}, 'depth has size 65536x65536, the limit is'),
     ],
 )
 def test_bad_messages_are_refused(changes, text):

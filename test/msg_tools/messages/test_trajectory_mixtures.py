@@ -113,7 +113,7 @@ def test_messages_that_contradict_themselves(messages: RosbagsMessages) -> None:
     for name in ('marginal_covariances', 'joint_positions'):
         message = trajectory_mixture_message(messages, CONTENT)
         setattr(message.components[0], name, np.zeros(0))
-        with pytest.raises(MessageError, match=f'some components have {name}, others have none'):
+        with pytest.raises(MessageError, match=f'has no {name}, others have one'):
             trajectory_mixture_of(message)
     message.components = []
     with pytest.raises(MessageError, match='no components'):

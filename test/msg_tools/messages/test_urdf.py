@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
+from hmt_ros.body.skeleton import Skeleton
 from msg_tools import MessageError
-from msg_tools.messages.urdf import Freedom, Segment, body_urdf, roll_pitch_yaw, segments_of
+from msg_tools.messages.urdf import body_urdf, roll_pitch_yaw
 
 AXES = np.eye(3)
 
@@ -27,48 +28,58 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray[Any, Any]:
     return rotation(axis / np.linalg.norm(axis), rng.uniform(-np.pi, np.pi))
 
 
-def random_body(seed: int) -> list[Segment]:
+def skeleton_of(
+    segments: list[tuple[str, int]],
+    offsets: Any,
+    mounts: Any,
+    dofs: Any = (),
+    joints: Any = (),
+) -> Skeleton:
+    """A skeleton of segments (name, parent), dofs (name, segment, axis, turns), joints of 0."""
+    names, parents = zip(*segments, strict=True)
+    s, j, columns = len(segments), len(joints), list(zip(*dofs, strict=True)) or [()] * 4
+    return Skeleton(
+        'body', names, parents, np.array(mounts), np.array(offsets), np.zeros((s, 3, 1)),
+        columns[0], np.array(columns[1], dtype=int), np.array(columns[2], dtype=int),
+        np.array(columns[3], dtype=bool), np.full(len(dofs), -np.inf), np.full(len(dofs), 2.0),
+        tuple(f'joint {i}' for i in range(j)), np.zeros(j, dtype=int),
+        np.reshape(joints, (j, 3, 1)), ('scale',), np.ones(1),
+    )  # fmt: skip
+
+
+def random_body(seed: int) -> Skeleton:
     rng = np.random.default_rng(seed)
-    segments = []
+    segments: list[tuple[str, int]] = []
+    mounts, dofs = [], []
     for index in range(9):
-        freedoms: list[Freedom] = []
-        for kind, count in (('prismatic', rng.integers(0, 3)), ('revolute', rng.integers(0, 4))):
-            for axis in rng.permutation(list('xyz'))[:count]:
-                name = f'{index}_{kind}_{axis}'
-                freedoms.append(Freedom(name, axis, kind, -np.inf, 2.0))  # type: ignore[arg-type]
+        for turns, count in ((False, rng.integers(0, 3)), (True, rng.integers(0, 4))):
+            axes = rng.permutation(3)[:count].tolist()
+            dofs += [(f'{index}_{turns}_{axis}', index, axis, turns) for axis in axes]
         mount = random_rotation(rng)
         if index % 3 == 0:  # at the pole of roll, pitch and yaw
             mount = rotation(AXES[2], 0.3) @ rotation(AXES[1], np.pi / 2) @ rotation(AXES[0], 0.5)
-        segments.append(
-            Segment(
-                f'segment {index}',
-                int(rng.integers(-1, index)) if index else -1,
-                rng.normal(size=3),
-                mount,
-                freedoms,
-                rng.normal(size=(2, 3)),
-            )
-        )
-    return segments
+        segments.append((f'segment {index}', int(rng.integers(-1, index)) if index else -1))
+        mounts.append(mount)
+    return skeleton_of(segments, rng.normal(size=(9, 3)), mounts, dofs, rng.normal(size=(2, 3)))
 
 
-def forward(segments: list[Segment], pose: dict[str, float]) -> list[np.ndarray[Any, Any]]:
+def forward(skeleton: Skeleton, pose: dict[str, float]) -> list[np.ndarray[Any, Any]]:
     """Trans(offset + translations) * mount * rotations, one matrix after the other."""
     frames: list[np.ndarray[Any, Any]] = []
-    for segment in segments:
-        frame = np.eye(4) if segment.parent == -1 else frames[segment.parent].copy()
-        place = np.array(segment.offset, dtype=float)
-        for freedom in segment.freedoms:
-            if freedom.kind == 'prismatic':
-                place += pose[freedom.name] * AXES['xyz'.index(freedom.axis)]
+    for index, parent in enumerate(skeleton.parents):
+        frame = np.eye(4) if parent == -1 else frames[parent].copy()
         step = np.eye(4)
-        step[:3, 3] = place
-        step[:3, :3] = segment.mount
+        step[:3, 3], step[:3, :3] = skeleton.offsets[index], skeleton.mounts[index]
+        for dof in skeleton.segment_dofs[index]:
+            axis = AXES[skeleton.dof_axes[dof]]
+            if not skeleton.dof_is_rotation[dof]:
+                step[:3, 3] += pose[skeleton.dof_names[dof]] * axis
         frame = frame @ step
-        for freedom in segment.freedoms:
-            if freedom.kind == 'revolute':
+        for dof in skeleton.segment_dofs[index]:
+            if skeleton.dof_is_rotation[dof]:
                 turn = np.eye(4)
-                turn[:3, :3] = rotation(AXES['xyz'.index(freedom.axis)], pose[freedom.name])
+                axis = AXES[skeleton.dof_axes[dof]]
+                turn[:3, :3] = rotation(axis, pose[skeleton.dof_names[dof]])
                 frame = frame @ turn
         frames.append(frame)
     return frames
@@ -77,10 +88,10 @@ def forward(segments: list[Segment], pose: dict[str, float]) -> list[np.ndarray[
 @pytest.mark.parametrize('seed', range(6))
 def test_forward_kinematics_of_pinocchio(seed: int) -> None:
     pinocchio = pytest.importorskip('pinocchio', reason='Pinocchio (pin) is not installed')
-    segments = random_body(seed)
-    model = pinocchio.buildModelFromXML(body_urdf('body', segments, 'camera'))
+    skeleton = random_body(seed)
+    model = pinocchio.buildModelFromXML(body_urdf(skeleton, 'camera'))
     data = model.createData()
-    names = [freedom.name for segment in segments for freedom in segment.freedoms]
+    names = skeleton.dof_names
     assert sorted(list(model.names)[1:]) == sorted(names)
     assert model.nq == len(names)
     rng = np.random.default_rng(100 + seed)
@@ -90,8 +101,9 @@ def test_forward_kinematics_of_pinocchio(seed: int) -> None:
         for name, value in pose.items():
             q[model.joints[model.getJointId(name)].idx_q] = value
         pinocchio.framesForwardKinematics(model, data, q)
-        for segment, wanted in zip(segments, forward(segments, pose), strict=True):
-            found = data.oMf[model.getFrameId(segment.name)].homogeneous
+        segments = skeleton.segment_names
+        for segment, wanted in zip(segments, forward(skeleton, pose), strict=True):
+            found = data.oMf[model.getFrameId(segment)].homogeneous
             np.testing.assert_allclose(found, wanted, atol=1e-9)
     upper = model.upperPositionLimit
     assert (upper == 2.0).all()
@@ -103,7 +115,7 @@ def test_joints_of_a_body(name: str) -> None:
     pinocchio = pytest.importorskip('pinocchio', reason='Pinocchio (pin) is not installed')
     body = load_body(name)
     skeleton = body.skeleton
-    model = pinocchio.buildModelFromXML(body_urdf(name, segments_of(skeleton), 'camera'))
+    model = pinocchio.buildModelFromXML(body_urdf(skeleton, 'camera'))
     data = model.createData()
     poses = np.random.default_rng(0).uniform(-1, 1, (5, body.dimension))
     for pose, wanted in zip(poses, body.joint_positions(poses), strict=True):
@@ -130,13 +142,12 @@ def test_roll_pitch_yaw_gives_back_the_rotation() -> None:
 
 
 def test_rods_reach_from_the_origin_to_the_points() -> None:
-    segments = [
-        Segment('a', -1, np.zeros(3), np.eye(3), (), [[0.1, -0.2, 0.3], [0, 0, -1], [0, 0, 0]])
-    ]
-    robot = ET.fromstring(body_urdf('body', segments, 'camera'))
+    points = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.1, -0.2, 0.3]])
+    skeleton = skeleton_of([('a', -1)], [np.zeros(3)], [np.eye(3)], joints=points)
+    robot = ET.fromstring(body_urdf(skeleton, 'camera'))
     visuals = robot.findall("./link[@name='a']/visual")
     assert len(visuals) == 2
-    for visual, point in zip(visuals, np.array(segments[0].points), strict=False):
+    for visual, point in zip(visuals, points[[0, 2]], strict=True):
         origin = visual.find('origin')
         cylinder = visual.find('geometry/cylinder')
         assert origin is not None
@@ -150,31 +161,16 @@ def test_rods_reach_from_the_origin_to_the_points() -> None:
 
 
 def test_text_is_the_same_every_time_and_escaped() -> None:
-    segments = [Segment('a<b>&"c', -1, -np.zeros(3), np.eye(3))]
-    text = body_urdf('body', segments, 'camera')
-    assert text == body_urdf('body', segments, 'camera')
+    skeleton = skeleton_of([('a<b>&"c', -1)], [-np.zeros(3)], [np.eye(3)])
+    text = body_urdf(skeleton, 'camera')
+    assert text == body_urdf(skeleton, 'camera')
     assert '-0.0' not in text
     robot = ET.fromstring(text)
     assert [link.attrib['name'] for link in robot.findall('link')] == ['camera', 'a<b>&"c']
     assert robot.find('joint').attrib['type'] == 'fixed'  # type: ignore[union-attr]
 
 
-def test_defects() -> None:
-    turn = Freedom('turn', 'x', 'revolute', -1, 1)
-    slide = Freedom('slide', 'x', 'prismatic', -1, 1)
-    zero, one = np.zeros(3), np.eye(3)
-    for segments, error in (
-        ([Segment('a', 0, zero, one)], 'segment a has parent 0, wanted one before it'),
-        ([Segment('a', -1, zero, one), Segment('a', 0, zero, one)], "the link 'a' is there twice"),
-        ([Segment('camera', -1, zero, one)], "the link 'camera' is there twice"),
-        (
-            [Segment('a', -1, zero, one, [turn, turn])],
-            "the joint 'turn' is there twice",
-        ),
-        ([Segment('a', -1, zero, one, [turn, slide])], 'is translated after it is rotated'),
-        ([Segment('a', -1, zero, -one)], 'the mount of segment a is no rotation'),
-        ([Segment('a', -1, zero, 2 * one)], 'the mount of segment a is no rotation'),
-        ([Segment('a', -1, np.zeros(2), one)], r'has offset \(2,\) and mount \(3, 3\)'),
-    ):
-        with pytest.raises(MessageError, match=error):
-            body_urdf('body', segments, 'camera')
+def test_a_segment_with_the_name_of_the_camera() -> None:
+    skeleton = skeleton_of([('camera', -1)], [np.zeros(3)], [np.eye(3)])
+    with pytest.raises(MessageError, match="the link 'camera' is there twice"):
+        body_urdf(skeleton, 'camera')
