@@ -18,6 +18,26 @@ def files(folder: str, pattern: str) -> list[str]:
     return sorted(str(path.relative_to(ROOT)) for path in (ROOT / folder).glob(pattern))
 
 
+# Whether pip builds a wheel, which has the library and the offline commands; colcon builds none.
+WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel'}.isdisjoint(sys.argv)
+
+
+def opencv() -> list[str]:
+    """OpenCV as a requirement of a wheel, unless the environment of pip has one.
+
+    Its distributions (apt, opencv-python, -headless, -contrib) hold one module: a second one would
+    overwrite the first.
+    """
+    if not WHEEL:
+        return []
+    # pip builds in an environment of its own, by these variables.
+    hidden = ('PYTHONPATH', 'PYTHONNOUSERSITE')
+    environment = {name: value for name, value in os.environ.items() if name not in hidden}
+    program = 'import importlib.util as u; raise SystemExit(u.find_spec("cv2") is None)'
+    done = subprocess.run([sys.executable, '-c', program], env=environment, cwd='/', check=False)
+    return ['opencv-python-headless'] if done.returncode else []
+
+
 class Install(install):
     """``install``, and the messages with it; into the prefix that colcon or bloom gives."""
 
@@ -29,7 +49,8 @@ class Install(install):
     def run(self) -> None:
         """Install hmt_msgs, then hmt_ros, and compile its kernels."""
         prefix = Path(self.install_base)
-        if in_colcon(prefix) or (self.prefix_is_given and 'AMENT_PREFIX_PATH' in os.environ):
+        given = self.prefix_is_given and 'AMENT_PREFIX_PATH' in os.environ and not WHEEL
+        if given or in_colcon(prefix):
             build_base = Path(self.get_finalized_command('build').build_base)
             install_messages(build_base / MESSAGES, prefix, str(self.root or ''))
         super().run()
@@ -53,7 +74,9 @@ class Develop(develop):
 
 def in_colcon(prefix: Path) -> bool:
     """Whether colcon installs into this folder, alone or together with other packages."""
-    return any((x / '.colcon_install_layout').is_file() for x in (prefix, prefix.parent))
+    return not WHEEL and any(
+        (x / '.colcon_install_layout').is_file() for x in (prefix, prefix.parent)
+    )
 
 
 def compile_kernels(folder: Path) -> None:
@@ -185,9 +208,8 @@ setup(
         'tqdm',
         'lz4',
         'zstandard',
+        *opencv(),
     ],
-    # OpenCV has several distributions of one module (apt, opencv-python, -headless): naming one
-    # here would install it a second time next to another.
     extras_require={
         'test': ['pytest', 'hypothesis'],
         'dask': ['distributed'],
@@ -197,7 +219,10 @@ setup(
     zip_safe=False,
     cmdclass={'install': Install, 'develop': Develop},
     entry_points={
-        'console_scripts': [
+        # "ros2 run" finds each program by its name; pip would put all these names into PATH.
+        'console_scripts': ['hmt_ros = hmt_ros.app:main']
+        if WHEEL
+        else [
             'filter_node = hmt_ros.nodes.filter_node:main',
             'smoother_node = hmt_ros.nodes.smoother_node:main',
             'bme_node = hmt_ros.nodes.bme_node:main',

@@ -75,7 +75,7 @@ FOREIGN = {
     'rviz2',
     'sed',
     'git',
-    'docker',
+    'ln',
     'rosdoc2',
     'sphinx-build',
     'install/hmt_ros/lib/hmt_ros/filter_node',

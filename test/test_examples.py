@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import runpy
@@ -12,12 +13,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
-from msg_tools import BagWriter, RosbagsMessages
+from hmt_ros.tracking.keep_out import keep_out_capsules
+from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message
 from msg_tools.messages.pose_mixtures import (
@@ -32,6 +36,8 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / 'examples'
 MESSAGES = RosbagsMessages()
 NAN = math.nan
+# Share of 10 m by 10 m under the capsule of `keep_out`, 2 m long, with half the diagonal of a cell.
+LYING = (2.0 * 2.0 * 0.2854 + math.pi * 0.2854**2) / 100.0
 
 
 def example(name):
@@ -40,16 +46,18 @@ def example(name):
 
 def test_the_readme_names_every_example():
     text = (EXAMPLES / 'README.md').read_text('utf-8')
-    assert all(f'`{path.name}`' in text for path in EXAMPLES.glob('*.py'))
+    programs = [path.name for path in EXAMPLES.iterdir() if path.suffix in ('.py', '.ipynb')]
+    assert len(programs) == 5
+    assert all(f'`{name}`' in text for name in programs)
 
 
-def keep_out(state, away=1.5, unseen=0.0):
+def keep_out(state, away=1.5, unseen=0.0, frame='eye'):
     """Somebody `away` m from the origin, if anybody is known."""
     some = state not in (KeepOutState.NOBODY, KeepOutState.UNKNOWN)
     starts, ends = np.array([[-1.0, 0.0, away + 0.25]]), np.array([[1.0, 0.0, away + 0.25]])
     none = np.empty((0, 3))
     content = KeepOut(
-        10**9, 'eye', state, starts if some else none, ends if some else none,
+        10**9, frame, state, starts if some else none, ends if some else none,
         np.full(int(some), 0.25), unseen=unseen if some else NAN,
     )  # fmt: skip
     return keep_out_message(MESSAGES, content)
@@ -71,12 +79,74 @@ def test_a_robot_slows_down_and_stops_where_nothing_is_known():
         (keep_out(KeepOutState.LOST, 9.0, 0.4), 1.0),
         (keep_out(KeepOutState.LOST, 9.0, 0.6), 0.0),
     ):
-        constants = {f'STATE_{each.name}': int(each) for each in KeepOutState}
-        given = SimpleNamespace(
-            **constants,
-            **{x: getattr(message, x) for x in ('state', 'unseen', 'starts', 'ends', 'radii')},
-        )
-        assert scale(given) == pytest.approx(wanted)
+        assert scale(with_constants(message)) == pytest.approx(wanted)
+
+
+def with_constants(message):
+    """A message with the constants that one of rclpy has."""
+    names = ('header', 'state', 'unseen', 'starts', 'ends', 'radii')
+    return SimpleNamespace(
+        **{f'STATE_{each.name}': int(each) for each in KeepOutState},
+        **{name: getattr(message, name) for name in names},
+    )
+
+
+def test_cells_under_capsules_are_occupied():
+    told = example('keep_out_grid')
+    centres = np.arange(-4.975, 5.0, 0.05)
+    x, y = np.meshgrid(centres, centres)
+    # One that stands, and one that lies across the grid's border.
+    under = told['shadows']([1, 2, 0, 4, -3, 1], [1, 2, 3, 9, -3, 1], [0.5, 0.3])
+    away = np.minimum(np.hypot(x - 1, y - 2) - 0.5, np.hypot(np.minimum(x - 4, 0), y + 3) - 0.3)
+    assert under.shape == x.shape
+    assert under[away <= 0].all()
+    assert not under[away > 0.05].any()
+    assert not told['shadows']([9, 9, 0], [9, 9, 1], [0.5]).any()
+
+
+@pytest.mark.parametrize(
+    ('state', 'unseen', 'frame', 'share'),
+    [
+        (KeepOutState.NOBODY, 0.0, 'odom', 0.0),
+        (KeepOutState.NOBODY, 0.0, 'eye', 1.0),
+        (KeepOutState.UNKNOWN, 0.0, 'odom', 1.0),
+        (KeepOutState.STALE, 0.0, 'odom', 1.0),
+        (KeepOutState.LOST, 0.6, 'odom', 1.0),
+        (KeepOutState.LOST, 0.4, 'odom', LYING),
+        (KeepOutState.TRACKING, 0.0, 'odom', LYING),
+    ],
+)
+def test_everything_is_occupied_where_nothing_is_known(state, unseen, frame, share):
+    message = with_constants(keep_out(state, 1.5, unseen, frame))
+    cells = example('keep_out_grid')['occupancy'](message)
+    assert set(np.unique(cells)) <= {0, 100}
+    assert np.mean(cells == 100) == pytest.approx(share, abs=1e-3)
+
+
+def test_the_person_of_a_bag_stands_on_occupied_cells():
+    """Truth of bags/reach, in odom, where its camera stands."""
+    body = load_body('human37')
+    with BagReader(ROOT / 'bags' / 'reach') as bag:
+        (stored,) = bag.messages(['/tf_static'])
+    (place,) = stored.message.transforms
+    x, y, z, w = (getattr(place.transform.rotation, name) for name in 'xyzw')
+    across = [getattr(place.transform.translation, name) for name in 'xyz']
+    turn = Rotation.from_quat([x, y, z, w])
+    with np.load(ROOT / 'bags' / 'reach' / 'truth.npz') as truth:
+        poses, joints = truth['poses'][::15], truth['joints'][::15]
+    for pose, true in zip(poses, joints, strict=True):
+        posterior = GaussianMixture([1.0], pose[None], [1e-4 * np.eye(body.dimension)])
+        capsules = keep_out_capsules(body, posterior)
+        content = KeepOut(
+            10**9, place.header.frame_id, KeepOutState.TRACKING,
+            turn.apply(capsules.starts) + across, turn.apply(capsules.ends) + across,
+            capsules.radii, unseen=0.0,
+        )  # fmt: skip
+        message = with_constants(keep_out_message(MESSAGES, content))
+        cells = example('keep_out_grid')['occupancy'](message)
+        columns, rows = np.floor((turn.apply(true) + across)[:, :2].T / 0.05).astype(int) + 100
+        assert (cells[rows, columns] == 100).all()
+        assert 0.3 < 0.05**2 * np.sum(cells == 100) < 2.0  # m^2
 
 
 def mixture(*heights, weights=(0.75, 0.25)):
@@ -130,15 +200,41 @@ def test_the_height_of_a_joint_is_drawn(tmp_path):
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
 
 
+def test_the_notebook_runs_from_its_first_cell_to_its_last(monkeypatch, capsys):
+    """As it is saved, without results: its code in order."""
+    content = json.loads((EXAMPLES / 'library.ipynb').read_text('utf-8'))
+    cells = [cell for cell in content['cells'] if cell['cell_type'] == 'code']
+    assert content['nbformat'] == 4
+    assert not any(cell['outputs'] or cell['execution_count'] for cell in cells)
+    monkeypatch.setenv('MPLBACKEND', 'Agg')
+    plt.switch_backend('Agg')
+    monkeypatch.chdir(EXAMPLES)
+    names = {}
+    for number, cell in enumerate(cells):
+        exec(compile(''.join(cell['source']), f'cell {number}', 'exec'), names)
+    # Each mode has four limbs on each picture, and the truth has four on one.
+    drawn = [len(axes.lines) for axes in (names['picture'], names['above'])]
+    plt.close('all')
+    count = len(names['posterior'].weights)
+    assert drawn == [4 * count, 4 * count + 4]
+    assert names['best'] <= names['heaviest'] < 0.1
+    assert f'{count} modes: heaviest' in capsys.readouterr().out
+
+
 @pytest.mark.ros
 @pytest.mark.parametrize(
     ('name', 'topic', 'wanted'),
-    [('keep_distance', 'speed_scale', 0.5), ('raised_hand', 'raised_hand', 0.0)],
+    [
+        ('keep_distance', 'speed_scale', 0.5),
+        ('raised_hand', 'raised_hand', 0.0),
+        ('keep_out_grid', 'keep_out_grid', LYING),
+    ],
 )
 def test_an_example_answers(name, topic, wanted):
     import rclpy
     from hmt_msgs.msg import KeepOut as KeepOutOfRos
     from hmt_msgs.msg import PoseMixture as MixtureOfRos
+    from nav_msgs.msg import OccupancyGrid
     from std_msgs.msg import Float64
 
     body = load_body('human37')
@@ -151,7 +247,15 @@ def test_an_example_answers(name, topic, wanted):
     given = {
         'keep_distance': ('keep_out', KeepOutOfRos, keep_out(KeepOutState.TRACKING, 1.25)),
         'raised_hand': ('pose_mixture', MixtureOfRos, pose_mixture_message(MESSAGES, content)),
-    }
+        'keep_out_grid': (
+            'keep_out', KeepOutOfRos, keep_out(KeepOutState.TRACKING, 1.25, frame='odom')
+        ),
+    }  # fmt: skip
+    answer = OccupancyGrid if name == 'keep_out_grid' else Float64
+
+    def value(told):
+        return told.data if answer is Float64 else np.mean(np.array(told.data) == 100)
+
     source, kind, message = given[name]
     assert POSE_MIXTURE.endswith('PoseMixture')
     context = rclpy.Context()
@@ -160,7 +264,7 @@ def test_an_example_answers(name, topic, wanted):
     executor = rclpy.executors.SingleThreadedExecutor(context=context)
     executor.add_node(node)
     heard: list[float] = []
-    node.create_subscription(Float64, topic, lambda x: heard.append(x.data), 10)
+    node.create_subscription(answer, topic, lambda x: heard.append(value(x)), 10)
     publisher = node.create_publisher(kind, source, 10)
     process = subprocess.Popen(
         [sys.executable, EXAMPLES / f'{name}.py', '--ros-args', '-r', '__ns:=/lab']

@@ -6,18 +6,22 @@ import ast
 import importlib
 import os
 import runpy
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+import zipfile
 from fnmatch import fnmatch
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import setuptools
 
 import hmt_ros
+from hmt_ros.app import COMMANDS
 from test.conftest import LONGEST
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -148,15 +152,21 @@ def test_every_folder_of_modules_is_a_package() -> None:
     assert [folder for folder in folders if not (folder / '__init__.py').is_file()] == []
 
 
+def setup_arguments_of(command: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What setup.py hands to setuptools for a command."""
+    arguments: dict[str, Any] = {}
+    monkeypatch.setattr(setuptools, 'setup', lambda **given: arguments.update(given))
+    monkeypatch.setattr(sys, 'argv', ['setup.py', command])
+    monkeypatch.chdir(ROOT)
+    runpy.run_path('setup.py', run_name='__main__')
+    return arguments
+
+
 @pytest.fixture(scope='module')
 def setup_arguments() -> dict[str, Any]:
     """What setup.py hands to setuptools."""
-    arguments: dict[str, Any] = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(setuptools, 'setup', lambda **given: arguments.update(given))
-        patch.chdir(ROOT)
-        runpy.run_path('setup.py', run_name='__main__')
-    return arguments
+        return setup_arguments_of('install', patch)
 
 
 def xml(path: Path) -> ET.Element:
@@ -234,6 +244,62 @@ def test_generated_interface_imports(path: Path) -> None:
     lines = [line.split('#')[0].split() for line in definition.splitlines()]
     fields = [words[1] for words in lines if len(words) == 2 and '=' not in words[1]]
     assert list(generated.get_fields_and_field_types()) == fields
+
+
+@pytest.mark.parametrize(
+    ('command', 'there', 'wanted'),
+    [('bdist_wheel', False, True), ('bdist_wheel', True, False), ('install', False, False)],
+)
+def test_a_wheel_requires_opencv_where_there_is_none(
+    command: str, there: bool, wanted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = SimpleNamespace(returncode=int(not there))
+    monkeypatch.setattr(subprocess, 'run', lambda *_, **__: done)
+    required = setup_arguments_of(command, monkeypatch)['install_requires']
+    assert ('opencv-python-headless' in required) == wanted
+
+
+def test_a_wheel_has_the_library_and_one_command(tmp_path: Path) -> None:
+    sources = tmp_path / 'sources'
+    for name in ('hmt_ros', 'msg_tools', 'resource', 'launch', 'rviz', 'foxglove', 'security'):
+        ignored = shutil.ignore_patterns('__pycache__')
+        shutil.copytree(ROOT / name, sources / name, ignore=ignored)
+    for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml'):
+        shutil.copy(ROOT / name, sources)
+    command = [sys.executable, '-m', 'pip', 'wheel', '--no-deps', '--no-build-isolation']
+    made = subprocess.run(
+        [*command, '--wheel-dir', tmp_path, sources], capture_output=True, text=True, check=False
+    )
+    assert made.returncode == 0, made.stderr
+    (path,) = tmp_path.glob('*.whl')
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path / 'site')
+    (text,) = (x.read_text('utf-8') for x in tmp_path.glob('site/*.dist-info/entry_points.txt'))
+    assert text.split() == ['[console_scripts]', 'hmt_ros', '=', 'hmt_ros.app:main']
+    program = (
+        'import sys; sys.path.insert(0, sys.argv[1])\n'
+        'for missing in ("rclpy", "hmt_msgs", "std_msgs", "sensor_msgs", "geometry_msgs"):\n'
+        '    sys.modules[missing] = None\n'
+        'from hmt_ros.app import COMMANDS, main\n'
+        'from hmt_ros.body import load_body\n'
+        'from msg_tools import typestore\n'
+        'assert "hmt_msgs/msg/PoseMixture" in typestore().types\n'
+        'for name in COMMANDS:\n'
+        '    try:\n'
+        '        main([name, "--help"])\n'
+        '    except SystemExit as ended:\n'
+        '        assert ended.code == 0, name\n'
+        'print(load_body.__code__.co_filename, load_body("human37").dimension, file=sys.stderr)\n'
+    )
+    ran = subprocess.run(
+        [sys.executable, '-I', '-c', program, tmp_path / 'site'],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.count('usage: ') == len(COMMANDS)
+    where, dimension = ran.stderr.split()
+    assert Path(where).is_relative_to(tmp_path / 'site')
+    assert dimension == '37'
 
 
 @pytest.mark.ros
