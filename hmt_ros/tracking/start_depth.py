@@ -1,11 +1,11 @@
-"""What a depth image tells a start: how far away joints are, whose pixels are known.
+"""Depths of joints from a depth image, for a start: the pixels of the joints are known.
 
 A joint lies behind the skin that its pixel shows, by about the radius of the flesh there:
 
     z_j = D(u_j) + r_j +- sigma_j,   sigma_j^2 = (r_j / 2)^2 + SIGMA^2
 
 D is a low quantile of the depths around the pixel, as limbs are thin and the background is behind
-them. What stands before the joint, or was measured beside it, is an outlier; kernels are robust.
+them. A thing before the joint, or a depth beside it, is an outlier; kernels are robust.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def depths_of(depth: NDArray[np.floating] | None) -> ImageMap | None:
 
 @dataclass(frozen=True, eq=False)
 class JointDepths:
-    """Depths of some joints, as a depth image tells them.
+    """Depths of some joints from a depth image.
 
     Attributes:
         joints: (M,) of the skeleton.
