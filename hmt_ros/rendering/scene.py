@@ -1,4 +1,4 @@
-"""What a rendered person stands in and wears: light, floor, wall, things, noise; and clothes.
+"""Surroundings of a rendered person: light, floor, wall, things, noise; and the clothes.
 
 A scene is a seed and a few numbers. The picture of the empty place follows from them by casting
 rays through every pixel, so that it is right for every distortion of the camera.
