@@ -1,4 +1,4 @@
-"""Which paths through the modes of a sequence are probable, each filtered in closed form.
+"""Probable paths through the modes of a sequence, each filtered in closed form.
 
 A path that goes on to mode k of the next image has the state and the weight
 
@@ -9,7 +9,7 @@ The network of VMS 4 weighs a path by pairs of neighbours (`embedded_network`), 
 nothing of what was before it: where most modes are wide, a path may turn round and back. In every
 image few paths are kept of all: some that are apart, and the heaviest.
 
-What a path was before, given all of it, follows backwards from its states (`smoothed_paths`):
+The states of a path, given all of it, follow backwards from the last one (`smoothed_paths`):
 
     x_t = m_t + G_t (x_{t+1} - A m_t),          G_t = S_t A' P_{t+1}^-1,  P_{t+1} = A S_t A' + Q
     C_t = S_t + G_t (C_{t+1} - P_{t+1}) G_t'    [Rauch, Tung and Striebel 1965]
@@ -60,7 +60,7 @@ class Passage:
     noise: Array
 
     def __getitem__(self, index: Index) -> Passage:
-        """That of some paths."""
+        """The passage from some of the paths."""
         return replace(
             self,
             means=self.means[index],
@@ -224,7 +224,7 @@ class FilteredPaths:
         self._forget_dead_ends()
 
     def advance(self) -> None:
-        """Takes the oldest time out; what was before the new one are the states of the paths."""
+        """Takes the oldest time out; the states of the paths stand for all times before."""
         del self.steps[0], self._gaps[0]
         first = self.steps[0]
         self.steps[0] = replace(
@@ -240,7 +240,7 @@ class FilteredPaths:
 
     @property
     def motions(self) -> Index:
-        """Of each path the heaviest one that is one motion with it, (H,); itself: it leads one."""
+        """Leader (H,) of each path, the heaviest path of the same motion; may be itself."""
         log = self.steps[-1].log_weights
         past = self._past
         if past is None:
