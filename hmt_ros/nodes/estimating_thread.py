@@ -45,11 +45,11 @@ class Waiting(NamedTuple):
 
 
 class Duration(NamedTuple):
-    """What an estimate took.
+    """Times that an estimate took.
 
     Attributes:
         whole: from the bytes of its message to the last one that it led to, s.
-        publishing: of this what making these into bytes took, and publishing them, s.
+        publishing: part of it for making messages into bytes and publishing them, s.
     """
 
     whole: float
@@ -57,7 +57,7 @@ class Duration(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """What has come since the last time.
+    """Messages that have come since the last time.
 
     Attributes:
         waiting: in the order of arrival.
