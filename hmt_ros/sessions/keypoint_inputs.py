@@ -1,11 +1,11 @@
-"""Keypoints of the person who is tracked, from messages of any detector, and what they wait with.
+"""Keypoints of the person who is tracked, from messages of any detector.
 
-The parameter `source` says what the messages are: hmt_msgs/Keypoints2D of one person, or those of
+The parameter `source` gives the kind of messages: hmt_msgs/Keypoints2D of one person, or those of
 other detectors, of one person or of several:
 
 - Skeleton2D is in units of the image: it needs a camera_info before. Its topic belongs to one
   person already. Float32MultiArray without a stamp has that of the newest camera_info.
-- Of several people one is chosen: by `person_id`, or the largest at first, and then the one who is
+- One of several people is chosen: by `person_id`, or the largest at first, and then the one who is
   nearest to the last place.
 
 Keypoints without names say that nobody was seen. Positions in space join the keypoints of their
@@ -207,7 +207,7 @@ class KeypointReader:
         return known[np.flatnonzero(known.seen)] if known.names else None
 
     def forget(self) -> None:
-        """Whom the messages were about is chosen anew."""
+        """Forgets the chosen person; the next one is chosen anew."""
         self._chosen.forget()
 
     def _report(self, unknown: list[str], scheme: str) -> None:
