@@ -202,7 +202,7 @@ def until_nobody_reads(printing: Callable[[], int]) -> int:
             # Otherwise the interpreter finds the closed pipe at its end, and prints an error.
             sys.stdout.flush()
     except BrokenPipeError:
-        # What is still buffered is written at the end.
+        # Buffered text is still written at the end.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)

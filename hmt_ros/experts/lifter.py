@@ -56,7 +56,7 @@ LANDMARKS = (
     *(f'{side}_{name}' for name in _SIDED for side in ('left', 'right')),
     'neck_base', 'mid_hip', 'centre_of_head',
 )  # fmt: skip
-# What schemes of joint centres have in the place of a landmark on the skin.
+# Names in schemes of joint centres, in the place of landmarks on the skin.
 INSTEAD = {
     **{f'centre_of_{side}_{name}': f'{side}_{name}'
        for name in ('shoulder', 'hip') for side in ('left', 'right')},

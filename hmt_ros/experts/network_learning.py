@@ -37,7 +37,7 @@ RISING, MARK = 300, 500
 END = 0.005
 NEEDED = 'a network needs JAX and Optax to learn, which are missing: pip install jax optax'
 
-# Of parameters, inputs and targets: log gates (N, K), log densities (N, K), distances (N, K).
+# From parameters, inputs and targets: log gates, log densities and distances, all (N, K).
 Terms = Callable[[Any, Any, Any], tuple[Any, Any, Any]]
 
 
@@ -46,7 +46,7 @@ class Descent:
     """How a network learns.
 
     Attributes:
-        rate: Of Adam, at its highest.
+        rate: Learning rate of Adam, at its highest.
         distance_weight: Factor a.
         sharpness: Exponent b of the densities in q.
         told: Is called after each step, with its number and the loss.

@@ -31,8 +31,8 @@ Box = tuple[int, int, int, int]
 # Number of lines that images are made smaller to, about: by a whole factor.
 LINES = 240
 
-# What OpenCV's models call a pixel that differs from the background, and one that is darker in the
-# same colour.
+# Values of OpenCV's models for a pixel that differs from the background, and for one that is darker
+# in the same colour.
 FOREGROUND, SHADOW = 255, 127
 # Grey levels by which a pixel may differ from the colours of the background around it: compression
 # and aliasing move its edges.
@@ -331,7 +331,7 @@ class _Parts:
         rows, columns = np.nonzero(empty & self.unknown)
         values = image[rows, columns].astype(np.float32)
         mean, agreeing = self._mean[rows, columns], self._agreeing[rows, columns]
-        # Who disagrees begins anew: somebody was there, then or now.
+        # Pixels that disagree begin anew: somebody was there, then or now.
         agreeing[np.abs(values - mean).max(1, initial=0.0) > AGREEMENT] = 0
         agreeing += 1
         self._mean[rows, columns] = mean + (values - mean) / agreeing[:, None]

@@ -77,7 +77,7 @@ class Vertical:
 
 
 def seen_vertical(image: Image, camera: Camera) -> Vertical | None:
-    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines tell of none."""
+    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines show none."""
     lines = straight_lines(image, camera)
     return vertical_of(lines) if len(lines.normals) else None
 

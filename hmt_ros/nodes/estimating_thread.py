@@ -29,11 +29,11 @@ _REMEMBERED = 1000
 
 
 class Waiting(NamedTuple):
-    """Something that waits.
+    """A message or a request that waits.
 
     Attributes:
-        source: where it comes from.
-        content: what it is.
+        source: its origin.
+        content: the message, or the action.
         arrival: when it came, in seconds of a clock that does not jump.
         stamp_ns: of its header; 0 where it has none.
     """
@@ -178,7 +178,7 @@ class EstimatingThread:
         read: the message of a type in bytes.
 
     Attributes:
-        queue: what waits.
+        queue: messages and requests that wait.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class EstimatingThread:
         session.interrupted = self._is_interrupted
         self._inputs: dict[str, SubscribedTopic] = {}
         self._stamped: set[str] = set()
-        # Of several requests to start anew the last counts.
+        # The last of several requests to start anew counts.
         limits = {_RESTART: 1, session.COUNTED: session.most_waiting}
         self.queue = InputQueue(limits, counted=session.COUNTED)
         for one in inputs:

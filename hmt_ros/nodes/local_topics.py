@@ -46,7 +46,7 @@ class LocalTopics:
     """
 
     def __init__(self) -> None:
-        # What several nodes read and decode: the newest, with what they were made of.
+        # Messages and pictures that several nodes share: the newest, with their sources.
         self._read: deque[tuple[bytes, Any]] = deque(maxlen=SHARED)
         self._decoded: deque[tuple[Any, Image]] = deque(maxlen=SHARED)
         self._offered: set[str] = set()
@@ -143,5 +143,5 @@ class OwnMessages:
 
 
 def _key(data: bytes) -> bytes:
-    """The message without its head, and without what the middleware pads its end with."""
+    """The message without its head, and without the padding of the middleware at its end."""
     return bytes(data[4:]).rstrip(b'\0')

@@ -134,7 +134,7 @@ class SilentTopics:
 def why_silent(
     wanted: list[SubscribedTopic], names: list[str], published: list[Publication]
 ) -> str:
-    """Cause of silence on topics any of which is enough, and the remedy."""
+    """Cause of silence on topics, any one of which is enough, and the remedy."""
     topics = ' or '.join(
         f'{name} ({_short(one.msgtype)})' for one, name in zip(wanted, names, strict=True)
     )

@@ -264,7 +264,7 @@ def _mesh(body: Body) -> Mesh:
     if not body.shapes:
         raise ValueError(f'body {body.name} has no flesh: it can not be drawn')
     mesh = body.flesh.mesh(STACKS, SLICES)
-    # What faces the camera is told from the order of the corners: make it that of the normals.
+    # The order of the corners decides which triangles face the camera: make it fit the normals.
     a, b, c = mesh.vertices[mesh.triangles.T]
     inwards = np.einsum('fx,fx->f', np.cross(b - a, c - a), mesh.normals[mesh.triangles[:, 0]]) < 0
     triangles = np.where(inwards[:, None], mesh.triangles[:, ::-1], mesh.triangles)
@@ -280,7 +280,7 @@ def _renderer(body: Body, camera: Camera, scene: Scene, wearer: int = 0) -> _Ren
 
 @lru_cache(maxsize=8)
 def _field_of_view(camera: Camera) -> Array:
-    """Bounds [[low, high], [low, high]] of x / z and of y / z of what the image may show."""
+    """Bounds [[low, high], [low, high]] of x / z and of y / z of points in the image."""
     u, v = np.linspace(-0.5, camera.width - 0.5, 33), np.linspace(-0.5, camera.height - 0.5, 33)
     rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1))
     slopes = (rays[..., :2] / rays[..., 2:]).reshape(-1, 2)

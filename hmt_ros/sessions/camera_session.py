@@ -319,7 +319,7 @@ class CameraSession(Session[CameraParameters, State]):
                 self._leave_out_late_images()
             while self._waiting and not self._left and self._is_ready(self._waiting[0]):
                 self._estimate_next(self._camera)
-                # What has come meanwhile decides which image is next.
+                # Messages that have come meanwhile decide which image is next.
                 self._left = bool(self._waiting) and self.interrupted()
         self._drop_incomplete_images()
 

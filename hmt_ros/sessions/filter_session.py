@@ -147,10 +147,10 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointReader(self.parameters.source, self._log)
-        # Of an image that was left out since the last estimate.
+        # From an image that was left out since the last estimate.
         self._late_prediction: PosePrediction | None = None
         self.robot = RobotOutputs()
-        # What a watchdog says never follows the answer to a newer image.
+        # A message of the watchdog never follows the answer to a newer image.
         self._telling = threading.Lock()
         self.state = self._present_state()
 

@@ -43,7 +43,7 @@ from msg_tools.messages.keypoints import Positions, keypoints_of
 LONGEST_ABSENCE = 1.0
 # A person moves less between two images, in sizes of the person.
 _FARTHEST = 1.0
-# What remains from image to image of the size of a person of whom less is seen now.
+# Factor per image on the size of a person of whom less is seen now.
 _SIZE_KEPT = 0.95
 # Sets of unknown names that are warned of, each once; a detector has one.
 _MOST_WARNINGS = 20

@@ -3,7 +3,7 @@
 The rules, besides those of `TrackingSession`:
 
 - An image waits for its detections (`image_inputs`).
-- Somebody to whom the detector gives an identity keeps it. Others are told apart by where they were
+- Identities of the detector are kept. People without one are told apart by where they were
   last and how they moved (`hmt_ros.tracking.association`).
 - A detection that matches nobody who is followed starts a filter, the largest first, up to
   `max_people`. A person without a track, or no longer in view (`Tracker.status`), is dropped.

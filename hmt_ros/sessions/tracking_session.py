@@ -27,7 +27,7 @@ State = TypeVar('State', bound=SessionState)
 
 
 class TrackingSession(CameraSession[Parameters, State]):
-    """Tracks whoever is before one camera; see `Session` for arguments and attributes.
+    """Tracks the people before one camera; see `Session` for arguments and attributes.
 
     Attributes:
         start: of the tracks.

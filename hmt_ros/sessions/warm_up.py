@@ -87,7 +87,7 @@ def warm_up_tracking() -> None:
 
 
 def likelihoods(body: Body) -> list[Any]:
-    """hmt_msgs/PoseMixture of two modes that move, as the filter says what images show."""
+    """hmt_msgs/PoseMixture of two modes that move, as likelihoods of the filter."""
     messages, made = RosbagsMessages(), []
     for t in range(IMAGES):
         means = np.stack([body.prior_mean + 0.01 * t, body.prior_mean - 0.05])

@@ -333,7 +333,7 @@ def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = Tru
         factorise: whether covariances are checked to be positive definite.
 
     Raises:
-        ValueError: what is wrong, and at which place.
+        ValueError: a mixture that can not be smoothed, with its place.
     """
     if len(mixtures) == 0:
         raise ValueError('no mixtures to smooth; wanted one for each time')

@@ -91,7 +91,7 @@ class PathHypotheses:
         return len(self.modes)
 
     def __getitem__(self, index: Index) -> PathHypotheses:
-        """Some of them, in the order of the index; weights are what they were."""
+        """Some of them, in the order of the index; weights are not normalised again."""
         return replace(
             self,
             log_weights=self.log_weights[index],
@@ -254,7 +254,7 @@ class FilteredPaths:
         self._gaps.append(self._past)
 
     def _distances(self, poses: Array) -> Array | None:
-        """Distances (K, K) of poses (K, d), m; None: nothing tells how far they are apart."""
+        """Distances (K, K) of poses (K, d), m; None: there is no measure of distance."""
         return None if self.points is None else distances(self.points(poses))
 
     def _forget_dead_ends(self) -> None:
@@ -301,7 +301,7 @@ def traced(steps: Sequence[PathHypotheses]) -> Index:
 
 
 def first_state(mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> GaussianMixture:
-    """The density of the first state: its likelihood times what the dynamics know of it."""
+    """The density of the first state: its likelihood times the prior of the dynamics."""
     n, d = dynamics.state_dimension, dynamics.dimension
     precisions = np.zeros((len(mixture), n, n))
     precisions[:, :d, :d] = np.linalg.inv(mixture.covariances)

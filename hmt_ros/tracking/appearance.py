@@ -233,7 +233,7 @@ class Appearance:
         self._share, self._area = MOST, math.nan
         self._stamp = 0
         self._coloured: int | None = None
-        # Of the last image: foreground on the raster, and the piece of it that is a person.
+        # Foreground of the last image on the raster, and the piece of it that is a person.
         self._foreground: Mask | None = None
         self._piece: Piece | None = None
 

@@ -98,7 +98,7 @@ def shows_a_start(view: View, body: Body, *, masked: bool) -> bool:
     """Whether an image shows somebody that a first track can start from, if somebody is there.
 
     Args:
-        view: what the image shows.
+        view: of the image.
         body: model of the person.
         masked: whether the silhouette is a segmenter's.
     """
@@ -139,10 +139,10 @@ class Starts:
         """The start of the track at an image; None: it does not start there.
 
         Args:
-            view: what the image shows.
+            view: of the image.
             stamp: of the image, ns.
             body: that the poses of a mixture are of.
-            upright: what is known of gravity.
+            upright: gravity; None: unknown.
             prediction: by the image, if any.
             observed: makes the observation of the image.
             masked: whether the silhouette is a segmenter's.
@@ -167,14 +167,14 @@ def beginning_given(
     start: Subject | GaussianMixture, model: Body, body: Body, camera: Camera,
     upright: Gravity | None, depths: ImageMap | None = None,
 ) -> Beginning:  # fmt: skip
-    """The body and the poses that a track begins with, of a start that was given.
+    """The body and the poses that a track begins with, from a given start.
 
     Args:
-        start: what it starts from.
+        start: subject or mixture that it starts from.
         model: body that a subject's lengths replace those of.
         body: that the poses of a mixture are of.
         camera: that sees the person.
-        upright: what is known of gravity.
+        upright: gravity; None: unknown.
         depths: of the image that a subject's joints were seen in; None: unknown.
     """
     if isinstance(start, GaussianMixture):
@@ -192,13 +192,13 @@ def beginning_seen(
     box: Box | None,
     observed: Callable[[], Observation],
 ) -> Beginning | None:
-    """The body and the poses that a track begins with, of what an image shows.
+    """The body and the poses that a track begins with, from an image.
 
     Args:
-        view: what the image shows.
+        view: of the image.
         model: body whose lengths are fitted to keypoints.
         camera: that sees the person.
-        upright: what is known of gravity.
+        upright: gravity; None: unknown.
         prediction: by the image, if any.
         box: in which the person is, if one was given.
         observed: makes the observation of the image.

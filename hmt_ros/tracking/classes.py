@@ -7,14 +7,14 @@
 
 A camera hardly tells a pose from its reversal in depth (`body.mirror`), and a wrong one does not
 come right by small steps. S = logit p are the log odds that the person faces the other way than the
-heaviest mode, Q the rate of the symmetry `reversal` (`body.body`), e_k what an image says
-against mode k. Nobody turns about from one image to the next: a hypothesis that faces the other way
-is another history of the track, and weighs what all images so far say of that history, whether a
-mode was kept of it or not. Seen from the side the two histories meet (1): t is the transition of
-the joints (`weighting`), h that of the heading, which wanders at the rate of the body. The best
-motion of either way stands for it (2), as the number of its modes says nothing; one that was not
-followed is no evidence, as nothing held it. An image speaks of the way to face with the probability
-v, or of something else, as a flash does or a covered lens (3): no single one turns a track about.
+heaviest mode, Q the rate of the symmetry `reversal` (`body.body`), e_k the energy of an image at
+mode k. Nobody turns about from one image to the next: a hypothesis that faces the other way is
+another history of the track, weighed with the evidence of all images so far for that history,
+whether a mode was kept of it or not. Seen from the side the two histories meet (1): t is the
+transition of the joints (`weighting`), h that of the heading, which wanders at the rate of the
+body. The best motion of either way stands for it (2), as the number of its modes is no evidence,
+nor is a motion that was not followed. An image shows the facing direction with the probability v,
+or something else, as a flash does or a covered lens (3): none turns a track about alone.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import faces_back, left_directions, root_rotation_dofs
 from hmt_ros.inference.arrays import Array, Mask
 
-# Probability v that what an image says of the way to face is about the person.
+# Probability v that the evidence of an image for a facing direction is about the person.
 VALID = 0.9
 # Largest log odds that are counted, nats: those against a way that a start does not contain.
 MOST = 10.0

@@ -244,7 +244,7 @@ def _sized(body: Body, subject: Subject) -> Body:
     known = subject.segment_lengths
     names = body.skeleton.length_names
     if known:
-        # What was not measured scales with what was.
+        # Lengths without a measurement scale with the measured ones.
         factor = sum(known.values()) / sum(body.segment_lengths[x] for x in known)
         scaled = {x: body.segment_lengths[x] * factor for x in names if x not in known}
         body = body.with_segment_lengths({**scaled, **known})

@@ -8,7 +8,7 @@ the body model and the uncertainty of its place,
 s the deviation of its ends in the second direction in which they are known least; along the first,
 which is depth, it is repeated, side by side, over q times the deviation there. Modes are taken,
 heaviest first, until they weigh `probability` together. Capsules that others hold are left out.
-Whoever is lost may have moved since: all capsules are wider by `reach_after` the time since then.
+A lost person may have moved since: all capsules are wider by `reach_after` the time since then.
 
 The guarantee is the coverage that `benchmarks/keep_out.py` measures on clips, and no more: people
 whom the tracker has lost without knowing, and long things that people hold, are outside.

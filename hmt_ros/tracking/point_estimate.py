@@ -7,11 +7,11 @@
 The modes of an image that face alike go on as one motion: a Gaussian over pose and velocity, moved
 by the dynamics of the tracker (2) and conditioned on the mean of the image's modes (3). R_k are the
 covariances of the modes, which believe only a share of an image, because errors last: how far the
-pose follows an image depends on what the image fixes, and on the time since the last one. What the
-modes disagree in is not in R: their weights know all images, not this one alone.
+pose follows an image depends on the information in the image, and on the time since the last one.
+Differences between the modes are not in R: their weights know all images, not this one alone.
 
 A mean over poses that face opposite ways is no pose. The motion keeps its way as long as the weight
-of the other one is within what a single image may say by mistake, and then turns at once.
+of the other one is within the error of a single image, and then turns at once.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ Exchange of left and right by the detector, in each mode from image to image:
 
 Q are the rates at which detectors begin and cease to exchange sides (`image.keypoint_schemes`). A
 person who is turned about and whose sides are exchanged looks the same to the keypoints as one who
-is not: what tells the two apart is that people turn slowly and detectors change their mind at once.
+is not: the two differ in that people turn slowly and detectors change their mind at once.
 """
 
 from __future__ import annotations

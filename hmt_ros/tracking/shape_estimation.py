@@ -6,9 +6,9 @@
     P = (P_0^-1 + A / (1 + c n))^-1,    theta = P b / (1 + c n)
 
 theta is the shape (see `body.shape`), x_k the pose of mode k, h and H are gradient and Gauss-Newton
-Hessian of the energy of one image over both. A pose gives way to a wrong shape: what is left of the
-information when it does is the Schur complement S. Of every image only the share tau is believed,
-as its errors are those of its neighbours, and of all images together no more than 1 / c of one
+Hessian of the energy of one image over both. A pose gives way to a wrong shape: the information
+left when it does is the Schur complement S. Every image counts with the share tau, as its errors
+are those of its neighbours, and all images together with no more than 1 / c of one
 (`inference.error_model`): clothes, and all else that the model lacks, are the same in all of them,
 and would in the end outweigh the prior over people. Uncertainty of the shape makes the pose
 uncertain: J P J' is added to the covariances of modes (a consider covariance, [Schmidt 1966]).

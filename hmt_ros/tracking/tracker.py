@@ -179,10 +179,10 @@ class Tracker:
             mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
                 all false: it sees nobody; None: unknown.
             nobody_predicted: whether that regression saw nobody in this image.
-            others: (H, W) pixels that somebody else covers or may cover: they speak neither for a
-                pose nor against it; None: there are none.
-            depth: (H, W) depth of what each pixel shows, along the axis of the camera, m; 0, NaN
-                and what is out of range says nothing. None: unknown.
+            others: (H, W) pixels that somebody else covers or may cover: no evidence for a
+                pose or against it; None: there are none.
+            depth: (H, W) depth at each pixel, along the axis of the camera, m; 0, NaN and values
+                out of range are no evidence. None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t), undiscounted (see

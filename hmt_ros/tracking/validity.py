@@ -23,7 +23,7 @@ stands for the states without the silhouette:
 A pose that was moved to fit a cue is no evidence for that cue. t is how well the pose went on from
 the image before (`weighting`) when the two parted.
 
-Depths, whose misfit is that of a pose moved to where they place it, say nothing of the track: they
+Depths, whose misfit is that of a pose moved to where they place it, do not test the track: they
 have a chain of their own, which takes in log(P(v_0) exp(e_g) + 1 - P(v_0)).
 
 In an image each cue counts with the energy p_g E_g, to which the energy above is equal in first
@@ -51,12 +51,12 @@ FAILS, RECOVERS = 0.05, 1.0
 USUAL = RECOVERS / (FAILS + RECOVERS)
 # The same of a detector as a whole, which sees somebody else, 1/s.
 DETECTOR_FAILS = 0.02
-# What a cue says that is wholly explained or not at all, N u and N (1 - u), nats in all, and how
-# many of its measurements say so much: neighbours err together.
+# Evidence of a cue that is wholly explained or not at all, N u and N (1 - u), nats in all, and the
+# number of its measurements that give it: neighbours err together.
 NATS, ENOUGH = 16.0, 4
 # How long misfits last, s.
 TAU = 0.1
-# What one image can say of a cue at most, nats: it may be of something that nobody has thought of.
+# Maximum evidence of one image about a cue, nats: it may be wrong in unforeseen ways.
 MOST = 3.5
 
 DEPTH = 'depth'

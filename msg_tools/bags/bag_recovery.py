@@ -159,7 +159,7 @@ def _line(file: McapSalvage, loss: Loss) -> str:
     return text
 
 
-# What lies where
+# Files of a damaged bag
 
 
 def _files(source: Path) -> tuple[list[Path], list[str]]:

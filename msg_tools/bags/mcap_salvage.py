@@ -35,7 +35,7 @@ from msg_tools.bags.mcap_records import (
     records_in,
 )
 
-# What stands before the summary.
+# Records before the summary.
 _DATA_RECORDS = (
     Opcode.HEADER,
     Opcode.SCHEMA,
@@ -49,7 +49,7 @@ _DATA_RECORDS = (
 _DATA_END_BYTES = 4
 # As many bytes of the mark at the start may be wrong.
 _WRONG_BYTES = 2
-# What stands behind the fixed fields of a compressed chunk.
+# Bytes behind the fixed fields of a compressed chunk.
 _COMPRESSIONS = (b'\x04\x00\x00\x00zstd', b'\x03\x00\x00\x00lz4')
 _SEARCHED_BYTES = 2**20
 
@@ -140,7 +140,7 @@ class McapSalvage:
         """All that is whole; channels come before their messages.
 
         Raises:
-            BagError: the disk does not give what it has.
+            BagError: the disk can not be read.
         """
         try:
             with self._path.open('rb') as file:

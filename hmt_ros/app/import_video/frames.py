@@ -362,7 +362,7 @@ class Masks:
 def mask_in(image: Image) -> Mask:
     """(H, W) where a picture (H, W, 3) shows the person.
 
-    That is where its brightest channel is above 127, or above 0 in a picture of zeros and ones.
+    The brightest channel is above 127 there, or above 0 in a picture of zeros and ones.
     """
     brightest = image.max(2)
     result: Mask = brightest > (_HALF if brightest.max() > 1 else 0)

@@ -194,7 +194,7 @@ class LiveTrack(PlayedTrack):
                 names = [name for name, own in every if own is not None]
                 process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', names)
             live = partial(LiveNode, player, opened, within=process, write=self._write)
-            # Of the namespace that both share: whatever comes must not be lost.
+            # Topics of the namespace that both share: none of their messages must be lost.
             sensors = (f'/{topic}', '/camera_info', *(f'/{source}' for source in given))
             if self._parameters.bme is not None:
                 self._bme = live(
