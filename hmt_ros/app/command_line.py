@@ -1,4 +1,4 @@
-"""What all commands share: reading of arguments, error lines and exit codes."""
+"""Common parts of all commands: reading of arguments, error lines and exit codes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CommandParser(argparse.ArgumentParser):
         """Adds --output, --overwrite and --quiet of a command that writes a folder.
 
         Args:
-            what: what it is, 'bag' for example.
+            what: kind of the folder, 'bag' for example.
         """
         self.add_argument('-o', '--output', type=Path, required=True, metavar=metavar, help=text)
         self.add_argument('--overwrite', action='store_true', help=f'replace an existing {what}')
@@ -74,7 +74,7 @@ class CommandParser(argparse.ArgumentParser):
         """Adds the bag, --truth, --topic and --body of a command that reads mixtures.
 
         Args:
-            verb: what it does with them, 'evaluate' for example.
+            verb: of the command, 'evaluate' for example.
         """
         self.add_argument(
             'bag', type=Path, metavar='OUT', help='bag with mixtures: a folder or a file'
@@ -110,7 +110,7 @@ def add_seed(parser: argparse._ActionsContainer) -> None:
 
 
 def add_sources(parser: argparse._ActionsContainer, said: str = '--acknowledgement') -> None:
-    """Adds --without, and what a file says of its motions, of a command that learns from them."""
+    """Adds --without, and the note on the motions, of a command that learns from motions."""
     parser.add_argument(
         '--without', nargs='+', default=[], metavar='NAME',
         help='motions to leave out, names of files without suffix; * stands for any letters',
@@ -122,7 +122,7 @@ def add_sources(parser: argparse._ActionsContainer, said: str = '--acknowledgeme
 
 
 def add_people(parser: argparse._ActionsContainer) -> None:
-    """Adds --test, --alike and --alike-share of a command that learns what people do."""
+    """Adds --test, --alike and --alike-share of a command that learns from people."""
     parser.add_argument(
         '--test', type=Path, metavar='DIR', help='motions of other people to score on'
     )
@@ -202,7 +202,7 @@ def until_nobody_reads(printing: Callable[[], int]) -> int:
             # Otherwise the interpreter finds the closed pipe at its end, and prints an error.
             sys.stdout.flush()
     except BrokenPipeError:
-        # What is still buffered is written at the end.
+        # Buffered text is still written at the end.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)

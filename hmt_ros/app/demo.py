@@ -1,4 +1,4 @@
-"""The demonstration of `make demo`: tracks the person in a bag, says how well, writes a report.
+"""The demonstration of `make demo`: tracks the person in a bag, prints the errors, writes a report.
 
 `python -m hmt_ros.app.demo bags/reach -o build/demo --live`
 
@@ -75,12 +75,12 @@ class _Poses:
 
     @staticmethod
     def of(layer: Layer) -> _Poses:
-        """Those of the mixtures on a topic."""
+        """The poses of the mixtures on a topic."""
         return _Poses(layer.joint_names, {t: x.joints for t, x in layer.mixtures.items()})
 
     @staticmethod
     def detected(bag: Path, topic: str) -> _Poses:
-        """Those that a detector lifted to 3D itself."""
+        """The poses that a detector lifted to 3D itself."""
         names: tuple[str, ...] = ()
         joints = {}
         with BagReader(bag) as reader:

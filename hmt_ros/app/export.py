@@ -86,11 +86,11 @@ class TrackedMotion:
     Attributes:
         topic: of the mixtures.
         steps: (T,) in the order of their stamps.
-        of: the last of the mixtures, for what all have in common.
+        of: the last of the mixtures, for the fields that all have in common.
         body: at the lengths of the last; None: not known.
         room: (3, 3) rotation from the frame of the mixtures to axes with y up.
         height: of the camera in the room, m: above the floor, or 0 where that is not known.
-        notes: what a user should know of it, line by line.
+        notes: for the user, line by line.
     """
 
     topic: str
@@ -397,7 +397,7 @@ def _track(
 
 
 def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
-    """Axes with y up: rotation, height of the camera in them, and what they are."""
+    """Axes with y up: rotation, height of the camera in them, and a description."""
     grounds = read_grounds(path, topic, frame_id).values()
     if not grounds:
         told = f'in the axes of {frame_id}, turned to y up: its gravity is not known'
@@ -419,7 +419,7 @@ def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
 
 
 def _notes(steps: Sequence[TrackedPose], end: int) -> list[str]:
-    """What a user should know of a motion whose topic goes on until `end`, ns."""
+    """Notes for a user on a motion whose topic goes on until `end`, ns."""
     notes = []
     others = np.array([a.identity != b.identity for a, b in pairwise(steps)], dtype=bool)
     if others.any():

@@ -11,12 +11,12 @@ intervals tau in a row have, at damping g, with velocities of the variance s and
     var = 2 s / g^2 (g tau - e) + W tau,    cov = s / g^2 e^2,    e = 1 - exp(-g tau)
 
 g, s and W maximise the Gaussian likelihood of all pairs over intervals of 1/30 to 1/5 s (composite
-likelihood [Varin, Reid and Firth 2011]); its sufficient statistics are the two moments. What the
-first displacement does not predict of the second is correlated over the degrees of freedom: the
-couplings. A mirrored copy of every motion takes part, so that left and right move alike.
+likelihood [Varin, Reid and Firth 2011]); its sufficient statistics are the two moments. The
+residuals of the second displacement, given the first, are correlated over the degrees of freedom:
+the couplings. A mirrored copy of every motion takes part, so that left and right move alike.
 
-Where the camera stands is not learned: translations of the root are isotropic and not coupled, and
-of the heading only changes count.
+The place of the camera is not learned: translations of the root are isotropic and not coupled, and
+only changes of the heading count.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def read_motions(
     *,
     quiet: bool = False,
 ) -> list[Item]:
-    """What is read from motions for a body; a line on stderr for each that can not be used.
+    """Content of motions, for a body; a line on stderr for each that can not be used.
 
     Args:
         read: reads one; errors of input and of arithmetic say that it can not be used.
@@ -155,7 +155,7 @@ def read_motions(
 
 
 def _read_one(path: Path, read: Callable[[Path, Body], Item], body: str) -> tuple[Item | None, str]:
-    """What is read from a motion; or why it can not be used."""
+    """Content of a motion; or the reason why it can not be used."""
     try:
         return read(path, load_body(body)), ''
     except (ValueError, OSError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -168,7 +168,7 @@ def shares_of(sequences: list[PoseSequence], alike: str, share: float) -> list[f
 
 
 def data_card(sequences: list[PoseSequence], acknowledgement: str) -> str:
-    """What the file says of its motions."""
+    """Note on the motions that a file was learned from."""
     seconds = sum(len(one.poses) for one in sequences) / RATE
     names = ', '.join(sorted(one.name for one in sequences))
     said = f'{acknowledgement.strip()}\n' if acknowledgement.strip() else ''
@@ -297,7 +297,7 @@ def _fitted(moments: Array) -> tuple[float, float, float]:
 def _couplings(
     pairs: Array, damping: Array, variance: Array, white: Array, interval: float
 ) -> Array:
-    """Correlations (d, d) of what first displacements do not predict of second ones."""
+    """Correlations (d, d) of the residuals of second displacements, given the first."""
     var, cov = modelled_moments(interval, damping, variance, white)
     surprise = pairs[:, 1] - cov / var * pairs[:, 0]
     both = surprise.T @ surprise / len(surprise)

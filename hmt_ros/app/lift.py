@@ -117,7 +117,7 @@ def _parser() -> CommandParser:
 
 
 class _NoFrames(FrameSource):
-    """What numbers frames that are not there."""
+    """A source without frames, which numbers the frames of keypoints."""
 
     def frames(self, selection: Selection) -> Iterator[Frame]:
         """None."""
@@ -191,7 +191,7 @@ def _chosen(found: FoundPersons, choice: Choice, fps: float) -> tuple[list[int],
 
 
 def _body(camera: Camera, arguments: argparse.Namespace) -> Body:
-    """The body with what is known of the person's lengths."""
+    """The body with the lengths of the person, as far as they are known."""
     body = load_body('human37')
     if arguments.subject is not None:
         subject = read_subject(arguments.subject, body)

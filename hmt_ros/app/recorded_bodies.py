@@ -82,7 +82,7 @@ class RecordedBodies:
 
 
 def read_grounds(path: Path, topic: str, frame_id: str) -> dict[int, GroundState]:
-    """What a bag tells of the ground, by stamp in ns; nothing if it has no such topic.
+    """The ground in a bag, by stamp in ns; empty if it has no such topic.
 
     Args:
         topic: topic of the mixtures that are shown: the ground is on the topic of the same

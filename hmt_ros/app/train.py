@@ -218,7 +218,7 @@ def _sequences(options: argparse.Namespace, body: Body) -> tuple[list[PoseSequen
 
 
 def _named(sequences: list[PoseSequence], shares: list[float]) -> str:
-    """What tells some motions, and what is taken of them, from others."""
+    """A name that identifies motions and their shares."""
     state = hashlib.sha256()
     for one, share in zip(sequences, shares, strict=True):
         state.update(f'{one.name} {share}'.encode() + one.poses.tobytes())

@@ -3,7 +3,7 @@
     p(a) = w_0 N(a; m_0, S_0) + sum_k w_k/2 [N(a; m_k, S_k) + N(Ra; m_k, S_k)]
 
 a are the angles of a pose, R their mirror image, left for right. Component 0 is broad: it bounds
-what a pose costs that resembles nothing learned.
+the energy of a pose that resembles nothing learned.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class AngleMixture:
         dofs: names of the n degrees of freedom that it covers.
         components: broad component first, then K components; the weight of each of these is that
             of the component and its mirror image together.
-        card: what it was learned from and how, its licence, text by heading.
+        card: data, method and licence, text by heading.
 
     Raises:
         ValueError: names that the body does not have or that lack their mirror image, or
@@ -129,7 +129,7 @@ class AngleMixture:
         return self.whole.log_density(poses[:, self.indices])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What a file holds; numbers in single precision."""
+        """The arrays of a file; numbers in single precision."""
         own, n = self.components, len(self.dofs)
         lower = np.tril_indices(n)
         return {

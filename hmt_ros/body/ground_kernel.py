@@ -17,7 +17,7 @@ from hmt_ros.inference.arrays import Array
 
 
 class Constants(NamedTuple):
-    """What does not depend on the pose.
+    """Inputs that do not depend on the pose.
 
     Attributes:
         dof_is_rotation: (d,).

@@ -6,7 +6,7 @@ like one who walks away. The joint angles of that pose are those of the mirrored
 lie within the limits, too.
 
 Angles without limits are the same after a whole turn. A person who turns about passes the angle at
-which it is cut, and of two estimates of one heading one may be a turn ahead. Whoever compares poses
+which it is cut, and of two estimates of one heading one may be a turn ahead. A comparison of poses
 by their variables has to take turns out first.
 """
 
@@ -129,7 +129,7 @@ def _units(vectors: Array) -> Array:
 
 
 def faces_back(body: Body, poses: Array, reference: Array) -> Mask:
-    """Which of poses (N, d) face another way than a reference pose (d,).
+    """Whether poses (N, d) face another way than a reference pose (d,).
 
     They face away from it, or one faces the camera where the other turns its back: a turn, seen
     from the side, may go either way on.

@@ -31,7 +31,7 @@ _ENTRIES = ('format', 'version', 'body', 'dof_names', 'damping', 'diffusion', 'w
 
 @dataclass(frozen=True, eq=False)
 class LearnedMotion:
-    """What was learned of how the poses of a body move; see `DampedVelocity`.
+    """A motion prior of the poses of a body that was learned; see `DampedVelocity`.
 
     Attributes:
         body: name of the body.
@@ -39,7 +39,7 @@ class LearnedMotion:
         damping: (d,) share of the velocity lost per second.
         diffusion: (d, d) covariance that the velocity gains per second, (m/s)^2 and (rad/s)^2.
         white: (d,) variance that the pose gains per second besides, m^2 and rad^2.
-        card: from what it was learned, and how; plain text.
+        card: data and method of the learning; plain text.
 
     Raises:
         ValueError: values that make no motion prior.
@@ -88,7 +88,7 @@ def motion_prior(body: Body) -> LinearGaussianDynamics:
 
 @cache
 def shipped_motion(name: str) -> LearnedMotion | None:
-    """What ships for the body of a name; None: nothing was learned for it.
+    """The motion prior that ships for the body of a name; None: there is none.
 
     Raises:
         ValueError: the file that ships is damaged.

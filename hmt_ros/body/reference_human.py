@@ -127,9 +127,9 @@ def fit_reference_human(
     """The reference model in the pose that joint positions show.
 
     Of the two sets of angles that a limb may have for one direction, the one that is within the
-    ranges of the reference and near the last one is chosen. What positions do not tell keeps its
-    last value: the roll of a limb that is straight, the yaw of one that hangs straight down. They
-    never tell that the head turns: `y_head` is 0.
+    ranges of the reference and near the last one is chosen. Angles that positions do not show keep
+    their last values: the roll of a limb that is straight, the yaw of one that hangs straight down.
+    Positions never show that the head turns: `y_head` is 0.
 
     Args:
         names: (J) of the joints.
@@ -274,7 +274,7 @@ def _fit_leg(
 def _best_angles(
     found: Sequence[tuple[float, ...]], names: Sequence[str], before: Mapping[str, float]
 ) -> tuple[float, ...]:
-    """Of several sets of angles for one direction the one that fits ranges and last values best."""
+    """The best of several sets of angles for one direction, by ranges and last values."""
 
     def cost(each: tuple[float, ...]) -> float:
         terms = zip(each, (RANGES[name] for name in names), names, strict=True)

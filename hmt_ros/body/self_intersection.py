@@ -40,7 +40,7 @@ class _Axes(NamedTuple):
 
 
 class Overlaps(NamedTuple):
-    """Parts, the pairs (Q,) of them that may overlap, and what moves them.
+    """Parts, the pairs (Q,) of them that may overlap, and the variables that move them.
 
     Attributes:
         parts: of the body.
@@ -80,7 +80,7 @@ def self_intersection_energy(
 
 @lru_cache(maxsize=16)
 def overlaps_of(body: Body, sigma: float) -> Overlaps:
-    """What compiled code reads of the parts of a body; sigma as for `self_intersection_energy`."""
+    """The parts of a body as compiled code reads them; sigma: overlap with energy 1/2, m."""
     first, second = _pairs(body)
     skeleton = body.skeleton
     return Overlaps(

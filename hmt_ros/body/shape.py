@@ -1,4 +1,4 @@
-"""The shape of a person as a vector: the lengths, and how the parts of the flesh differ.
+"""The shape of a person as a vector: the lengths, and the growth of the parts of the flesh.
 
     theta = (lengths - lengths of the body, growth of each group of parts)
 
@@ -27,7 +27,7 @@ from hmt_ros.inference.arrays import Array, Mask
 
 
 class ShapeSpace:
-    """What can change in the shape of a body.
+    """The variables of the shape of a body.
 
     Args:
         body: at which derivatives are taken; the vector 0 leaves it as it is.
@@ -148,7 +148,7 @@ class ShapeSpace:
 
 
 class _ShapeTable(NamedTuple):
-    """What compiled code reads of the shape.
+    """The shape as compiled code reads it.
 
     Attributes:
         part_of: (S,) part on each segment; -1: there is none.

@@ -167,7 +167,7 @@ class _Square:
 
     @classmethod
     def about(cls, circle: Array) -> _Square:
-        """That about a circle, with the circle's point above the centre."""
+        """The square about a circle, with the circle's point above the centre."""
         centre, (along, down) = circle[0], circle[1] - circle[0]
         side = 2 * _MARGIN * math.hypot(along, down)
         return cls((centre[0], centre[1]), side, math.atan2(along, -down))
@@ -185,14 +185,14 @@ class _Square:
         return result
 
     def seen(self, image: Image, size: int, border: int) -> Image:
-        """What it shows, (size, size, 3) RGB."""
+        """The image in the square, (size, size, 3) RGB."""
         matrix = np.column_stack([self.axes.T * (self.side / size), self.corner])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         result = cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=border)
         return np.asarray(result[..., ::-1], np.uint8)
 
     def spread(self, values: _Tensor, size: tuple[int, int]) -> _Tensor:
-        """An image of `size`, (H, W), with what the square has, (n, n), in its place."""
+        """An image of `size`, (H, W), with the values (n, n) of the square in its place."""
         to_square = self.axes * (len(values) / self.side)
         matrix = np.column_stack([to_square, -to_square @ self.corner])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -201,10 +201,10 @@ class _Square:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What the second network finds in one image.
+    """The output of the second network for one image.
 
     Attributes:
-        square: what it saw.
+        square: its input.
         points: (35, 2) landmarks, then centre and point of the circle, px.
         visibilities: (33,) of the landmarks.
         positions: (33, 3) of the landmarks, m.
@@ -219,7 +219,7 @@ class _Found:
 
 
 class _Followed:
-    """What is smoothed of a person from image to image.
+    """The smoothed values of a person, from image to image.
 
     Attributes:
         circle: (2, 2) centre and point where the person is sought in the next image, px.

@@ -25,7 +25,7 @@ _GAP = 1.5
 
 @dataclass(frozen=True, eq=False)
 class TrueGround:
-    """What is truly so of the floor at one time.
+    """The true floor, feet and camera at one time.
 
     Attributes:
         up: (3,) unit vector against gravity, camera frame.

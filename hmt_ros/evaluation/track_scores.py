@@ -43,7 +43,7 @@ class Truth:
         joint_names: (J,).
         joints: stamp in ns -> (J, 3) m, camera optical frame.
         frame_id: frame of the positions; '' if unknown.
-        ground: what is true of the floor, by stamp; empty: unknown.
+        ground: the true floor by stamp; empty: unknown.
 
     Raises:
         ValueError: no frames, or positions that do not fit the names or are not finite.
@@ -73,7 +73,7 @@ class Truth:
         return f'{min(self.joints)} to {max(self.joints)} ns'
 
     def evaluated_joints(self) -> tuple[str, ...]:
-        """Those of `EVALUATED_JOINTS` that the truth knows.
+        """The joints among `EVALUATED_JOINTS` that the truth has.
 
         Raises:
             ValueError: fewer than four.
@@ -89,7 +89,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A mixture over poses at one time, or what is known of it.
+    """A mixture over poses at one time, or the known part of it.
 
     Attributes:
         stamp_ns: time of the poses.

@@ -3,8 +3,8 @@
 Recorded motions become tracks of landmarks: of the person who was recorded, mirrored, of other
 proportions, with the trunk and arms of another motion, with angles that wander. A window is drawn
 from a track: its camera (heading, height, pitch, roll, distance, maybe moving), the rate of its
-images, the speed of the motion, the scheme of the detector, its errors, what is known of gravity
-and of the person's lengths. What detectors do stands in `image/keypoint_schemes.yaml`.
+images, the speed of the motion, the scheme of the detector, its errors, the knowledge of gravity
+and of the person's lengths. Errors of detectors are in `image/keypoint_schemes.yaml`.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ SHORTEST = 10  # frames of a motion
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """What windows are drawn from.
+    """The distribution that windows are drawn from.
 
     Attributes:
         elevation, elevation_spread: angle by which the camera looks down, degrees.

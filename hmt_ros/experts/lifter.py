@@ -56,7 +56,7 @@ LANDMARKS = (
     *(f'{side}_{name}' for name in _SIDED for side in ('left', 'right')),
     'neck_base', 'mid_hip', 'centre_of_head',
 )  # fmt: skip
-# What schemes of joint centres have in the place of a landmark on the skin.
+# Names in schemes of joint centres, in the place of landmarks on the skin.
 INSTEAD = {
     **{f'centre_of_{side}_{name}': f'{side}_{name}'
        for name in ('shoulder', 'hip') for side in ('left', 'right')},
@@ -223,13 +223,13 @@ ANYWHERE = 0.15
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Network(Layers):
-    """What gates, means and deviations share.
+    """The network of gates, means and deviations, with shared layers.
 
     The numbers after the layers are those of K + 6 J K: gates, means and log deviations.
 
     Attributes:
         mean, scale: (p,) of the inputs.
-        middle: (J, 3) what means are relative to, m.
+        middle: (J, 3) origin of the means, m.
     """
 
     mean: Floats
@@ -276,7 +276,7 @@ class Lifter:
         self.notes = dict(notes or {})
 
     def proportions(self, body: Body) -> Array | None:
-        """What a window takes in of a person's lengths; None: the body lacks some of them."""
+        """Proportions of a person, as inputs of a window; None: the body lacks some lengths."""
         lengths = body.segment_lengths
         known = lengths.keys() >= {*PROPORTIONED}
         return proportions(self.usual, lengths) if known else None
@@ -392,7 +392,7 @@ class KeypointHistory:
         return rays, confidences
 
     def carry(self, rotation: Array) -> None:
-        """Takes what is known into the frame (rotation (3, 3)) of a camera that has turned."""
+        """Takes the history into the frame (rotation (3, 3)) of a camera that has turned."""
         for i, rays in enumerate(self._rays):
             turned = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) @ rotation.T
             self._rays[i] = turned[:, :2] / np.maximum(turned[:, 2:], BEFORE)
@@ -427,7 +427,7 @@ def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> t
 
 
 def lifted_positions(camera: Camera, keypoints: Keypoints) -> LiftedPoses | None:
-    """The one pose that a detector which lifts guesses; None: it shows no hips."""
+    """The pose that a detector which lifts estimates; None: it shows no hips."""
     assert keypoints.positions is not None
     seen = keypoints.seen
     if not seen.any():

@@ -2,13 +2,13 @@
 
     loss = -log sum_i g_i p_i / n + a sum_i q_i d_i,     q_i ~ g_i p_i^b
 
-The first part is the mixture density [Bishop 1994], of n numbers. Alone it polishes what is sure
-already; the second part, over the experts that answer for a target, makes the means good where
+The first part is the mixture density [Bishop 1994], of n numbers. Alone it improves means of small
+deviation; the second part, over the experts responsible for a target, improves the means where
 deviations are large: d_i is the distance of a mean from the target. q does not pass gradients. The
 rate of Adam falls as a cosine.
 
-JAX and Optax do the work; who only predicts needs neither. The same seed, steps and machine give
-the same bytes.
+JAX and Optax do the work; prediction needs neither. The same seed, steps and machine give the same
+bytes.
 
 `Layers` have units that leak; each layer is added to the last.
 """
@@ -37,7 +37,7 @@ RISING, MARK = 300, 500
 END = 0.005
 NEEDED = 'a network needs JAX and Optax to learn, which are missing: pip install jax optax'
 
-# Of parameters, inputs and targets: log gates (N, K), log densities (N, K), distances (N, K).
+# From parameters, inputs and targets: log gates, log densities and distances, all (N, K).
 Terms = Callable[[Any, Any, Any], tuple[Any, Any, Any]]
 
 
@@ -46,7 +46,7 @@ class Descent:
     """How a network learns.
 
     Attributes:
-        rate: Of Adam, at its highest.
+        rate: Learning rate of Adam, at its highest.
         distance_weight: Factor a.
         sharpness: Exponent b of the densities in q.
         told: Is called after each step, with its number and the loss.
@@ -148,7 +148,7 @@ def first_layers(inputs: int, units: int, layers: int, outputs: int, seed: int) 
 
 
 def layer_outputs(p: Any, x: Any) -> Any:
-    """What layers say (N, O) of whitened inputs (N, p), as JAX computes it; `Layers.outputs`."""
+    """Outputs (N, O) of layers at whitened inputs (N, p), in JAX; see `Layers.outputs`."""
     from jax.nn import leaky_relu
 
     h = leaky_relu(x @ p['first'] + p['first_bias'], LEAK)
@@ -158,7 +158,7 @@ def layer_outputs(p: Any, x: Any) -> Any:
 
 
 def _ahead(drawn: Callable[[int], Any], steps: range) -> Iterator[tuple[int, Any]]:
-    """Steps with what was drawn for them, drawn beside the step before."""
+    """Steps with their random draws, made beside the step before."""
     with ThreadPoolExecutor(1) as beside:
         waiting = beside.submit(drawn, steps[0]) if steps else None
         for step in steps:
@@ -229,7 +229,7 @@ class Layers:
         return result
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays for a file: in half precision, but what is one row."""
+        """The arrays for a file: in half precision, except single rows."""
         return {
             name: np.asarray(value, dtype=np.float16 if value.ndim > 1 else np.float32)
             for name, value in vars(self).items()
@@ -247,7 +247,7 @@ class Layers:
 
 
 def _leaky(x: Floats) -> Floats:
-    """What units say."""
+    """Outputs of leaky units."""
     result: Floats = np.maximum(x, np.float32(LEAK) * x)
     return result
 

@@ -78,7 +78,7 @@ class CovariancePrior:
     scatter: Array
 
     def log_density(self, covariances: Array) -> float:
-        """Of covariances (K, n, n), up to a constant."""
+        """Log density of covariances (K, n, n), up to a constant."""
         trace = np.trace(np.linalg.solve(covariances, self.scatter), axis1=1, axis2=2)
         return float(-0.5 * self.samples * (np.linalg.slogdet(covariances)[1] + trace).sum())
 
@@ -206,13 +206,13 @@ class PriorSettings:
 
 @dataclass(frozen=True, eq=False)
 class LearnedPrior:
-    """A prior and how good it is.
+    """A prior and its scores.
 
     Attributes:
         mixture: the prior.
         held_out: number of components -> log likelihood of people left out, nats per pose.
         plain: that of the Gaussians of the body's model file.
-        poses, motions, people: what it was learned from.
+        poses, motions, people: numbers of those that it was learned from.
     """
 
     mixture: AngleMixture
@@ -273,7 +273,7 @@ class PriorData:
 def prior_data(
     body: Body, sequences: Sequence[PoseSequence], people: Sequence[str], settings: PriorSettings
 ) -> PriorData:
-    """What is kept of motions."""
+    """The poses of motions, without those that are nearly equal, up to a number of each."""
     kept = []
     for sequence in sequences:
         frames = novel_frames(body, sequence.poses, settings.novelty)
@@ -287,7 +287,7 @@ def prior_data(
 def recorded_dofs(body: Body, sequences: Sequence[PoseSequence], people: Sequence[str]) -> Index:
     """The angles (n,) that motions show: those that move with more than half of the people.
 
-    Not those of the root: where a person faces and how far the camera leans is no posture.
+    Angles of the root are left out: heading of the person and lean of the camera are no posture.
     """
     moves = {
         person: np.median(
@@ -315,7 +315,7 @@ def learned_prior(
 
     Args:
         dofs: (n,) angles that it covers.
-        card: what the data are, text by heading.
+        card: description of the data, text by heading.
         progress: iterates over the numbers of components, given how many.
 
     Raises:

@@ -1,9 +1,9 @@
 """Configurations of all limbs on the trunks of a group of modes, and their products (KJS 3).
 
 Modes with nearly the same trunk form a group. On its trunk each limb has configurations: those of
-the modes, their flips, and what a search of the image found. Other trunks have the same image: two
-limbs that each take the other's place, and the torso flipped in depth. On each of them the limbs
-hang in all ways that keep their image.
+the modes, their flips, and the results of a search. Other trunks have the same image: two limbs
+that each take the other's place, and the torso flipped in depth. On each of them the limbs hang in
+all ways that keep their image.
 
 Because limbs are nearly independent given the trunk, the energy of a product is that of its trunk
 plus the change that each configuration makes alone: a few dozen evaluations rate thousands of
@@ -110,7 +110,7 @@ class LimbProducts:
         return cls(body, modes, result, int(exchanged))
 
     def at_most(self, poses: int) -> LimbProducts:
-        """Those without the last trunks, so that about so many poses are to be evaluated.
+        """The products without the last trunks, so that about so many poses are to be evaluated.
 
         The trunk of the group stays in any case.
         """

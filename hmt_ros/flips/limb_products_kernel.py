@@ -98,7 +98,7 @@ def _filled(arrays: list[NDArray[Any]]) -> NDArray[Any]:
 
 
 class Configurations(NamedTuple):
-    """What limbs can do on T trunks; the first is that of G modes.
+    """Configurations of limbs on T trunks; the first trunk is that of G modes.
 
     Attributes:
         trunks: (T, d) a pose of each trunk.
@@ -167,7 +167,7 @@ def _hang(limbs, c, columns, origins, pose, ends, slack, leaves, out):  # type: 
 
 @njit(cache=True, nogil=True)
 def _distinct_angles(tree, limbs, c, columns, origins, pose, angles, apart, most):  # type: ignore[no-untyped-def]
-    """Which of the configurations (A, D) of limb c differ, and which stands for each.
+    """Indices of the distinct configurations (A, D) of limb c, and the one that stands for each.
 
     Args:
         tree, limbs, c: the limb.

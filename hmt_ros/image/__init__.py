@@ -1,1 +1,1 @@
-"""What an image says about a pose: background, observation, optical flow, likelihood."""
+"""Evidence of images about poses: background, observation, optical flow, likelihood."""

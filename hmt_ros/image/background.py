@@ -2,7 +2,7 @@
 
 The background is either a given image of the empty scene or learned from frames in which the person
 is absent or moves. OpenCV's mixture (MOG2) or nearest-neighbour (KNN) model does the per-pixel
-work, on images made smaller to about `LINES` lines: what they cost does not depend on the camera,
+work, on images made smaller to about `LINES` lines: the cost does not depend on the camera,
 and the outline that comes back is smooth to a fraction of their pixels. A background that turns out
 to be useless is rebuilt from the pixels of images where the person is not.
 
@@ -31,8 +31,8 @@ Box = tuple[int, int, int, int]
 # Number of lines that images are made smaller to, about: by a whole factor.
 LINES = 240
 
-# What OpenCV's models call a pixel that differs from the background, and one that is darker in the
-# same colour.
+# Values of OpenCV's models for a pixel that differs from the background, and for one that is darker
+# in the same colour.
 FOREGROUND, SHADOW = 255, 127
 # Grey levels by which a pixel may differ from the colours of the background around it: compression
 # and aliasing move its edges.
@@ -73,7 +73,7 @@ class BackgroundSettings:
 
 
 class Silhouette(NamedTuple):
-    """What differs from the background.
+    """Pixels that differ from the background.
 
     Attributes:
         foreground: (H, W) the person.
@@ -86,10 +86,10 @@ class Silhouette(NamedTuple):
 
 
 class BackgroundModel:
-    """Learns an empty scene and finds what does not belong to it.
+    """Learns an empty scene and finds pixels that differ from it.
 
     Attributes:
-        settings: how.
+        settings: of the subtraction.
         frames: number of images that were learned.
         changed: share of the pixels of the last image that differ from the background, shadows
             among them.
@@ -171,7 +171,7 @@ class BackgroundModel:
         return self._larger(self._subtracted(image) == FOREGROUND)
 
     def silhouette(self, image: Image, region: Box | None = None) -> Mask:
-        """Foreground (H, W) of an image: the largest piece and what is near it, without shadow.
+        """Foreground (H, W) of an image: the largest piece and pieces near it, without shadow.
 
         Empty where nothing differs from the background. The model does not change.
 
@@ -188,7 +188,7 @@ class BackgroundModel:
     def split(
         self, image: Image, region: Box | None = None, others: Mask | None = None
     ) -> Silhouette:
-        """Foreground of an image, as for `silhouette`, and what may be person or shadow.
+        """Foreground of an image, as for `silhouette`, and pixels of the person or of a shadow.
 
         Args:
             others: (H, W) pixels that somebody else covers; None: none.
@@ -331,7 +331,7 @@ class _Parts:
         rows, columns = np.nonzero(empty & self.unknown)
         values = image[rows, columns].astype(np.float32)
         mean, agreeing = self._mean[rows, columns], self._agreeing[rows, columns]
-        # Who disagrees begins anew: somebody was there, then or now.
+        # Pixels that disagree begin anew: somebody was there, then or now.
         agreeing[np.abs(values - mean).max(1, initial=0.0) > AGREEMENT] = 0
         agreeing += 1
         self._mean[rows, columns] = mean + (values - mean) / agreeing[:, None]
@@ -342,7 +342,7 @@ class _Parts:
 
 
 def one_person(mask: Mask, settings: BackgroundSettings, region: Box | None = None) -> Mask:
-    """The largest piece of a mask (H, W) and what is large and near enough to belong to it."""
+    """The largest piece of a mask (H, W) and those large and near enough to belong to it."""
     result = np.zeros(mask.shape, dtype=np.bool_)
     part, found = mask[_part(region)], result[_part(region)]
     if part.size == 0:
@@ -394,8 +394,8 @@ class SceneWatch:
 
     Attributes:
         moved: whether the camera has moved since the background was taken.
-        shift: how far the scene lies from where the background has it, px; NaN: farther than can
-            be told.
+        shift: distance of the scene from its place in the background, px; NaN: too large to
+            measure.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Keypoint schemes: what detectors call the landmarks of a person, and where these lie on a body.
+"""Keypoint schemes: names of the landmarks of a person by detector, and their places on a body.
 
 A detector's "hip" is a point on the skin that annotators agreed on, not the centre of the joint.
 `keypoint_schemes.yaml` is the one table of names and offsets.
@@ -47,7 +47,7 @@ class Scheme:
     Attributes:
         name: of the scheme.
         names: of the landmarks, in the detectors' order.
-        landmarks: what the names mean.
+        landmarks: of the names.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Scheme:
     landmarks: tuple[Landmark, ...]
 
     def landmark(self, name: str) -> Landmark | None:
-        """What a name means; None: the scheme does not have it."""
+        """The landmark of a name; None: the scheme does not have it."""
         return self.landmarks[self.names.index(name)] if name in self.names else None
 
 
@@ -126,7 +126,7 @@ def recognised(names: Sequence[str]) -> Scheme | None:
 def landmarks_of(
     names: Sequence[str], joints: Sequence[str], scheme: str = AUTO
 ) -> list[Landmark | None]:
-    """What the names of keypoints mean; None: a joint of the body, or nothing that is known.
+    """The landmarks of keypoints by their names; None: a joint of the body, or unknown.
 
     Args:
         joints: of the body; outside schemes a name of one of them means this joint.
@@ -142,7 +142,7 @@ def landmarks_of(
 
 
 def landmark_called(name: str) -> Landmark | None:
-    """The landmark that the first scheme with a name calls by it; None: no scheme has the name."""
+    """The landmark of a name in the first scheme that has it; None: no scheme has the name."""
     found = (scheme.landmark(name) for scheme in schemes().values())
     return next((landmark for landmark in found if landmark is not None), None)
 
@@ -156,7 +156,7 @@ def noise_of(confidences: Array) -> Array:
 
 @dataclass(frozen=True)
 class DetectorErrors:
-    """How a detector errs: what experts learn with.
+    """The model of a detector's errors, for the training of experts.
 
     Attributes:
         sigma: Standard deviation of a keypoint that is sure, m at the person.
@@ -195,7 +195,7 @@ class DetectorErrors:
 
 @cache
 def position_deviations(scheme: str | None) -> Mapping[str, float]:
-    """Standard deviations of depths that a detector says, by the kind of the joint, m.
+    """Standard deviations of depths of a detector, by the kind of the joint, m.
 
     Args:
         scheme: name of the detector's; None or one that was not measured: the usual ones.
@@ -206,7 +206,7 @@ def position_deviations(scheme: str | None) -> Mapping[str, float]:
 
 @cache
 def detector_errors() -> DetectorErrors:
-    """How detectors err."""
+    """The model of the errors of detectors."""
     content = dict(_table()['errors'])
     return DetectorErrors(exchanged=tuple(content.pop('exchanged')), **content)
 
@@ -220,5 +220,5 @@ def exchange_rates() -> Array:
 
 @cache
 def usual_exchanges() -> Array:
-    """(1, E) log probability of each exchange, where nothing is known of the images before."""
+    """(1, E) log probability of each exchange, without knowledge of the images before."""
     return np.log(np.array(_table()['exchanges']['at_first'], dtype=np.float64))[None]

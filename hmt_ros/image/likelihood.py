@@ -89,7 +89,7 @@ class ImageEnergy:
 
     Attributes:
         terms: name -> (N,) energy, of the terms that are on and have evidence.
-        costs: (N, M) what each sample of the silhouette's outline costs.
+        costs: (N, M) energy of each sample of the silhouette's outline.
         gradient, hessian: (N, d), (N, d, d) of the sum; None: not asked for.
     """
 
@@ -107,10 +107,10 @@ class ImageEnergy:
 
 @dataclass(frozen=True, eq=False)
 class ImageLikelihood:
-    """What poses of a body before a camera cost, by image.
+    """The energy of poses of a body before a camera, given an image.
 
     Attributes:
-        body, camera: who is seen by what.
+        body, camera: the person, and the camera that sees the person.
         settings: of the terms.
         parts: the parts of the flesh that are compared with the image; None: all.
         occluders: the parts that hide others; None: all.
@@ -159,7 +159,7 @@ class ImageLikelihood:
 
         Args:
             exchanges: of sides, see `KeypointTerm`; None: as usual for detectors.
-            share: of the energy that counts, beside what is known of the exchanges.
+            share: of the energy that counts, beside the prior of the exchanges.
             lifted_share: the same of the energy of lifted poses.
         """
         assert observation.keypoints is not None
@@ -173,7 +173,7 @@ class ImageLikelihood:
 
     @cached_property
     def priors(self) -> tuple[FrameTerm, ...]:
-        """What is known of a pose without any image: joint angles, parts that do not intersect."""
+        """The terms without any image: prior of joint angles, parts that do not intersect."""
         s = self.settings
         if not np.isfinite(s.self_intersection_sigma):
             return (self.pose_prior,)
@@ -196,7 +196,7 @@ class ImageLikelihood:
         """The image terms, one by one, at the frames of N poses.
 
         Args:
-            explained: (N, M) or (1, M) what each sample of the outline costs at most, because
+            explained: (N, M) or (1, M) maximum energy of each sample of the outline, because
                 something else explains it.
             derivatives: whether gradient and Hessian are wanted.
         """
@@ -247,7 +247,7 @@ class ImageLikelihood:
     def inputs(
         self, observation: Observation, poses: int, explained: Array | None
     ) -> tuple[Any, ...]:
-        """What the kernels of all terms read, for so many poses."""
+        """The inputs of the kernels of all terms, for so many poses."""
         beliefs = observation.beliefs
         request = Request(poses, explained)
         result = []
@@ -266,7 +266,7 @@ class ImageLikelihood:
 
     @cached_property
     def model(self) -> Model:
-        """What the kernels read of body and camera."""
+        """Body and camera as the kernels read them."""
         body = self.body
         flesh = flesh_table_of(body)
         count = len(flesh.part_segments)

@@ -1,4 +1,4 @@
-"""What one image says: the evidence of every term of the likelihood, once for all poses."""
+"""The evidence of one image for every term of the likelihood, once for all poses."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class Beliefs:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """An image and what was taken from it.
+    """An image and the evidence taken from it.
 
     Attributes:
         silhouette: (H, W) foreground, or None: unknown, or not believed.
         keypoints: joints seen in the image, or None.
-        evidence: by the name of the term; what the image lacks is left out.
-        foreground: (H, W) what differs from the background, believed or not; None: unknown.
+        evidence: by the name of the term; terms without evidence in the image are left out.
+        foreground: (H, W) pixels that differ from the background, believed or not; None: unknown.
         depths: m, believed or not; None: unknown.
         flow: from the image before, two channels, px; None: there is none.
         others: (H, W) pixels that somebody else covers or may cover; None: there are none.
@@ -102,8 +102,8 @@ def observe(
         wanted: names of terms; None: all.
         unsure: (H, W) pixels that may belong to the silhouette; None: none.
         others: (H, W) pixels that somebody else covers; None: none.
-        depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and what is out
-            of range says nothing.
+        depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and values out of
+            range are no evidence.
 
     Raises:
         ValueError: shapes that contradict each other.

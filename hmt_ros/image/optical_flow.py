@@ -1,4 +1,4 @@
-"""Where the optical flow takes the surface of the body from one image to the next (KJS 2).
+"""Energy of poses against the optical flow from one image to the next (KJS 2).
 
     E(x) = w / Q sum_q rho(|u_q(x) - p_q - f(p_q)| / (sigma + 0.15 |f(p_q)|))
 
@@ -44,7 +44,7 @@ SMALLEST = 32
 def optical_flow(window: ImageWindow) -> ImageMap | None:
     """Dense flow from the last image to this one, two channels, px [Kroeger et al., ECCV 2016].
 
-    NaN where somebody else is; None: there is no last image.
+    NaN on pixels of somebody else; None: there is no last image.
     """
     if window.last_image is None:
         return None
@@ -61,7 +61,7 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
 
 
 class FlowInputs(NamedTuple):
-    """What the energy of the flow reads; attributes as for `FlowTerm`."""
+    """Inputs of the energy of the flow; attributes as for `FlowTerm`."""
 
     points: SurfacePoints
     flow: ImageMap
@@ -102,7 +102,7 @@ class FlowTerm:
 
     @property
     def compiled(self) -> FlowInputs:
-        """As compiled code reads it."""
+        """The term as compiled code reads it."""
         return FlowInputs(self.points, self.flow, float(self.weight))
 
 

@@ -43,13 +43,13 @@ Term = TypeVar('Term')
 
 @dataclass(frozen=True, eq=False)
 class ByCue:
-    """Energies of n poses by what they come from: image, keypoints, and all that is known else.
+    """Energies of n poses by source: image, keypoints, and all other terms.
 
     Attributes:
-        energy: of all together.
+        energy: sum of all.
         values: (n, 3).
         gradients, hessians: (n, 3, d), (n, 3, d, d); of no pose: not asked for.
-        outline_costs: (n, M) what each sample of the silhouette's outline costs.
+        outline_costs: (n, M) energy of each sample of the silhouette's outline.
     """
 
     energy: Energy
@@ -69,7 +69,7 @@ class PoseEnergy:
         motion: around where poses are expected, over the free variables; None: nothing is expected.
         point: (d,) values of all variables; None: all are free.
         free: (f,) variables that may move, where there is a point.
-        counted: is called with the number of poses that were evaluated; None: nobody counts.
+        counted: called with the number of poses that were evaluated; None: not called.
 
     Raises:
         ValueError: two terms of one kind that has a kernel.
@@ -251,7 +251,7 @@ class PoseEnergy:
 
     @cached_property
     def _rest(self) -> dict[str, Any]:
-        """What compiled code reads besides the terms of the image."""
+        """Inputs of compiled code besides the terms of the image."""
         body = self.likelihood.body
         keypoints, overlaps = self._term(KeypointTerm), self._term(SelfIntersection)
         ground, mixture = self._term(GroundTerm), self._term(MixturePrior)

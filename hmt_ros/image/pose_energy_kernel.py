@@ -35,7 +35,7 @@ _CONVERGED, _LIMIT, _STALLED, _NOT_FINITE = (
 
 
 class Compiled(NamedTuple):
-    """The terms as compiled code reads them; what is not there counts 0.
+    """The terms as compiled code reads them; a term that is not there counts 0.
 
     Attributes:
         placing: of the skeleton.
@@ -63,7 +63,7 @@ class Compiled(NamedTuple):
 
 
 class Descent(NamedTuple):
-    """What minima are found by; see `bounded_newton.minimise`.
+    """Settings of the minimiser; see `bounded_newton.minimise`.
 
     Attributes:
         most: evaluations per problem after the first one.
@@ -81,7 +81,7 @@ NO_DESCENT = Descent(0, 1.0, 0.0, np.zeros(0))
 
 
 class Room(NamedTuple):
-    """Where one pose is worked on.
+    """Working arrays for one pose.
 
     Attributes:
         pose: (1, d).
@@ -90,7 +90,7 @@ class Room(NamedTuple):
         shown: the pose as the terms of the image see it.
         wrenches, stiffnesses: (S, 6), (S, 6, 6) sums over the segments.
         energies: (terms,) of the image.
-        value: (cues,) energies: of image, keypoints and what is known else, or one of them all.
+        value: (cues,) energies: of image, keypoints and all other terms, or one of them all.
         ground: (1, 2).
         row: (1,) of the problem.
         gradient, hessian: (cues, d), (cues, d, d).
@@ -259,18 +259,18 @@ def solve(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Energies at the points first to last - 1, or minima from there.
 
-    One function for both: whatever calls the kernels of all terms takes long to compile.
+    One function for both: a function that calls the kernels of all terms takes long to compile.
 
     Args:
         first, last: range of points.
         compiled, point, free, rows, exact: as for `PoseEnergy.energy`.
         limits: (2, f) lower and upper ones.
-        descent: what `bounded_newton.minimise` descends by.
+        descent: settings as for `bounded_newton.minimise`.
         x: (n, f) points; become minima, where iterations are asked for.
         value, gradient, hessian: (n,), (n, f), (n, f, f) result; of no point: no derivatives are
             wanted, and no minima.
         by_cue: energies (n, 3), gradients (n, 3, d) and Hessians (n, 3, d, d) of image, keypoints
-            and what is known else, result; of no point: not wanted. They are those of the last
+            and all other terms, result; of no point: not wanted. They are those of the last
             evaluation, all variables are free, and gradients only where the others are.
         status, iterations: (n,) results.
     """

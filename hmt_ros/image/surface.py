@@ -1,4 +1,4 @@
-"""The occluding contour in the image, and which parts of it can be seen; compiled, pose by pose.
+"""The occluding contour in the image, and its visible points; compiled, pose by pose.
 
 The counterpart of the contours of `body.flesh` and `Camera.project` for the inner loop of the
 likelihood: on every ring of the flesh the two points whose normal is perpendicular to the ray.
@@ -319,7 +319,7 @@ def _condition(w, bx, by, uz, kx, ky, power):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def mark_visibility(flesh, occluders, columns, origins, parts, points, valid, covered, hidden):  # type: ignore[no-untyped-def]
-    """Which points (P, 3) have other parts on their rays, and which before them.
+    """Marks points (P, 3) with other parts on their rays, and those with parts before them.
 
     Every part counts as its ellipsoid |A (x - c)| = 1. On the ray t p it is entered at
     t = (m.k - sqrt((m.k)^2 - m.m (k.k - 1))) / m.m with m = A p, k = A c.

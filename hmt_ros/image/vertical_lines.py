@@ -1,4 +1,4 @@
-"""Which way is up, as the straight lines of a scene tell (Coughlan and Yuille, ICCV 1999).
+"""The vertical from the straight lines of a scene (Coughlan and Yuille, ICCV 1999).
 
 Edges of walls, doors and furniture run along the vertical or along two horizontal directions at
 right angles to each other. With an angle e_ik between line i in the image and the direction k of
@@ -7,8 +7,8 @@ such a frame R, as the image would show it at the place of the line,
     log p(lines | R) = sum_i log[1 - s + s / 3 sum_k r(e_ik)],   r(e) = N(e; 0, sigma) / uniform,
 
 the share s of all lines follows the frame and the rest is clutter. Summed over a raster of frames
-with a prior over how cameras are mounted, this tells how probable it is that there is such a frame
-at all, and which of its directions is the vertical. Furniture stands in all horizontal directions:
+with a prior over how cameras are mounted, this gives the probability that there is such a frame at
+all, and the direction of its vertical. Furniture stands in all horizontal directions:
 the vertical is then refined by the lines that agree with it alone, from a wide sigma to a narrow
 one.
 """
@@ -77,7 +77,7 @@ class Vertical:
 
 
 def seen_vertical(image: Image, camera: Camera) -> Vertical | None:
-    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines tell of none."""
+    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines show none."""
     lines = straight_lines(image, camera)
     return vertical_of(lines) if len(lines.normals) else None
 
@@ -111,7 +111,7 @@ def straight_lines(image: Image, camera: Camera) -> Lines:
 
 
 def vertical_of(lines: Lines) -> Vertical | None:
-    """The vertical that lines tell; None: they are clutter, or fit several."""
+    """The vertical of lines; None: they are clutter, or fit several."""
     raster = _raster()
     ratios = _ratios(raster.directions, lines, COARSE)
     vertical = SHARE / 3.0 * ratios[raster.vertical] + (1.0 - SHARE)
@@ -156,7 +156,7 @@ def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
 
 
 def _distinct(normals: Array) -> Index:
-    """Those of unit normals (N, 3), first come, that differ from all that were kept before."""
+    """Indices of unit normals (N, 3) that differ from all that were kept before them."""
     same = np.abs(normals @ normals.T) > np.cos(SAME_LINE)
     free = np.ones(len(normals), dtype=np.bool_)
     kept = []

@@ -5,12 +5,12 @@ quadratic model in the box,
 
     g.s + 1/2 s.(H + lambda W) s    subject to    lower - x <= s <= upper - x,
 
-by an active set: what the step on the free variables drives across a limit is put on it, the others
-are solved again, and what pulls away from its limit is set free. `TrustRegion` moves lambda. Each
-problem has its own lambda and its own active set, and leaves the batch when it has converged.
+by an active set: variables that the step drives across a limit are put on it, the others are solved
+again, and variables that are pulled away from their limit are set free. `TrustRegion` moves lambda.
+Each problem has its own lambda and its own active set, and leaves the batch when it has converged.
 
-The damping says how far the model is trusted: how much of the decrease that it predicts comes true
-says what lambda is for the next step [Nielsen, Damping parameter in Marquardt's method, 1999]:
+The damping shows how far the model is trusted: the fraction of the predicted decrease that comes
+true sets lambda for the next step [Nielsen, Damping parameter in Marquardt's method, 1999]:
 
     rho = (E(x) - E(x + s)) / (m(0) - m(s))
 
@@ -177,7 +177,7 @@ def box_step(gradient, hessian, low, high, damping, metric, step, curve):  # typ
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _decrease(gradient, hessian, step, curve):  # type: ignore[no-untyped-def]
-    """What the quadratic model says that a step gains; `curve` becomes H step."""
+    """Decrease that the quadratic model predicts for a step; `curve` becomes H step."""
     count = len(step)
     curve[:] = 0.0
     for j in range(count):  # along rows of a symmetric matrix: so the compiler takes many at once
@@ -358,11 +358,11 @@ class TrustRegion:
         self._limit, self._least_factor, self._least_refused = limit, least_factor, least_refused
 
     def accept(self, rows: Index, decrease: Array, predicted: Array) -> NDArray[np.bool_]:
-        """Which steps are to be taken, (n,); their dampings follow.
+        """Mask (n,) of the steps that are to be taken; their dampings follow.
 
         Args:
             rows: (n,) the problems.
-            decrease: (n,) of their energies; what is not finite is no decrease.
+            decrease: (n,) of their energies; values that are not finite are no decrease.
             predicted: (n,) decrease, positive.
         """
         ratio = np.where(np.isfinite(decrease), decrease, -np.inf) / predicted
@@ -374,7 +374,7 @@ class TrustRegion:
         return better
 
     def refuse(self, rows: Index) -> Index:
-        """Damps problems (n,) whose steps are refused; those of them that have stalled."""
+        """Damps problems (n,) whose steps are refused; returns those that have stalled."""
         self.damping[rows] = np.maximum(self.damping[rows], self._least_refused)
         self.damping[rows] *= self._growth[rows]
         self._growth[rows] *= 2.0

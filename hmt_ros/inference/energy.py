@@ -2,8 +2,8 @@
 
     E(x) = - sum_i log p_i(x),     g = dE/dx,     H ~ d2E/dx2
 
-Everything that says something about x is an `EnergyTerm`. A posterior is the sum of its terms, and
-every optimiser takes such a sum (KJS 2 and 3.2, VMS 5).
+Every factor of a density over x is an `EnergyTerm`. A posterior is the sum of its terms, and every
+optimiser takes such a sum (KJS 2 and 3.2, VMS 5).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hmt_ros.inference.arrays import Array, Index
 
 
 class Derivatives(IntEnum):
-    """Which derivatives an energy is asked for."""
+    """Derivatives that an energy is asked for."""
 
     NONE = 0
     GRADIENT = 1  # the gradient; a term may return a Hessian with it

@@ -5,7 +5,7 @@
 
 so that gaps and uneven intervals need no further rule: the prediction over two intervals is that
 over their sum. The random walk has F = 0; at constant velocity the state is the pose and its
-velocity, and what is white is the acceleration.
+velocity, and the acceleration is white.
 """
 
 from __future__ import annotations
@@ -242,7 +242,7 @@ class LinearGaussianDynamics:
     def states(self, covariances: Array) -> Array:
         """Covariances (K, n, n) of states with poses of covariances (K, d, d).
 
-        What is known of the velocities is what is known of the first one.
+        All velocities have the covariance of the first one.
         """
         d, n = self.dimension, self.state_dimension
         if n == d:
@@ -255,7 +255,7 @@ class LinearGaussianDynamics:
     def predict_poses(
         self, means: Array, covariances: Array, interval: float
     ) -> tuple[Array, Array]:
-        """Means (K, d) and covariances (K, d, d) of poses, of whose velocities nothing is known.
+        """Predicted means (K, d) and covariances (K, d, d) of poses of unknown velocities.
 
         Args:
             means, covariances: (K, d) and (K, d, d) of the poses.
@@ -291,7 +291,7 @@ class LinearGaussianDynamics:
 
         Args:
             intervals: (T-1,).
-            initial: whether what is known of the first state is part of it.
+            initial: whether the prior of the first state is part of it.
 
         Raises:
             ValueError: the noise over an interval is not positive definite.
@@ -324,7 +324,7 @@ class LinearGaussianDynamics:
 
 
 def _kept(known: dict[float, T], interval: float, make: Callable[[float], T]) -> T:
-    """What is known of an interval; else what is made of it, which is kept."""
+    """The value kept for an interval; else one that is made, and kept."""
     found = known.get(interval)
     if found is None:
         found = make(interval)

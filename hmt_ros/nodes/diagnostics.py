@@ -1,6 +1,6 @@
-"""What a node reports in its diagnostics: rates of messages, and events of the middleware.
+"""Diagnostics of a node: rates of messages, and events of the middleware.
 
-Without these events a publisher whose quality of service does not fit is silence without a cause.
+Without these events a publisher of an incompatible quality of service goes unnoticed.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ class Rates:
 
     Args:
         name: of the messages that are counted, 'images'.
-        done: what those are called that were used, 'tracked'.
+        done: name of those that were used, 'tracked'.
 
     Attributes:
         name: of the messages.
         dropped, faults, lost: of the period.
-        computing: how long a message takes, in words.
+        computing: time that a message takes, in words.
     """
 
     def __init__(self, name: str, done: str) -> None:
@@ -96,7 +96,7 @@ class Rates:
 
 
 def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -> str:
-    """What went wrong in the last period, the reason first; '' if nothing did."""
+    """Trouble of the last period, the reason first; '' if there was none."""
     name, why = rates.name, '; '.join(silent.texts.values())
     if rates.dropped:
         held_up = f'waits for {state.held_up}' if state.held_up else rates.computing

@@ -29,11 +29,11 @@ _REMEMBERED = 1000
 
 
 class Waiting(NamedTuple):
-    """Something that waits.
+    """A message or a request that waits.
 
     Attributes:
-        source: where it comes from.
-        content: what it is.
+        source: its origin.
+        content: the message, or the action.
         arrival: when it came, in seconds of a clock that does not jump.
         stamp_ns: of its header; 0 where it has none.
     """
@@ -45,11 +45,11 @@ class Waiting(NamedTuple):
 
 
 class Duration(NamedTuple):
-    """What an estimate took.
+    """Times that an estimate took.
 
     Attributes:
         whole: from the bytes of its message to the last one that it led to, s.
-        publishing: of this what making these into bytes took, and publishing them, s.
+        publishing: part of it for making messages into bytes and publishing them, s.
     """
 
     whole: float
@@ -57,7 +57,7 @@ class Duration(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """What has come since the last time.
+    """Messages that have come since the last time.
 
     Attributes:
         waiting: in the order of arrival.
@@ -178,7 +178,7 @@ class EstimatingThread:
         read: the message of a type in bytes.
 
     Attributes:
-        queue: what waits.
+        queue: messages and requests that wait.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class EstimatingThread:
         session.interrupted = self._is_interrupted
         self._inputs: dict[str, SubscribedTopic] = {}
         self._stamped: set[str] = set()
-        # Of several requests to start anew the last counts.
+        # The last of several requests to start anew counts.
         limits = {_RESTART: 1, session.COUNTED: session.most_waiting}
         self.queue = InputQueue(limits, counted=session.COUNTED)
         for one in inputs:

@@ -1,7 +1,7 @@
 """Topics between nodes that run in one process.
 
-What one node publishes, another gets as it is, without the middleware. What comes from other
-processes is subscribed to once, by the first node that listens, which hands it to the others.
+A message of one node goes to another as it is, without the middleware. A topic of other processes
+is subscribed to once, by the first node that listens, which hands messages to the others.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class LocalTopics:
     """
 
     def __init__(self) -> None:
-        # What several nodes read and decode: the newest, with what they were made of.
+        # Messages and pictures that several nodes share: the newest, with their sources.
         self._read: deque[tuple[bytes, Any]] = deque(maxlen=SHARED)
         self._decoded: deque[tuple[Any, Image]] = deque(maxlen=SHARED)
         self._offered: set[str] = set()
@@ -110,7 +110,7 @@ class LocalTopics:
 
 
 class OwnMessages:
-    """What was published on a topic to which the publisher subscribes, too; for any thread."""
+    """Messages published on a topic to which the publisher subscribes, too; for any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -127,7 +127,7 @@ class OwnMessages:
                 self._forget(self._order.popleft())
 
     def is_own(self, data: bytes) -> bool:
-        """Whether a message that was received is one of those; each comes back once."""
+        """Whether a message that was received is an own one; each comes back once."""
         key = _key(data)
         with self._lock:
             if key not in self._waiting:
@@ -143,5 +143,5 @@ class OwnMessages:
 
 
 def _key(data: bytes) -> bytes:
-    """The message without its head, and without what the middleware pads its end with."""
+    """The message without its head, and without the padding of the middleware at its end."""
     return bytes(data[4:]).rstrip(b'\0')

@@ -88,7 +88,7 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
 
 
 def next_step(node: Node, error: ValueError, checked: Iterable[str]) -> str:
-    """What to do after a configuration that failed.
+    """Advice after a configuration that failed.
 
     Args:
         checked: names of parameters that may be the cause.
@@ -143,12 +143,12 @@ def _sections(document: Mapping[Any, Any], prefix: str) -> Iterator[str]:
 
 
 def _pattern(section: str) -> str:
-    """What a section matches, as a regular expression over full names of nodes."""
+    """Regular expression over full names of nodes that a section matches."""
     parts = {'*': '/[^/]+', '**': '(/[^/]+)*'}
     return ''.join(parts.get(part, f'/{re.escape(part)}') for part in section.split('/')[1:])
 
 
 def _is_meant(section: str, node: str) -> bool:
-    """Whether somebody who writes this section means the node."""
+    """Whether this section is probably meant for the node."""
     name, own = section.rpartition('/')[2], node.rpartition('/')[2]
     return difflib.SequenceMatcher(None, name, own).ratio() >= _ALIKE_NODE

@@ -1,4 +1,4 @@
-"""Why nothing arrives: what a node waits for, who publishes it, and what there is instead.
+"""Causes of silence: topics that a node waits for, their publishers, and similar topics.
 
 All but `arrived` runs in the executor's thread, once a period of the diagnostics, and asks the
 graph only about topics on which nothing arrives.
@@ -29,7 +29,7 @@ _OTHER = {_IMAGE: _COMPRESSED, _COMPRESSED: _IMAGE}
 
 
 class Publication(NamedTuple):
-    """That somebody else publishes on a topic.
+    """A publication of another node on a topic.
 
     Attributes:
         topic: its full name.
@@ -107,7 +107,7 @@ class SilentTopics:
         return now - last >= SILENCE
 
     def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
-        """What others publish on topics that are like some, by type or by name.
+        """Publications of others on topics that are like some, by type or by name.
 
         The silhouettes and overlays of our own nodes are no images of a camera.
         """
@@ -134,7 +134,7 @@ class SilentTopics:
 def why_silent(
     wanted: list[SubscribedTopic], names: list[str], published: list[Publication]
 ) -> str:
-    """Why nothing arrives on topics any of which is enough, and what to do."""
+    """Cause of silence on topics, any one of which is enough, and the remedy."""
     topics = ' or '.join(
         f'{name} ({_short(one.msgtype)})' for one, name in zip(wanted, names, strict=True)
     )
@@ -154,7 +154,7 @@ def why_silent(
 
 
 def _instead(wanted: SubscribedTopic, name: str, published: list[Publication]) -> str:
-    """What there is in place of a topic; '' if nothing is like it."""
+    """Similar topics in place of a topic, in words; '' if nothing is like it."""
     kinds = {each.topic: each.msgtype for each in published}
     transport = _other_transport(wanted, name, kinds)
     if transport:

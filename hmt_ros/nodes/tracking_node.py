@@ -1,4 +1,4 @@
-"""A node that tracks people: what nodes of one person and of several have in common.
+"""A node that tracks people: the common part of nodes for one person and for several.
 
 A watchdog tells robots where no image was answered for `stale_time`, by a clock that does not jump.
 """
@@ -85,7 +85,7 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
 
     @abstractmethod
     def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
-        """What tracks start from by a request, and what will start them, in words.
+        """The start of the tracks that a request asks for, and its description in words.
 
         Raises:
             ValueError: a request that can not be used.

@@ -126,7 +126,7 @@ def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class _Renderer:
-    """What pictures of the same body, camera and scene share."""
+    """Common data of pictures of the same body, camera and scene."""
 
     body: Body
     camera: Camera
@@ -228,7 +228,7 @@ class _Triangles:
         return values[0], along_u, along_v
 
     def interpolated(self, values: Picture, front: _Front) -> Picture:
-        """Values (M, k) at what is seen, of values (V, k) at the vertices; right in perspective."""
+        """Values (M, k) at the pixels, from values (V, k) at the vertices; right in perspective."""
         # Divided by the depth they are linear over the image.
         weighted = values[self.corners] * self.inverse_depth[:, :, None].astype(np.float32)
         which = front.triangles
@@ -264,7 +264,7 @@ def _mesh(body: Body) -> Mesh:
     if not body.shapes:
         raise ValueError(f'body {body.name} has no flesh: it can not be drawn')
     mesh = body.flesh.mesh(STACKS, SLICES)
-    # What faces the camera is told from the order of the corners: make it that of the normals.
+    # The order of the corners decides which triangles face the camera: make it fit the normals.
     a, b, c = mesh.vertices[mesh.triangles.T]
     inwards = np.einsum('fx,fx->f', np.cross(b - a, c - a), mesh.normals[mesh.triangles[:, 0]]) < 0
     triangles = np.where(inwards[:, None], mesh.triangles[:, ::-1], mesh.triangles)
@@ -280,7 +280,7 @@ def _renderer(body: Body, camera: Camera, scene: Scene, wearer: int = 0) -> _Ren
 
 @lru_cache(maxsize=8)
 def _field_of_view(camera: Camera) -> Array:
-    """Bounds [[low, high], [low, high]] of x / z and of y / z of what the image may show."""
+    """Bounds [[low, high], [low, high]] of x / z and of y / z of points in the image."""
     u, v = np.linspace(-0.5, camera.width - 0.5, 33), np.linspace(-0.5, camera.height - 0.5, 33)
     rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1))
     slopes = (rays[..., :2] / rays[..., 2:]).reshape(-1, 2)
@@ -311,7 +311,7 @@ def _project(mesh: Mesh, points: Array, camera: Camera) -> _Triangles:
 
 
 def _fill(triangles: _Triangles, height: int, width: int) -> _Filled:
-    """All pixels whose centres lie in triangles, without regard to what hides what."""
+    """All pixels whose centres lie in triangles, whether or not another triangle hides them."""
     # Corners from top to bottom. Both triangles at an edge then compute its places alike, and every
     # pixel goes to one of them.
     order = np.argsort(triangles.v, axis=0, kind='stable')
@@ -333,7 +333,7 @@ def _fill(triangles: _Triangles, height: int, width: int) -> _Filled:
 
 
 def _front(triangles: _Triangles, filled: _Filled, shape: tuple[int, int]) -> _Front:
-    """Of all that the pixels of one image may show, what is nearest to the camera."""
+    """The triangle nearest to the camera at each pixel of one image."""
     base, along_u, along_v = triangles.planes(triangles.inverse_depth)
     base = base - along_u * triangles.u[0] - along_v * triangles.v[0]
     which = filled.triangles
@@ -387,7 +387,7 @@ OF_DEPTH = 6
 
 
 def sensed_depth(depth: Depth, camera: Camera, seed: int, frame: int = 0) -> NDArray[np.uint16]:
-    """What a sensor measures of true depths.
+    """Depths measured by a sensor, from true depths.
 
     Args:
         depth: (H, W) along the axis of the camera, m; inf where nothing is.
@@ -420,7 +420,7 @@ def _smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], blur: float)
 
 
 def _shadowed(inverse: Depth, shift: float) -> NDArray[np.bool_]:
-    """What the second eye, to the right, does not see, by disparities in units of 1/m."""
+    """Pixels hidden from the second eye, to the right, by disparities in units of 1/m."""
     column = np.arange(inverse.shape[1])
     # A pixel is seen there at this column; what is nearer, further right, covers it.
     there = column - shift * inverse

@@ -1,4 +1,4 @@
-"""What a rendered person stands in and wears: light, floor, wall, things, noise; and clothes.
+"""Surroundings of a rendered person: light, floor, wall, things, noise; and the clothes.
 
 A scene is a seed and a few numbers. The picture of the empty place follows from them by casting
 rays through every pixel, so that it is right for every distortion of the camera.
@@ -34,7 +34,7 @@ OF_THINGS, OF_SURFACES, OF_NOISE, OF_CLOTHES = 1, 2, 3, 4
 WAVE_LENGTHS = (0.30, 0.16, 0.10, 0.07)  # m, of what a pattern is the sum of
 # Where cloth ends, as shares of the segment from its start.
 SLEEVE, SHORTS, SOCK = 0.80, 0.15, 0.85
-# What covers a segment whose name contains the word; everything else is skin.
+# Cover of the segments whose name contains the word; everything else is skin.
 KIND_OF_SEGMENT = {
     'head': 'head', 'neck': 'head', 'trunk': 'shirt', 'pelvis': 'shorts', 'upper_arm': 'sleeve',
     'thigh': 'shorts', 'shin': 'shin', 'foot': 'shoe',

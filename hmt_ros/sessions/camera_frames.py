@@ -1,8 +1,8 @@
-"""What frames tell of the camera through transforms: gravity, its height, its pose.
+"""The camera by transforms to other frames: gravity, its height, its pose.
 
-A frame with z up (`gravity_frame`) tells which way is up and, where z = 0 is the floor, how high
-the camera is. A frame that stands still (`fixed_frame`) tells how the camera moves. Both may be
-one.
+A frame with z up (`gravity_frame`) gives the direction of gravity and, where z = 0 is the floor,
+the height of the camera. A frame that stands still (`fixed_frame`) gives the motion of the camera.
+Both may be one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _SHORTEST = 1e-6
 
 
 class SeenGravity(NamedTuple):
-    """What the transforms tell about a camera at a time.
+    """Gravity and height of a camera, from the transforms at a time.
 
     Attributes:
         up: (3,) unit vector against gravity, camera frame.
@@ -36,7 +36,7 @@ class SeenGravity(NamedTuple):
 
 
 class CameraFrames:
-    """The frames that transforms lead to from the camera, and what they tell.
+    """The frames that transforms lead to from the camera, with gravity and pose.
 
     Args:
         gravity_frame: name of a frame with z up; empty: there is none.
@@ -44,7 +44,7 @@ class CameraFrames:
         floor: whether z = 0 of `gravity_frame` is the floor.
 
     Attributes:
-        gravity: what was seen of it last; None: nothing yet.
+        gravity: the newest from transforms; None: none yet.
         newest: whether that was at the image that was looked up last.
         heard: whether any transform has come.
         pose: of the camera in `fixed_frame` at the image that was looked up last; None: unknown.
@@ -71,7 +71,7 @@ class CameraFrames:
         return self._transforms.put(message, static=static)
 
     def forget_after(self, stamp_ns: int) -> None:
-        """See `TransformBuffer.forget_after`; what was seen is forgotten, too."""
+        """See `TransformBuffer.forget_after`; gravity and pose are forgotten, too."""
         self._transforms.forget_after(stamp_ns)
         self.gravity, self.newest, self.pose = None, False, None
 
@@ -91,7 +91,7 @@ class CameraFrames:
         """Looks gravity and the pose of the camera up at the time of an image.
 
         Returns:
-            What is wrong; where there is no transform, what was looked for and what there is.
+            The faults; for a missing transform, the one that was wanted and those there are.
         """
         faults = []
         if self.gravity_frame:
@@ -101,7 +101,7 @@ class CameraFrames:
         return faults
 
     def known_ground(self, otherwise: KnownGround) -> KnownGround:
-        """What was seen last, in place of what is known otherwise."""
+        """The ground known otherwise, with gravity and height from the newest transforms."""
         if self.gravity is None:
             return otherwise
         height = otherwise.camera_height

@@ -65,7 +65,7 @@ class WaitingImage(NamedTuple):
         image: (H, W, 3) BGR.
         stamp_ns: of the image.
         frame_id: optical frame of the camera.
-        given: what has come with it, by the name of the input.
+        given: inputs that have come with it, by name.
     """
 
     image: Image
@@ -74,7 +74,7 @@ class WaitingImage(NamedTuple):
     given: Mapping[str, Taken] = MappingProxyType({})
 
     def content(self, name: str) -> Any:
-        """What an input says of the image; None: nothing."""
+        """Content of an input for the image; None: nothing."""
         return self.given[name].content if name in self.given else None
 
     @property
@@ -85,7 +85,7 @@ class WaitingImage(NamedTuple):
 
     @property
     def depth(self) -> NDArray[np.float32] | None:
-        """Of what each pixel shows, (H, W) m; None: unknown."""
+        """Depth of the surface at each pixel, (H, W) m; None: unknown."""
         depth: NDArray[np.float32] | None = self.content(DEPTH)
         return depth
 
@@ -96,7 +96,7 @@ class NamedFrames:
     Two publishers on one topic, or the camera_info of another camera, else go unnoticed.
 
     Args:
-        image, info: what sessions call the sources of images and of camera_info.
+        image, info: names of the sources of images and of camera_info.
     """
 
     def __init__(self, image: str, info: str) -> None:
@@ -104,7 +104,7 @@ class NamedFrames:
         self._seen: dict[str, list[str]] = {image: [], info: []}
 
     def see(self, source: str, frame_id: str, naming: Callable[[str], str]) -> list[str]:
-        """Takes the frame of a message; returns what is to be warned of, once for each frame.
+        """Takes the frame of a message; returns warnings, once for each frame.
 
         Args:
             frame_id: may be empty.
@@ -135,7 +135,7 @@ class CameraSession(Session[CameraParameters, State]):
     """A session that estimates from images; see `Session` for arguments and attributes.
 
     Attributes:
-        rows: what may come with the images.
+        rows: inputs that may come with the images.
     """
 
     COUNTED = IMAGE
@@ -160,7 +160,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._dropped: deque[int] = deque(maxlen=REMEMBERED)
 
     def needed_inputs(self) -> list[NeededInput]:
-        """What has to come at present; may be called by any thread."""
+        """Inputs that are needed at present; may be called by any thread."""
         needed = super().needed_inputs()
         if self._camera is None and not self._uncalibrated:
             needed.append(NeededInput((CAMERA_INFO,)))
@@ -169,7 +169,7 @@ class CameraSession(Session[CameraParameters, State]):
 
     @classmethod
     def inputs_of(cls, parameters: Any) -> tuple[ImageInput, ...]:
-        """What may come with the images, by the parameters."""
+        """Inputs that may come with the images, by the parameters."""
         return (MASK_INPUT,)
 
     def _awaited(self) -> list[ImageInput]:
@@ -212,7 +212,7 @@ class CameraSession(Session[CameraParameters, State]):
         return None
 
     def _forget_inputs(self, stamp: int) -> None:
-        """Drops what belongs to the images before time jumped back to a stamp."""
+        """Drops the inputs of images before time jumped back to a stamp."""
         self._inputs.clear()
 
     def _has(self, inputs: StampedInputs[Any], stamp: int, timeout: float) -> bool:
@@ -294,7 +294,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._waiting.append(WaitingImage(image, stamp, str(message.header.frame_id)))
 
     def _end(self) -> int:
-        """Estimates from the images that wait for what does not come any more."""
+        """Estimates from the images that wait for inputs which do not come any more."""
         while self._waiting and self._camera is not None:
             self._estimate_next(self._camera)
         return self._newest or 0
@@ -319,7 +319,7 @@ class CameraSession(Session[CameraParameters, State]):
                 self._leave_out_late_images()
             while self._waiting and not self._left and self._is_ready(self._waiting[0]):
                 self._estimate_next(self._camera)
-                # What has come meanwhile decides which image is next.
+                # Messages that have come meanwhile decide which image is next.
                 self._left = bool(self._waiting) and self.interrupted()
         self._drop_incomplete_images()
 
@@ -368,7 +368,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._estimate(waiting._replace(frame_id=frame, given=given), camera)
 
     def _given_with(self, waiting: WaitingImage) -> dict[str, Taken]:
-        """What has come with an image, by the name of the input."""
+        """Inputs that have come with an image, by name."""
         return {
             row.name: self._inputs.take(row, waiting.stamp_ns, waiting.image, self._dropped)
             for row in self._awaited()
@@ -387,7 +387,7 @@ class CameraSession(Session[CameraParameters, State]):
 
 
 def camera_info_fault(error: CameraInfoError, source: str) -> str:
-    """What is wrong with a camera_info, and what to do."""
+    """Fault of a camera_info, and the remedy."""
     text = f'{source}{str(error).removeprefix("camera info")}'
     if isinstance(error, UncalibratedError):
         return f'{text}; calibrate the camera, and let its driver publish the result'
@@ -395,11 +395,11 @@ def camera_info_fault(error: CameraInfoError, source: str) -> str:
 
 
 def camera_moved_fault(shift: float, stamp_ns: int, remedy: str) -> str:
-    """Where the scene is after the camera has moved, and what to do.
+    """Shift of the scene after the camera has moved, and the remedy.
 
     Args:
         shift: of the scene, px; NaN: unknown.
-        remedy: how a new background is taken.
+        remedy: way to take a new background.
     """
     far = 'elsewhere' if math.isnan(shift) else f'{shift:.0f} px away'
     return (

@@ -135,7 +135,7 @@ class FilterParameters(CameraNodeParameters):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """What may start a track that has no subject_file."""
+        """Inputs that may start a track that has no subject_file."""
         used = {
             'keypoints of a person': self.use_keypoints,
             'a mask of a person': self.use_mask,
@@ -150,6 +150,6 @@ class FilterParameters(CameraNodeParameters):
 
     @property
     def known_ground(self) -> KnownGround:
-        """What the parameters tell of gravity and of the floor, without transforms."""
+        """Gravity and floor from the parameters, without transforms."""
         up = -unit_vector(self.gravity, 'gravity') if self.gravity else None
         return KnownGround(up, self.camera_height or None)

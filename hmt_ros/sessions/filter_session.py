@@ -78,11 +78,11 @@ class FilterState(SessionState):
         modes: components of the posterior.
         misfit: share of the image that no mode explains.
         evaluations: of the likelihood in the last image.
-        background: what is known of it, in a few words.
+        background: its state, in a few words.
         doubted: whether it was learned with the person in it, and is not known again.
         moved: whether the camera has moved since it was taken.
         track_id: number of the present track, or of the last one; 0 before the first.
-        started_from: what that track began from; '' before the first.
+        started_from: input that this track began from; '' before the first.
         existence: probability that a person is in view; NaN: no image yet.
         beliefs: probability that each cue shows the person, and that the track has the person.
     """
@@ -133,7 +133,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
     """Tracks one person before one camera; see `TrackingSession` for arguments and attributes.
 
     Attributes:
-        robot: what a robot acts on; may be read by any thread.
+        robot: outputs for robots; may be read by any thread.
     """
 
     TOPICS = TOPICS_OF_NODE
@@ -147,10 +147,10 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointReader(self.parameters.source, self._log)
-        # Of an image that was left out since the last estimate.
+        # From an image that was left out since the last estimate.
         self._late_prediction: PosePrediction | None = None
         self.robot = RobotOutputs()
-        # What a watchdog says never follows the answer to a newer image.
+        # A message of the watchdog never follows the answer to a newer image.
         self._telling = threading.Lock()
         self.state = self._present_state()
 
@@ -187,7 +187,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         return super()._read_input(row, message, stamp)
 
     def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
-        """The mixture and its body, see `body_of`; `NOBODY`: was seen; None: it says nothing.
+        """The mixture and its body, see `body_of`; `NOBODY`: nobody was seen; None: no prediction.
 
         Raises:
             ValueError: it can not be used; one line.
@@ -208,7 +208,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             self._late_prediction = found
 
     def _prediction_of(self, waiting: WaitingImage) -> PosePrediction | Status | None:
-        """What was predicted from an image or, without that, from one left out before it."""
+        """The prediction from an image or, without that, from one left out before it."""
         found: PosePrediction | Status | None = waiting.content(PREDICTION)
         late, self._late_prediction = self._late_prediction, None
         return late if found is None else found
@@ -328,7 +328,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         tracker: Tracker | None = None,
         posterior: GaussianMixture | None = None,
     ) -> None:
-        """Publishes what a robot acts on; of every image, whatever it shows.
+        """Publishes the outputs for robots, for every image, whatever it shows.
 
         Args:
             tracker: after the image; None: it could not be tracked.

@@ -1,4 +1,4 @@
-"""What sessions report: the outcome of each message, and counts over all of them."""
+"""Reports of sessions: the outcome of each message, and counts over all of them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Handled:
     Attributes:
         source: where it came from.
         stamp_ns: of the message.
-        faults: why it, or something that waited for it, could not be used; empty if it was used.
+        faults: of it, or of a message that waited for it; empty if it was used.
         warnings: for the log: the first fault of each kind.
         published: (topic, stamp) of all messages that were published, in their order.
         events: for the log of a node, and no faults: start and end of a track, say; not in the
@@ -106,11 +106,11 @@ class HandlingLog:
 
     Attributes:
         counts: number of the messages that are estimated from: 'received', and of these 'skipped',
-            'dropped' and what the session counts.
+            'dropped' and keys of the session.
         faults: number by kind.
         last_fault: the newest; '' before the first.
-        held_up: what the last dropped message waited for here; '' if it was dropped before.
-        prefix: what texts begin with: of whom they are.
+        held_up: input that the last dropped message waited for here; '' if dropped before.
+        prefix: start of all texts: the person that they are about.
     """
 
     def __init__(self) -> None:
@@ -129,7 +129,7 @@ class HandlingLog:
         self._published: list[tuple[str, int]] = []
 
     def fault(self, kind: Fault | MessageFault, text: str) -> None:
-        """Reports something that could not be used."""
+        """Reports a message or content that could not be used."""
         self._told.append(one_line(f'{self.prefix}{text}'))
         self.note(kind, text)
 
@@ -165,7 +165,7 @@ class HandlingLog:
         """Reports a message that waited here in vain and is dropped.
 
         Args:
-            held_up: what it waited for.
+            held_up: input that it waited for.
         """
         self.counts['dropped'] += 1
         self.held_up = held_up

@@ -80,7 +80,7 @@ _IMAGES = 20
 
 
 def mixture_source(namespace: str) -> str:
-    """What the session calls the mixtures of a namespace."""
+    """Name of the source of the mixtures of a namespace."""
     return f'{MIXTURE} of {namespace}'
 
 
@@ -90,7 +90,7 @@ def body_topic(identity: str, name: str) -> str:
 
 
 def published_topic(topic: str) -> PublishedTopic:
-    """What a topic of the session is."""
+    """Type and durability of a topic of the session."""
     return TOPICS.get(topic) or BODY_TOPICS[topic.rpartition('/')[2]]
 
 
@@ -183,7 +183,7 @@ class HriSession(Session[HriParameters, HriState]):
         return {person.identity for person in self._people.values() if person.identity}
 
     def needed_inputs(self) -> list[NeededInput]:
-        """What has to come at present; may be called by any thread."""
+        """Inputs that are needed at present; may be called by any thread."""
         return [NeededInput((mixture_source(name),)) for name in self.parameters.named]
 
     def _end(self) -> int:
@@ -331,7 +331,7 @@ class HriSession(Session[HriParameters, HriState]):
         shown: int,
         camera: Camera,
     ) -> None:
-        """What needs the calibration; nothing of a body that is beyond the image."""
+        """Publishes messages that need the calibration; none of a body beyond the image."""
         identity, stamp, frame = person.identity, content.stamp_ns, content.frame_id
         places, weights = content.joint_positions, content.weights
         region = region_in_image(camera, places[shown])

@@ -1,4 +1,4 @@
-"""What images say of a pose, as a smoother takes it in, and what of it counts."""
+"""Evidence of images about a pose, for a smoother, and the part of it that counts."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ ASTRAY = 1.0
 
 
 class Evidence(NamedTuple):
-    """What an image says of the pose.
+    """Evidence of an image about the pose.
 
     Attributes:
         stamp: of the image.
-        mixture: the whole of it.
-        errors: how long errors last.
-        shape: (d, d) covariance of what poses of all images err by alike; None: unknown.
+        mixture: the whole evidence.
+        errors: the error model.
+        shape: (d, d) covariance of the errors shared by poses of all images; None: unknown.
     """
 
     stamp: int
@@ -35,12 +35,12 @@ class Evidence(NamedTuple):
     shape: Array | None
 
     def since(self, before: int | None, rates: Array, distance: float) -> GaussianMixture:
-        """What counts of it after an image at the stamp `before`; None: there is none.
+        """The part that counts after an image at the stamp `before`; None: no image before.
 
         Args:
             before: ns.
             rates: (d,) variances of free motion, per second.
-            distance: below which modes are merged, in standard deviations of what counts.
+            distance: below which modes are merged, in standard deviations of that part.
         """
         dt = self._interval(before)
         share = self.errors.share(dt)
@@ -70,11 +70,11 @@ class KeptMixtures(NamedTuple):
 
 
 def evidence_of(content: PoseMixture) -> Evidence:
-    """What a mixture says, and how its errors last; of a kind without errors they do not.
+    """The evidence in a mixture, with its error model; without one, errors do not last.
 
     Raises:
-        MessageError: there are no components or no covariances; a forecast; a likelihood that does
-            not tell how its errors last.
+        MessageError: there are no components or no covariances; a forecast; a likelihood without an
+            error model.
     """
     if content.kind is MixtureKind.FORECAST:
         raise MessageError(

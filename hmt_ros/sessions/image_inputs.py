@@ -1,7 +1,7 @@
-"""What comes with the images of a camera, declared once, and what waits for its image.
+"""Inputs that come with the images of a camera, declared once, and those that wait for an image.
 
-`INPUTS` is the table: topics and types, how a message is read, how long an image waits for it, what
-its absence means. Sessions, nodes, replay and recording read it; a new input is a row here, the
+`INPUTS` is the table: topics and types, reading of messages, waiting of images for them, faults of
+their absence. Sessions, nodes, replay and recording read it; a new input is a row here, the
 parameter that switches it on, and the place where its content is used.
 
 An input belongs to the image of exactly its stamp; of several of one stamp the last counts. Where
@@ -52,10 +52,10 @@ class ImageInput:
         faulty, none: kinds of faults of a message that can not be used, and of an image without.
         read: content of a message of a stamp, None where it says that there is nothing; raises
             ValueError, in one line, where it can not be used.
-        lone: kind of fault of one that belongs to no image; None: it is not told of.
-        told: whether an image without one is told of.
-        pixels: whether it has a value for each pixel of its image; '' or what else to do.
-        remembered: how many are, of stamps whose image has not come.
+        lone: kind of fault of one that belongs to no image; None: it is not reported.
+        told: whether an image without one is reported.
+        pixels: remedy, maybe '', where its size is not that of its image; None: it has no pixels.
+        remembered: maximum number kept of stamps whose image has not come.
         largest: size of the largest message that is taken, bytes.
         reliable: whether none may be lost on its way.
         together: whether those of images that were left out stay, to be used with the next.
@@ -137,7 +137,7 @@ INPUTS = (MASK_INPUT, KEYPOINTS_INPUT, KEYPOINTS_3D_INPUT, DEPTH_INPUT, PREDICTI
 class StampedInputs(Generic[T]):
     """Inputs that belong to the image of exactly their stamp; of several the last counts.
 
-    None stands for an input that says nothing, as of a detector that saw nobody.
+    None stands for an input without content, as of a detector that saw nobody.
     """
 
     def __init__(self, most: int = REMEMBERED) -> None:
@@ -179,11 +179,11 @@ class StampedInputs(Generic[T]):
 
 
 class Taken(NamedTuple):
-    """What has come for an image.
+    """An input for an image.
 
     Attributes:
-        content: of its stamp; None: nothing, or what says nothing.
-        answered: whether anything has come.
+        content: of its stamp; None: no message, or one without content.
+        answered: whether a message has come.
     """
 
     content: Any
@@ -191,7 +191,7 @@ class Taken(NamedTuple):
 
 
 class ImageInputs:
-    """What has come for the images of a session."""
+    """Inputs that have come for the images of a session."""
 
     def __init__(self, rows: Iterable[ImageInput], log: HandlingLog) -> None:
         self._log = log
@@ -201,7 +201,7 @@ class ImageInputs:
         }
 
     def __getitem__(self, name: str) -> StampedInputs[Any]:
-        """Those of an input that wait."""
+        """The messages of an input that wait."""
         return self._waiting[name]
 
     def row(self, source: str) -> ImageInput | None:
@@ -222,7 +222,7 @@ class ImageInputs:
         self._waiting[row.name].put(stamp_ns, content)
 
     def take(self, row: ImageInput, stamp_ns: int, image: Image, dropped: Container[int]) -> Taken:
-        """What has come for an image; tells of what is missing, and of what belongs to none.
+        """The input for an image; reports a missing one, and those that belong to no image.
 
         Args:
             image: (H, W, 3).
@@ -253,6 +253,6 @@ class ImageInputs:
         return Taken(None, answered)
 
     def clear(self) -> None:
-        """Drops all that has come."""
+        """Drops all inputs that have come."""
         for waiting in self._waiting.values():
             waiting.clear()

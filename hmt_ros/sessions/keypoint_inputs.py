@@ -1,11 +1,11 @@
-"""Keypoints of the person who is tracked, from messages of any detector, and what they wait with.
+"""Keypoints of the person who is tracked, from messages of any detector.
 
-The parameter `source` says what the messages are: hmt_msgs/Keypoints2D of one person, or those of
+The parameter `source` gives the kind of messages: hmt_msgs/Keypoints2D of one person, or those of
 other detectors, of one person or of several:
 
 - Skeleton2D is in units of the image: it needs a camera_info before. Its topic belongs to one
   person already. Float32MultiArray without a stamp has that of the newest camera_info.
-- Of several people one is chosen: by `person_id`, or the largest at first, and then the one who is
+- One of several people is chosen: by `person_id`, or the largest at first, and then the one who is
   nearest to the last place.
 
 Keypoints without names say that nobody was seen. Positions in space join the keypoints of their
@@ -43,7 +43,7 @@ from msg_tools.messages.keypoints import Positions, keypoints_of
 LONGEST_ABSENCE = 1.0
 # A person moves less between two images, in sizes of the person.
 _FARTHEST = 1.0
-# What remains from image to image of the size of a person of whom less is seen now.
+# Factor per image on the size of a person of whom less is seen now.
 _SIZE_KEPT = 0.95
 # Sets of unknown names that are warned of, each once; a detector has one.
 _MOST_WARNINGS = 20
@@ -207,7 +207,7 @@ class KeypointReader:
         return known[np.flatnonzero(known.seen)] if known.names else None
 
     def forget(self) -> None:
-        """Whom the messages were about is chosen anew."""
+        """Forgets the chosen person; the next one is chosen anew."""
         self._chosen.forget()
 
     def _report(self, unknown: list[str], scheme: str) -> None:

@@ -3,12 +3,12 @@
 The rules, besides those of `TrackingSession`:
 
 - An image waits for its detections (`image_inputs`).
-- Somebody to whom the detector gives an identity keeps it. Others are told apart by where they were
+- Identities of the detector are kept. People without one are told apart by where they were
   last and how they moved (`hmt_ros.tracking.association`).
-- A detection of nobody who is followed starts a filter, the largest first, up to `max_people`. Whom
-  no track has, or who is no longer in view (`Tracker.status`), is not followed any more.
-- The nearest person is tracked first. To everybody the pixels of those who are nearer are unknown,
-  and the pixels that only somebody farther away covers (`Tracker.step`, others).
+- A detection that matches nobody who is followed starts a filter, the largest first, up to
+  `max_people`. A person without a track, or no longer in view (`Tracker.status`), is dropped.
+- The nearest person is tracked first. For each person the pixels of nearer people are unknown, and
+  the pixels that only somebody farther away covers (`Tracker.step`, others).
 - The background is learned while nobody is detected, or read from `background_file`.
 - With every image whose detections are known a list of the people who are tracked goes out.
 """
@@ -65,7 +65,7 @@ PEOPLE = 'people'
 
 
 def published_topic(topic: str) -> PublishedTopic:
-    """What is published on a topic of the node or of a person."""
+    """Type and durability of a topic of the node or of a person."""
     if topic in PeopleSession.TOPICS:
         return PeopleSession.TOPICS[topic]
     return TOPICS_OF_NODE[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
@@ -219,7 +219,7 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
     def _matched(
         self, found: Sequence[Found], stamp: int
     ) -> tuple[dict[_Person, Found], list[Found]]:
-        """What is found of everybody who is followed, and those whom nobody follows."""
+        """Detections of the people who are followed, by person, and the detections left over."""
         own: dict[_Person, Found] = {}
         left = list(found)
         for person in self._people:
@@ -246,7 +246,7 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         background: BackgroundModel,
         stamp: int,
     ) -> None:
-        """Follows the largest of those whom nobody follows; they move from `left` to `own`."""
+        """Follows the largest of the detections left over; they move from `left` to `own`."""
         p, size = self.parameters, (camera.width, camera.height)
         for one in sorted(left, key=lambda x: -x.sighting.size):
             corners = np.clip(np.rint(one.sighting.corners), 0, size).astype(int)

@@ -1,4 +1,4 @@
-"""What a robot acts on: where the person is at a time to come, and the space to keep out of.
+"""Outputs for robots: the pose of the person at a later time, and the space to keep out of.
 
 Both are made of the last image that showed the person. While no image does, because the track is
 lost, or no image comes, the space grows as fast as people move; only an image that says that nobody
@@ -53,7 +53,7 @@ class LastSeen:
 
     @cached_property
     def capsules(self) -> Capsules:
-        """That hold the person, in the frame that is published in."""
+        """Capsules that hold the person, in the frame that is published in."""
         held = keep_out_capsules(self.body, self.posterior, self.probability)
         if self.fixed is None:
             return held
@@ -65,7 +65,7 @@ class LastSeen:
 
 @dataclass(frozen=True)
 class _Told:
-    """What the newest image said; replaced as a whole, so that any thread may read it."""
+    """Result of the newest image; replaced as a whole, so that any thread may read it."""
 
     state: KeepOutState = KeepOutState.UNKNOWN
     stamp_ns: int = 0
@@ -86,7 +86,7 @@ class RobotOutputs:
         self._forecast_until = 0
 
     def forget(self) -> None:
-        """Time begins anew: what was seen tells nothing of it."""
+        """Forgets the images, as time begins anew."""
         self._told, self._forecast_until = _Told(), 0
 
     def tell(
@@ -98,7 +98,7 @@ class RobotOutputs:
         existence: float,
         seen: LastSeen | None = None,
     ) -> None:
-        """Takes what an image says.
+        """Takes the result of an image.
 
         Args:
             stamp_ns, frame_id: of the image; the frame is the one that is published in.
@@ -165,11 +165,11 @@ class RobotOutputs:
         )  # fmt: skip
 
     def due(self, rate: float, horizon: float) -> Iterable[int]:
-        """Times of which the newest image is the first to tell, by a horizon: a grid, ns.
+        """Times on a grid, ns, within the horizon of the newest image and of none before.
 
         Args:
             rate: times a second; 0: none.
-            horizon: how long after an image a time is that it tells of, s.
+            horizon: maximum time from an image to a forecast, s.
         """
         told = self._told
         if rate <= 0.0 or told.seen is None:

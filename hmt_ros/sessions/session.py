@@ -2,8 +2,8 @@
 
 The node and offline replay give their messages to one; the same messages in the same order give the
 same bytes. A message that is not younger than the one before is skipped, or starts the estimate
-anew with `reset_on_time_jump`. What can not be used is skipped. The first fault of each kind is
-logged; all are counted.
+anew with `reset_on_time_jump`. Messages that can not be used are skipped. The first fault of each
+kind is logged; all are counted.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ class SessionState(ABC):
 
     Attributes:
         status: in a word or two; see the sessions.
-        wants: what the next step waits for, '' while it works.
+        wants: input that the next step waits for, '' while it works.
         entropy: of the weights of the present mixture, nats; NaN where there is none.
         counts: number of the messages that are estimated from: 'received', and of these 'skipped',
-            'dropped' and what the session counts.
+            'dropped' and keys of the session.
         faults: number of faults by kind.
         last_fault: the newest; '' before the first.
-        held_up: what the last dropped message waited for; '' if it had only to wait its turn.
+        held_up: input that the last dropped message waited for; '' if only for its turn.
         frame_id: of the newest message that is estimated from; '' before the first.
     """
 
@@ -104,7 +104,7 @@ class SessionState(ABC):
 
 
 def kind_of(source: str) -> str:
-    """What a source has in common with others: 'mixture' of 'mixture of /humans/bodies/p1'."""
+    """Common name of similar sources: 'mixture' of 'mixture of /humans/bodies/p1'."""
     return source.partition(' of ')[0]
 
 
@@ -140,9 +140,9 @@ class Session(ABC, Generic[Parameters, State]):
         TOPICS: the topics that are published.
         COUNTED: source of the messages that are estimated from, or the kind of several sources, see
             `kind_of`.
-        UNIT: what one of them is called.
-        DONE: what those are called that were used; a key of `SessionState.counts`.
-        ESTIMATE: what starts anew when time jumps back.
+        UNIT: name of one of them.
+        DONE: name of those that were used; a key of `SessionState.counts`.
+        ESTIMATE: name of the estimate that starts anew when time jumps back.
         CHECKED: parameters whose values only a new session can check: names of files, say.
         parameters: a new value takes effect as `declared_parameters` says.
         interrupted: whether messages have come during an estimate; a node sets it.
@@ -181,10 +181,10 @@ class Session(ABC, Generic[Parameters, State]):
         self._set_up()
 
     def _set_up(self) -> None:
-        """Makes what a kind of session keeps; raises ValueError as the class says."""
+        """Makes the state of a kind of session; raises ValueError as the class does."""
 
     def prepare(self) -> None:
-        """Compiles, or loads, what the messages will need; nothing is estimated or published.
+        """Compiles, or loads, the code for messages; nothing is estimated or published.
 
         It takes a second or, the first time after an update, a minute. To be called before the
         first message.
@@ -201,7 +201,7 @@ class Session(ABC, Generic[Parameters, State]):
         Args:
             source: a source that the module of the session names.
             message: of the type of the source, from `rosbags` or ROS.
-            more: whether another message has come already; what can wait is left until then.
+            more: whether another message has come already; work that can wait is left until then.
         """
         self._log.begin()
         stamp = self._stamp_of(source, message)
@@ -214,7 +214,7 @@ class Session(ABC, Generic[Parameters, State]):
         return self._handled(source, stamp)
 
     def needed_inputs(self) -> list[NeededInput]:
-        """What has to come at present; may be called by any thread."""
+        """Inputs that are needed at present; may be called by any thread."""
         return [NeededInput((self.COUNTED,))]
 
     def restart(self) -> None:
@@ -224,12 +224,12 @@ class Session(ABC, Generic[Parameters, State]):
         self.state = self._present_state()
 
     def finish(self) -> Handled:
-        """Uses what waits for messages that do not come any more."""
+        """Uses messages that wait for others which do not come any more."""
         self._log.begin()
         return self._handled(FINISH, self._end())
 
     def _end(self) -> int:
-        """Uses what waits; the stamp of the newest message, ns, or 0."""
+        """Uses the messages that wait; returns the stamp of the newest message, ns, or 0."""
         return 0
 
     def refuse(self, source: str, text: str, *, more: bool = False) -> Handled:
@@ -265,7 +265,7 @@ class Session(ABC, Generic[Parameters, State]):
         """Handles a message; `take` reports on it."""
 
     def _use_what_has_come(self) -> None:
-        """Estimates from what `_take` has put aside."""
+        """Estimates from the messages that `_take` has put aside."""
 
     def _late(self, stamp_ns: int) -> str:
         """Why a message is dropped."""
@@ -292,7 +292,7 @@ class Session(ABC, Generic[Parameters, State]):
         return self._log.handled(source, stamp)
 
     def _totals(self) -> dict[str, Any]:
-        """What `SessionState` says over all messages."""
+        """Fields of `SessionState` over all messages."""
         log = self._log
         return {
             'entropy': entropy(self._weights),

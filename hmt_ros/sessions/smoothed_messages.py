@@ -56,12 +56,12 @@ class SmoothedBody:
 
 
 class OpenPose(NamedTuple):
-    """What is told of an image besides its poses.
+    """Content of a message on an image besides its poses.
 
     Attributes:
         state: of the track in the filter.
         existence: probability that a person is in view, in the filter; NaN: unknown.
-        shape: (d, d) covariance of what poses of all images err by alike; None: unknown.
+        shape: (d, d) covariance of the errors shared by poses of all images; None: unknown.
     """
 
     state: TrackState
@@ -77,7 +77,7 @@ def trajectory_content(
     Args:
         found: trajectories, with stamps.
         covariances: whether they are part of the message.
-        shapes: (d, d) by stamp, added to covariances: what poses of all images err by alike.
+        shapes: (d, d) by stamp, added to covariances: of errors shared by poses of all images.
     """
     content = found.message_content() if covariances else _without_covariances(found)
     if covariances:
@@ -158,7 +158,7 @@ def poses_apart(
     """The poses of motions that are apart at index t, and the indices of their trajectories.
 
     Args:
-        shape: (d, d) added to covariances: what poses of all images err by alike; None: nothing.
+        shape: (d, d) added to covariances: of errors shared by poses of all images; None: 0.
     """
     points = body.relative_joints(found.means[:, t])
     weights, motions = led(found.weights, points, SAME_MOTION, components)
@@ -171,7 +171,7 @@ def poses_apart(
 def nobody_messages(
     of: SmoothedBody, stamp_ns: int, existence: float, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Any]]:
-    """Topics and messages of a time from which on nobody is in view.
+    """Topics and messages at a time after which nobody is in view.
 
     Args:
         of: person of the poses before.

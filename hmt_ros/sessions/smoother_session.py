@@ -18,7 +18,7 @@ The rules, besides those of `Session`:
   error model, as in bags of earlier versions, and a forecast, which is no evidence, are skipped.
 - The pose may be none of the modes of an image: each image has a wide component more
   (`or_missed`), and a motion passes over images that would turn it round and back.
-- What is not known of the person's shape is the same in all images. It is added once, to the
+- The uncertainty of the person's shape is the same in all images. It is added once, to the
   covariances that are published.
 - Angles that go round are taken from mixture to mixture without whole turns, each mode from the
   nearest one before: to the dynamics a turn more would be a jump.
@@ -318,7 +318,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         return smoother
 
     def _end_window(self) -> None:
-        """Publishes what is still open, and forgets the window."""
+        """Publishes the poses that are still open, and forgets the window."""
         if self._window is not None and self._of is not None:
             # A track may go on in another window.
             self._first_identity = self._window.next_identity
@@ -358,7 +358,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def smoothed_span(
         self, from_ns: int = 0, to_ns: int = 0
     ) -> tuple[TrajectoryMixture, SmoothedBody]:
-        """The trajectories of a span of time, and whose; see `smooth_span`."""
+        """The trajectories of a span of time, and their person; see `smooth_span`."""
         of, items = self.kept
         chosen = [
             item for item in items if from_ns <= item.stamp and (to_ns == 0 or item.stamp <= to_ns)
@@ -408,7 +408,7 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
 
 
 def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
-    """Those that are known, by stamp."""
+    """The covariances of shapes that are known, by stamp."""
     return {stamp: shape for stamp, shape in items if shape is not None}
 
 

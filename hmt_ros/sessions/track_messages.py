@@ -77,7 +77,7 @@ class Made(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TrackedImage:
-    """An image, the track in it, and how it is shown.
+    """An image, the track in it, and settings of its messages.
 
     Attributes:
         waiting: the image.
@@ -263,7 +263,7 @@ def _state(tracker: Tracker) -> TrackState:
 
 
 def _ground_state(track: TrackedImage) -> GroundState:
-    """What is known of gravity and of the floor, as a message holds it."""
+    """Gravity and floor, as a message holds them."""
     ground = track.tracker.ground
     return GroundState(
         track.waiting.stamp_ns,

@@ -1,4 +1,4 @@
-"""What becomes of a track, for the log: each change is told once, when it comes."""
+"""Changes of a track, for the log: each is reported once, when it comes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SAME_MOMENT_NS = SECOND_NS // 5
 
 
 class TrackCondition(NamedTuple):
-    """What is compared from image to image.
+    """State of a track that is compared from image to image.
 
     Attributes:
         status: of the tracker.
@@ -54,10 +54,10 @@ def report_change(
     initial: Subject | GaussianMixture | None,
     stamp_ns: int,
 ) -> None:
-    """Tells what has changed with an image.
+    """Reports the changes that came with an image.
 
     Args:
-        initial: what the track was given to start from.
+        initial: subject or mixture that the track starts from.
     """
     now = TrackCondition.of(tracker)
     if now.doubted and not before.doubted:

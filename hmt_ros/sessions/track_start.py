@@ -42,7 +42,7 @@ class TrackStart:
     box: Box | None = None
 
     def wants(self, sources: tuple[str, ...]) -> str:
-        """What has to come before the track starts.
+        """Inputs that have to come before the track starts, in words.
 
         Args:
             sources: that may start a track where nothing is given.
@@ -68,7 +68,7 @@ class TrackStart:
         """A tracker that waits for its first image.
 
         Args:
-            ground: what is known of gravity and of the floor; None: what the parameters tell.
+            ground: gravity and floor, as far as they are known; None: by the parameters.
             shared: background of several people, which somebody else learns; None: an own one.
 
         Raises:

@@ -1,9 +1,9 @@
-"""What sessions that track one person and several have in common: starts, transforms, answers.
+"""The common part of sessions that track one person or several: starts, transforms, answers.
 
 - With `gravity_frame` or `fixed_frame` an image waits for the transforms of its stamp, or for an
   image or a transform that is `input_timeout` younger, and never so long that it would be dropped.
-  Where they do not come, what was known of gravity before holds, and the camera is taken to go on
-  as before.
+  Where they do not come, the gravity known before holds, and the camera is taken to go on as
+  before.
 - A camera_info with another calibration, and ~/reset, start the tracks anew.
 """
 
@@ -27,12 +27,12 @@ State = TypeVar('State', bound=SessionState)
 
 
 class TrackingSession(CameraSession[Parameters, State]):
-    """Tracks whoever is before one camera; see `Session` for arguments and attributes.
+    """Tracks the people before one camera; see `Session` for arguments and attributes.
 
     Attributes:
-        start: what tracks start from.
+        start: of the tracks.
         frames: that transforms lead to from the camera.
-        answered: number of images of which a robot was told.
+        answered: number of images whose results went to the robot.
     """
 
     DONE = 'tracked'
@@ -52,7 +52,7 @@ class TrackingSession(CameraSession[Parameters, State]):
         """Drops the tracks; new ones start with the images that follow.
 
         Args:
-            start: what they start from; None: what the parameters name.
+            start: of the new tracks; None: by the parameters.
 
         Raises:
             ValueError: the parameters name a file that can not be used; the tracks go on.
@@ -62,15 +62,15 @@ class TrackingSession(CameraSession[Parameters, State]):
 
     @abstractmethod
     def stale(self, silence: float, answered: int) -> list[Output]:
-        """What a robot is told where no image is answered; may be called by any thread.
+        """Messages for a robot where no image is answered; may be called by any thread.
 
         Args:
             silence: time since the newest image was answered, s.
-            answered: the number of images that were; nothing is told where there are more by now.
+            answered: number of images that were answered; if it has risen, there are no messages.
         """
 
     def needed_inputs(self) -> list[NeededInput]:
-        """What has to come at present; may be called by any thread."""
+        """Inputs that are needed at present; may be called by any thread."""
         needed = super().needed_inputs()
         if self.frames.wanted and not self.frames.heard:
             needed.append(NeededInput(TRANSFORMS))
@@ -109,6 +109,6 @@ class TrackingSession(CameraSession[Parameters, State]):
         return super()._is_ready(waiting) and self._has_transforms(self.frames, waiting)
 
     def _look_at_frames(self, waiting: WaitingImage) -> None:
-        """Looks up what transforms tell of gravity and of the camera at an image."""
+        """Looks up gravity and the pose of the camera at an image in the transforms."""
         for kind, text in self.frames.look(waiting.frame_id, waiting.stamp_ns):
             self._log.note(kind, text)

@@ -1,4 +1,4 @@
-"""What sessions run once before the first message, so that no message waits for compiled code.
+"""The warm-up of sessions before the first message, so that no message waits for compiled code.
 
 numba compiles a kernel, or loads what was compiled, at its first call. A short film, and mixtures
 as if of one, run all of them; nothing stays of it but the code (`Session.prepare`).
@@ -31,7 +31,7 @@ class Film(NamedTuple):
     """Somebody of rods before a grey wall, and a camera that stands still.
 
     Attributes:
-        body, camera: who, by what.
+        body, camera: the person, and the camera that sees the person.
         empty: (H, W, 3) the wall.
         poses: (T, d).
         images, masks: T of (H, W, 3) and (H, W).
@@ -87,7 +87,7 @@ def warm_up_tracking() -> None:
 
 
 def likelihoods(body: Body) -> list[Any]:
-    """hmt_msgs/PoseMixture of two modes that move, as the filter says what images show."""
+    """hmt_msgs/PoseMixture of two modes that move, as likelihoods of the filter."""
     messages, made = RosbagsMessages(), []
     for t in range(IMAGES):
         means = np.stack([body.prior_mean + 0.01 * t, body.prior_mean - 0.05])

@@ -1,4 +1,4 @@
-"""What a smoother knows of the observations: -log p(r_t | x_t), its gradient and its curvature.
+"""Likelihoods of observations for a smoother: -log p(r_t | x_t), its gradient and its curvature.
 
 The mixtures that a filter made, `MixtureLikelihood`, or the images themselves, `ImageSequence`, or
 any other `EnergyTerm` whose rows are times (VMS 5).
@@ -256,15 +256,15 @@ class LikelihoodPart:
 def counted(
     mixture: GaussianMixture, share: float, of_changes: float | None = None
 ) -> GaussianMixture:
-    """The likelihood of an observation of which a share is told that is new.
+    """The likelihood of an observation of which only a share is new information.
 
         sum_k v_k N(m_k, S_k / b) / sum_k v_k,        v_k = w_k^a |S_k|^((1 - a) / 2)
 
-    Where errors last, each observation repeats a part of what those before have told, and counts
-    with the share a (`inference.error_model`): near each mode the density is the power a of
-    w_k N(m_k, S_k), and b = a. Between poses that move, what lasts of an error does no harm: with b
-    of changes (`CueErrors.of_changes`) they are followed as closely as observations tell, and the
-    covariances of the result are to be made b / a times as large (`SlidingWindow.step`).
+    Where errors last, each observation repeats a part of the information of those before, and
+    counts with the share a (`inference.error_model`): near each mode the density is the power a of
+    w_k N(m_k, S_k), and b = a. Between poses that move, a lasting error does no harm: with b of
+    changes (`CueErrors.of_changes`) motions follow the observations closely, and the covariances of
+    the result are to be made b / a times as large (`SlidingWindow.step`).
 
     Args:
         mixture: the whole evidence; modes without weight are left out.
@@ -287,9 +287,9 @@ def counted(
 def merged_modes(mixture: GaussianMixture, distance: float) -> GaussianMixture:
     """The likelihood of an observation with modes that are close as one, led by the highest.
 
-    Modes are weighed by their heights w_k / |2 pi S_k|^(1/2) while they are merged, and what was
-    merged is as high as they are together: how wide a mode is tells how far it is to be believed,
-    not how well it explains the observation.
+    Modes are weighed by their heights w_k / |2 pi S_k|^(1/2) while they are merged, and a merged
+    mode is as high as its parts together: the width of a mode is its uncertainty, no measure of how
+    well it explains the observation.
 
     Args:
         mixture: the whole evidence.
@@ -333,7 +333,7 @@ def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = Tru
         factorise: whether covariances are checked to be positive definite.
 
     Raises:
-        ValueError: what is wrong, and at which place.
+        ValueError: a mixture that can not be smoothed, with its place.
     """
     if len(mixtures) == 0:
         raise ValueError('no mixtures to smooth; wanted one for each time')

@@ -84,7 +84,7 @@ class ModeSequence:
 
     @cached_property
     def prior(self) -> TrajectoryPrior:
-        """Of the states; with `first`, all variables of the state count as observed."""
+        """Prior of the states; with `first`, all variables of the state count as observed."""
         if self.first is None:
             return self.dynamics.prior(self.intervals)
         prior = self.dynamics.prior(self.intervals, initial=False)

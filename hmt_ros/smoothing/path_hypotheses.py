@@ -1,4 +1,4 @@
-"""Which paths through the modes of a sequence are probable, each filtered in closed form.
+"""Probable paths through the modes of a sequence, each filtered in closed form.
 
 A path that goes on to mode k of the next image has the state and the weight
 
@@ -9,7 +9,7 @@ The network of VMS 4 weighs a path by pairs of neighbours (`embedded_network`), 
 nothing of what was before it: where most modes are wide, a path may turn round and back. In every
 image few paths are kept of all: some that are apart, and the heaviest.
 
-What a path was before, given all of it, follows backwards from its states (`smoothed_paths`):
+The states of a path, given all of it, follow backwards from the last one (`smoothed_paths`):
 
     x_t = m_t + G_t (x_{t+1} - A m_t),          G_t = S_t A' P_{t+1}^-1,  P_{t+1} = A S_t A' + Q
     C_t = S_t + G_t (C_{t+1} - P_{t+1}) G_t'    [Rauch, Tung and Striebel 1965]
@@ -60,7 +60,7 @@ class Passage:
     noise: Array
 
     def __getitem__(self, index: Index) -> Passage:
-        """That of some paths."""
+        """The passage from some of the paths."""
         return replace(
             self,
             means=self.means[index],
@@ -91,7 +91,7 @@ class PathHypotheses:
         return len(self.modes)
 
     def __getitem__(self, index: Index) -> PathHypotheses:
-        """Some of them, in the order of the index; weights are what they were."""
+        """Some of them, in the order of the index; weights are not normalised again."""
         return replace(
             self,
             log_weights=self.log_weights[index],
@@ -224,7 +224,7 @@ class FilteredPaths:
         self._forget_dead_ends()
 
     def advance(self) -> None:
-        """Takes the oldest time out; what was before the new one are the states of the paths."""
+        """Takes the oldest time out; the states of the paths stand for all times before."""
         del self.steps[0], self._gaps[0]
         first = self.steps[0]
         self.steps[0] = replace(
@@ -240,7 +240,7 @@ class FilteredPaths:
 
     @property
     def motions(self) -> Index:
-        """Of each path the heaviest one that is one motion with it, (H,); itself: it leads one."""
+        """Leader (H,) of each path, the heaviest path of the same motion; may be itself."""
         log = self.steps[-1].log_weights
         past = self._past
         if past is None:
@@ -254,7 +254,7 @@ class FilteredPaths:
         self._gaps.append(self._past)
 
     def _distances(self, poses: Array) -> Array | None:
-        """Distances (K, K) of poses (K, d), m; None: nothing tells how far they are apart."""
+        """Distances (K, K) of poses (K, d), m; None: there is no measure of distance."""
         return None if self.points is None else distances(self.points(poses))
 
     def _forget_dead_ends(self) -> None:
@@ -301,7 +301,7 @@ def traced(steps: Sequence[PathHypotheses]) -> Index:
 
 
 def first_state(mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> GaussianMixture:
-    """The density of the first state: its likelihood times what the dynamics know of it."""
+    """The density of the first state: its likelihood times the prior of the dynamics."""
     n, d = dynamics.state_dimension, dynamics.dimension
     precisions = np.zeros((len(mixture), n, n))
     precisions[:, :d, :d] = np.linalg.inv(mixture.covariances)

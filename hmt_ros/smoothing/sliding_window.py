@@ -1,9 +1,9 @@
 """Smoothing while observations arrive: a window of fixed lag.
 
-The window holds the newest poses, and the paths through their modes that are probable, which are
-filtered one by one (`path_hypotheses`). What came before it are the states of these paths at its
-first time: the window is smoothed with their density in the place of the first likelihood, so that
-a new image costs the same however long the sequence is. A pose is final before it is older than the
+The window holds the newest poses, and the probable paths through their modes, which are filtered
+one by one (`path_hypotheses`). The states of these paths at its first time stand for all images
+before: the window is smoothed with their density in the place of the first likelihood, so that a
+new image costs the same however long the sequence is. A pose is final before it is older than the
 newest one by more than the lag, and the time between two smoothings.
 """
 
@@ -61,7 +61,7 @@ class FinalPose:
 
 @dataclass(frozen=True, eq=False)
 class WindowUpdate:
-    """What a new observation changes.
+    """Result of a new observation.
 
     Attributes:
         trajectories: the mixture over the poses in the window; None: it was not smoothed.
@@ -222,10 +222,10 @@ class SlidingWindow:
         return replace(found, identities=self._identities(found))
 
     def _identities(self, found: TrajectoryMixture) -> tuple[int, ...]:
-        """Of the trajectories of a window: the heaviest first, each that of what it continues.
+        """Identities of trajectories, given heaviest first; each has that of its predecessor.
 
-        It continues the nearest trajectory of the window before that no heavier one continues, if
-        no point of it is farther from it than `SAME_MOTION`; else it is a new motion.
+        The predecessor is the nearest trajectory of the window before without a heavier successor,
+        if no point of it is farther away than `SAME_MOTION`; without one it is a new motion.
         """
         numbers = np.zeros(len(found), dtype=np.int64)
         away, before = self._distances(found)
@@ -242,7 +242,7 @@ class SlidingWindow:
     def _distances(self, found: TrajectoryMixture) -> tuple[Array, tuple[int, ...]]:
         """Distances (M, L) from the L trajectories found last, and their identities.
 
-        Of the point that is farthest away in the mean over the times that both windows have.
+        They are those of the point farthest away, in the mean over the times of both windows.
         """
         last = self._last
         common = 0 if last is None else len({*self._stamps} & {*(last.stamps_ns or ())})

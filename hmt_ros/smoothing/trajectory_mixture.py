@@ -1,4 +1,4 @@
-"""A mixture of Gaussians over trajectories: what smoothing returns (VMS 6).
+"""A mixture of Gaussians over trajectories, the result of smoothing (VMS 6).
 
     q(X) = sum_i a_i N(X; M_i, s_i^2 P_i^-1)
 
@@ -111,7 +111,7 @@ class TrajectoryMixture:
 
     @cached_property
     def _covariances(self) -> dict[int, Array]:
-        """Those that were asked for, by component."""
+        """The covariances that were asked for, by component."""
         return {}
 
     @cached_property
@@ -194,7 +194,7 @@ class TrajectoryMixture:
         return result
 
     def message_content(self) -> dict[str, Any]:
-        """What a message needs besides names and frame (`msg_tools.messages`).
+        """Content of a message besides names and frame (`msg_tools.messages`).
 
         Raises:
             ValueError: the stamps are not known.

@@ -1,11 +1,11 @@
-"""What is usual of one person in silhouettes and colours, and whether an image shows that.
+"""Usual appearance of one person, in silhouettes and colours, and whether an image shows it.
 
     place    share of the model that is foreground / usual share
     area     area of the largest piece of the foreground that has the shape of one person / usual
 
 Where the clothes have the colours of the room only a part of the model is foreground: the share is
-asked against what this track has seen so far. A person who has not been seen for a time t may have
-gone SPEED t further away; the usual area shrinks accordingly.
+compared with that of earlier images of the track. A person who has not been seen for a time t may
+have gone SPEED t further away; the usual area shrinks accordingly.
 
 The colours of a person, and whether an image shows them anywhere.
 
@@ -19,14 +19,13 @@ shows somebody in these colours, wherever that is, and about 0 in a room without
 the two are alike the colours say nothing, and where the colours of the image are not those of the
 images before: a covered lens, another light.
 
-That they are nowhere speaks against the person only where the scene is the one that they were
-learned in:
+Their absence is evidence against the person only in the scene that they were learned in:
 
     stillness = 1 - changed pixels beyond the model / (UNDECIDED pixels of the model), at least 0
 
-Else `elsewhere` is that of another scene: the camera has moved, and what has gone may be a thing
-that the model was on. Somebody who moves beyond the model changes as much. A colour that no image
-had may be the person's, who turns about.
+Else `elsewhere` is that of another scene: the camera has moved, and the colours that are gone may
+be those of a thing that the model was on. A person who moves beyond the model changes as much. A
+colour that no image had may belong to the person, who turns about.
 """
 
 from __future__ import annotations
@@ -92,7 +91,7 @@ class Colours:
         self._beyond: Mask | None = None
 
     def score(self, image: Image, *, unseen: float = 0.0) -> float | None:
-        """How far an image (h, w, 3) BGR shows the person's colours; None: nothing can be told.
+        """Score of the person's colours in an image (h, w, 3) BGR; None: undecided.
 
         Args:
             image: on the raster.
@@ -202,11 +201,11 @@ def beyond(model: Mask) -> Mask:
 
 
 class Silhouetted(NamedTuple):
-    """What a silhouette says of somebody's presence, from -1, nobody, to 1.
+    """Evidence of a silhouette for the presence of a person, from -1, nobody, to 1.
 
     Attributes:
-        by_place: by what is foreground on the model.
-        by_area: by the largest piece that has the shape of a person, anywhere.
+        by_place: from the share of the model that is foreground.
+        by_area: from the largest piece that has the shape of a person, anywhere.
         cut: whether a side of the image may cut that piece.
     """
 
@@ -216,7 +215,7 @@ class Silhouetted(NamedTuple):
 
     @property
     def evidence(self) -> float:
-        """By both: a wrong pose is no absent person."""
+        """The larger of both: a person in a wrong pose is not absent."""
         return max(self.by_place, self.by_area)
 
 
@@ -234,7 +233,7 @@ class Appearance:
         self._share, self._area = MOST, math.nan
         self._stamp = 0
         self._coloured: int | None = None
-        # Of the last image: foreground on the raster, and the piece of it that is a person.
+        # Foreground of the last image on the raster, and the piece of it that is a person.
         self._foreground: Mask | None = None
         self._piece: Piece | None = None
 
@@ -250,10 +249,10 @@ class Appearance:
         return 0.0 if self._model is None else seconds(stamp - self._stamp)
 
     def silhouetted(self, view: View, stamp: int) -> Silhouetted | None:
-        """What the silhouette of an image says; None: it has none, or most of it has changed.
+        """Evidence of an image's silhouette; None: it has none, or most of it has changed.
 
         Args:
-            view: what the image shows.
+            view: of the image.
             stamp: of the image, ns.
         """
         self._foreground, self._piece = None, None
@@ -280,10 +279,9 @@ class Appearance:
         )
 
     def colour_evidence(self, view: View) -> tuple[bool, float] | None:
-        """Whether the colours speak for somebody, and how much, from 0 to 1; None: not at all.
+        """Whether colours are evidence for somebody, and its weight from 0 to 1; None: neither.
 
-        Against somebody they may speak with nothing: the person is not where the colours were
-        learned, and the scene is another one.
+        Evidence against somebody has weight 0 in another scene than that of the last learning.
         """
         image = _coarse(view)
         score = self.colours.score(image)
@@ -300,7 +298,7 @@ class Appearance:
     def is_apart(self, view: View, stamp: int) -> bool:
         """Whether most keypoints lie beside the box around the model, where a person may have gone.
 
-        What is too far away in so short a time is a mistake of the detector, or somebody else.
+        Keypoints too far away for so short a time are an error of the detector, or another person.
         """
         keypoints = view.keypoints
         if keypoints is None or self._model is None or not keypoints.seen.any():

@@ -1,4 +1,4 @@
-"""Which of the people whom a detector sees in an image is which of those who are followed.
+"""Assignment of the people whom a detector sees in an image to the people who are tracked.
 
     cost(i, j) = median_k |u_ik + v_i dt - p_jk| / s_i        over the joints k that both have
 
@@ -8,8 +8,8 @@ in common the middles of their boxes count. A pair is possible below a cost that
 for which the person was not seen. The assignment has the least sum of costs, of which somebody
 without a detection costs as much as the worst possible pair.
 
-Of two people the nearer one hides the farther one. To the farther one all that the nearer one
-covers is unknown; to the nearer one only what the farther one covers beside it.
+The nearer of two people hides the farther one. For the farther one all pixels of the nearer one are
+unknown; for the nearer one only those that the farther one covers beside it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Sighting:
 
     @classmethod
     def of(cls, keypoints: Keypoints, corners: Array) -> Sighting:
-        """Of keypoints, maybe none, and a box."""
+        """A sighting from keypoints, maybe none, and a box."""
         seen = np.flatnonzero(keypoints.seen)
         return cls({keypoints.names[i]: keypoints.pixels[i] for i in seen}, corners)
 
@@ -85,7 +85,7 @@ class ImageTrack:
         sighting: the last one.
         stamp: of its image, ns.
         velocity: (2,) px/s.
-        size: of the person, px; what is hidden for a while does not make it smaller at once.
+        size: of the person, px; it does not shrink at once when a part is hidden for a while.
     """
 
     def __init__(self, sighting: Sighting, stamp: int) -> None:
@@ -123,7 +123,7 @@ class ImageTrack:
 def assigned(
     tracks: Sequence[ImageTrack], sightings: Sequence[Sighting], stamp: int
 ) -> dict[int, int]:
-    """Number of the sighting in an image that each track goes on with; those that have one."""
+    """Number of the sighting in an image by number of the track, for tracks that have one."""
     if not tracks or not sightings:
         return {}
     costs = np.array([[track.cost(each, stamp) for each in sightings] for track in tracks])
@@ -138,11 +138,11 @@ def assigned(
 
 
 def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) -> Mask | None:
-    """Pixels (H, W) that do not tell of a person; None: there are none.
+    """Pixels (H, W) without evidence about a person; None: there are none.
 
     Args:
         mine: (H, W) that the person covers.
-        nearer, farther: what those cover who are before and behind the person.
+        nearer, farther: areas of the people before and behind the person.
     """
     result = np.zeros_like(mine)
     for area in nearer:

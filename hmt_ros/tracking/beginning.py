@@ -1,4 +1,4 @@
-"""What a track begins from, and when.
+"""The start of a track: from which input, and at which image.
 
     subject      at the image that its joints were seen in
     mixture      at the next image
@@ -58,7 +58,7 @@ REVERSED = 24
 
 
 class Source(Enum):
-    """What a track began from."""
+    """The input that a track began from."""
 
     SUBJECT = 'the subject file'
     MIXTURE = 'a mixture'
@@ -75,10 +75,10 @@ FROM_JOINTS = (Source.SUBJECT, Source.KEYPOINTS)
 
 @dataclass(frozen=True, eq=False)
 class Beginning:
-    """What `MixtureFilter.begin` is given of a start; see there.
+    """A start, as `MixtureFilter.begin` takes it; see there.
 
     Attributes:
-        source: what it comes from.
+        source: the input that it comes from.
     """
 
     source: Source
@@ -98,7 +98,7 @@ def shows_a_start(view: View, body: Body, *, masked: bool) -> bool:
     """Whether an image shows somebody that a first track can start from, if somebody is there.
 
     Args:
-        view: what the image shows.
+        view: of the image.
         body: model of the person.
         masked: whether the silhouette is a segmenter's.
     """
@@ -108,14 +108,14 @@ def shows_a_start(view: View, body: Body, *, masked: bool) -> bool:
 
 
 class Starts:
-    """Decides at which image a track starts, and what it begins from.
+    """Decides at which image a track starts, and from which input.
 
     Args:
         model: of a person; a subject's lengths replace the model's.
         camera: that sees the person.
 
     Attributes:
-        given: what the track starts from; None: what the images show.
+        given: subject or mixture that the track starts from; None: the images start it.
         box: (left, top, right, bottom) of the person in the next image, px; None: unknown.
     """
 
@@ -136,13 +136,13 @@ class Starts:
         masked: bool,
         somebody: bool,
     ) -> Beginning | None:
-        """What a track begins from at an image; None: it does not start there.
+        """The start of the track at an image; None: it does not start there.
 
         Args:
-            view: what the image shows.
+            view: of the image.
             stamp: of the image, ns.
             body: that the poses of a mixture are of.
-            upright: what is known of gravity.
+            upright: gravity; None: unknown.
             prediction: by the image, if any.
             observed: makes the observation of the image.
             masked: whether the silhouette is a segmenter's.
@@ -167,14 +167,14 @@ def beginning_given(
     start: Subject | GaussianMixture, model: Body, body: Body, camera: Camera,
     upright: Gravity | None, depths: ImageMap | None = None,
 ) -> Beginning:  # fmt: skip
-    """The body and the poses that a track begins with, of a start that was given.
+    """The body and the poses that a track begins with, from a given start.
 
     Args:
-        start: what it starts from.
+        start: subject or mixture that it starts from.
         model: body that a subject's lengths replace those of.
         body: that the poses of a mixture are of.
         camera: that sees the person.
-        upright: what is known of gravity.
+        upright: gravity; None: unknown.
         depths: of the image that a subject's joints were seen in; None: unknown.
     """
     if isinstance(start, GaussianMixture):
@@ -192,13 +192,13 @@ def beginning_seen(
     box: Box | None,
     observed: Callable[[], Observation],
 ) -> Beginning | None:
-    """The body and the poses that a track begins with, of what an image shows.
+    """The body and the poses that a track begins with, from an image.
 
     Args:
-        view: what the image shows.
+        view: of the image.
         model: body whose lengths are fitted to keypoints.
         camera: that sees the person.
-        upright: what is known of gravity.
+        upright: gravity; None: unknown.
         prediction: by the image, if any.
         box: in which the person is, if one was given.
         observed: makes the observation of the image.
@@ -236,7 +236,7 @@ def beginning_seen(
 
 
 def lifted_poses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
-    """Poses (N, d) of a person by what experts say of the depths of keypoints, if anything."""
+    """Poses (N, d) of a person from the depths of keypoints by experts, if there are any."""
     lifted = keypoints.lifted
     if lifted is None or not lifted.are_whole:
         return np.empty((0, body.dimension))
@@ -262,7 +262,7 @@ def poses_to_search(
     prediction: PosePrediction | None,
     upright: Gravity | None,
 ) -> Array | None:
-    """Poses (N, d) that a person may have by an image alone; None: it shows none.
+    """Poses (N, d) of a person from an image alone; None: it shows none.
 
     The body keeps its lengths and flesh. From keypoints come all poses that explain them, from
     a silhouette mean poses of several headings at its place, and what was predicted.

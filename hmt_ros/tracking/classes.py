@@ -1,4 +1,4 @@
-"""Which way the person faces: a two-state chain, whose evidence lasts as long as the track.
+"""Facing direction of the person: a two-state chain, whose evidence lasts as long as the track.
 
     S_t- = max(logit [exp(Q dt)] p_(t-1), max min(log t(x_k, x_j), log h(x_k, x_j))),
                                                                    j as the track faces, k not  (1)
@@ -7,14 +7,14 @@
 
 A camera hardly tells a pose from its reversal in depth (`body.mirror`), and a wrong one does not
 come right by small steps. S = logit p are the log odds that the person faces the other way than the
-heaviest mode, Q the rate of the symmetry `reversal` (`body.body`), e_k what an image says
-against mode k. Nobody turns about from one image to the next: a hypothesis that faces the other way
-is another history of the track, and weighs what all images so far say of that history, whether a
-mode was kept of it or not. Seen from the side the two histories meet (1): t is the transition of
-the joints (`weighting`), h that of the heading, which wanders at the rate of the body. The best
-motion of either way stands for it (2), as the number of its modes says nothing; one that was not
-followed is no evidence, as nothing held it. An image speaks of the way to face with the probability
-v, or of something else, as a flash does or a covered lens (3): no single one turns a track about.
+heaviest mode, Q the rate of the symmetry `reversal` (`body.body`), e_k the energy of an image at
+mode k. Nobody turns about from one image to the next: a hypothesis that faces the other way is
+another history of the track, weighed with the evidence of all images so far for that history,
+whether a mode was kept of it or not. Seen from the side the two histories meet (1): t is the
+transition of the joints (`weighting`), h that of the heading, which wanders at the rate of the
+body. The best motion of either way stands for it (2), as the number of its modes is no evidence,
+nor is a motion that was not followed. An image shows the facing direction with the probability v,
+or something else, as a flash does or a covered lens (3): none turns a track about alone.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import faces_back, left_directions, root_rotation_dofs
 from hmt_ros.inference.arrays import Array, Mask
 
-# Probability v that what an image says of the way to face is about the person.
+# Probability v that the evidence of an image for a facing direction is about the person.
 VALID = 0.9
 # Largest log odds that are counted, nats: those against a way that a start does not contain.
 MOST = 10.0
 
 
 class Facing:
-    """Which way the person of one track faces.
+    """Facing direction of the person of one track.
 
     Attributes:
         log_odds: S, that the person faces the other way than the mode that leads, the heaviest.
@@ -65,14 +65,14 @@ class Facing:
         return bool(log_weights[back].max() > log_weights[~back].max() + MOST)
 
     def lead(self, body: Body, poses: Array) -> None:
-        """The first of the modes, poses (K, d), says from now on how the track faces."""
+        """Makes the first of the modes, poses (K, d), the reference for the facing direction."""
         before = self._lead
         if before is not None and body.trunk_pairs and faces_back(body, poses[:1], before)[0]:
             self.log_odds = -self.log_odds
         self.carry(body, poses)
 
     def carry(self, body: Body, poses: Array) -> None:
-        """The same modes, (K, d), are seen by a camera that has moved."""
+        """Takes in the same modes, (K, d), in the frame of a camera that has moved."""
         self._lead = poses[0]
         if body.trunk_pairs:
             self.back = faces_back(body, poses, self._lead)
@@ -94,9 +94,9 @@ class Facing:
             body: of the poses.
             poses: (N, d).
             transitions: (K, N) log t(x_n, x_k) from the modes.
-            log_weights: (N,) that only the ratios within a way are taken of.
-            evidence: (N,) what the image says against each, nats.
-            followed: (N,) which have moved on from a mode.
+            log_weights: (N,); only their ratios within a way are used.
+            evidence: (N,) energies of the image, nats.
+            followed: (N,) whether each has moved on from a mode.
             dt: time since the image before, s.
             predicted: (K, d) poses that the modes are moved to.
         """
@@ -137,6 +137,6 @@ def log_turns(body: Body, first: Array, last: Array, dt: float) -> Array:
 
 
 def believed(evidence: float) -> float:
-    """What evidence for a way to face counts where an image may speak of something else, (3)."""
+    """Evidence for a facing direction, bounded as an image may show something else, (3)."""
     valid, other = np.log(VALID), np.log1p(-VALID)
     return float(np.logaddexp(valid + evidence, other) - np.logaddexp(valid, other + evidence))

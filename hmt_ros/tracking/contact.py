@@ -1,4 +1,4 @@
-"""Which feet rest: a hidden Markov chain for every point of the soles of every mode.
+"""Contact of the feet: a hidden Markov chain for every point of the soles of every mode.
 
     prior      P = s + (c_(t-1) - s) exp(-(enter + leave) dt),    s = enter / (enter + leave)
     height     log N(h; 0, s_h) - log(1 / LIFT)
@@ -59,7 +59,7 @@ class FootContacts:
             plane: gravity and floor.
             modes: whose ancestors are the modes that were taken in before.
             dt: time since then, s.
-            still: whether the motion of the camera is known; if not, that of a foot says nothing.
+            still: whether the motion of the camera is known; if not, that of a foot is no evidence.
         """
         points = sole_points(body, modes.poses)
         before = self._probabilities[modes.ancestors]

@@ -1,14 +1,14 @@
-"""What the evaluations of one image are spent on: a count, so that results do not depend on speed.
+"""Allocation of the evaluations of one image: a count, so that results do not depend on speed.
 
     budget B    predictions descend    limbs and trunks are rated    candidates descend
     share       about B / 8            at most 2 B / 3                about B / 5
 
-Of what is rated, 2 B / 5 are left where limbs are searched for, too.
+Where limbs are searched for as well, at most 2 B / 5 are rated.
 
-What is left goes to what is made of the modes: covariances, shape, the likelihood alone. Settings
-bound each part; a budget below them takes from all parts. An image that moves the heaviest mode
-far from where the motion prior has it, as where people move fast, gets more. How far is usual grows
-with what the image tells, so with the time between two images:
+The rest goes to covariances and shape of the modes and to the likelihood alone. Settings bound each
+part; a budget below them takes from all parts. An image that moves the heaviest mode far from where
+the motion prior has it, as where people move fast, gets more. The usual distance grows with the
+information in the image, so with the time between two images:
 
     m' P m  >  `SURPRISING` E m' P m  =  `SURPRISING` tr(I - P H^-1)
 
@@ -38,7 +38,7 @@ LEAST_SEARCHED = 100
 
 
 def is_surprising(moved: Array, precision: Array, hessian: Array) -> bool:
-    """Whether an image has moved a mode far for what it tells of it; never if that is nothing.
+    """Whether an image has moved a mode far for its information; never where it has none.
 
     Args:
         moved: (d,) from the prediction of the mode to its optimum.
@@ -51,7 +51,7 @@ def is_surprising(moved: Array, precision: Array, hessian: Array) -> bool:
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """How an image is searched.
+    """Sizes of the search in an image.
 
     Attributes:
         hypotheses: maximum number of modes that are kept, K.

@@ -14,18 +14,18 @@ nobody by cue g, and a_g the share that is left to it because its errors last (`
     silhouette   m = max(share of the model on it / usual share, area of its largest piece that has
                  the shape of a person / usual area), asked in the whole image
     detector     sum of the confidences of the keypoints
-    predictor    whether it expects somebody; that it does, only where there is no silhouette
+    predictor    whether it expects somebody; a yes counts only where there is no silhouette
     colours      whether the person's are anywhere; only where nothing else shows somebody, and
                  against somebody only where the scene is the one they were learned in
 
 Before a track, keypoints count once for a picture: a detector that takes the foot of a table for a
 person does so in every image that shows the same. People move, if only a little.
 
-An image most of which has changed says nothing: a covered lens, a flash, noise. Nor do the colours
-of a track speak against somebody when the camera has moved: what is gone may be a thing that the
-track was on. Of a person whom others hide nothing speaks but the keypoints that are seen. So only
-an image that shows the place empty ends a track: without it r tends to b / (b + l), which is far
-above `ABSENT`.
+An image that has changed for the most part is no evidence: a covered lens, a flash, noise. The
+colours of a track are no evidence against somebody when the camera has moved: they may have been
+those of a thing. For a person whom others hide only the keypoints that are seen count. So only an
+image that shows the place empty ends a track: without it r tends to b / (b + l), which is far above
+`ABSENT`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ BLUR, CHANGED, MOVING, CONTRAST = 1.5, 10.0, 0.002, 4.0
 
 
 class Status(Enum):
-    """What the tracker is doing."""
+    """State of the tracker."""
 
     WAITING = 'waiting'  # for the subject's image, or for somebody
     TRACKING = 'tracking'
@@ -72,7 +72,7 @@ class Status(Enum):
 
 
 class Cue(NamedTuple):
-    """How much a cue says.
+    """Weight of a cue.
 
     Attributes:
         nats: largest log likelihood ratio of somebody against nobody.
@@ -148,18 +148,18 @@ class Existence:
         return self.probability < ABSENT and self.llr < 0.0
 
     def meet(self) -> None:
-        """Forgets what is usual of the person: another one may come."""
+        """Forgets the usual appearance of the person: another one may come."""
         self._appearance = Appearance()
 
     def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
-        """Learns what is usual from the last image, in which the person is at a pose (d,)."""
+        """Learns the appearance from the last image, in which the person is at a pose (d,)."""
         self._appearance.learn(view, stamp, body, camera, pose)
 
     def look(self, view: View, stamp: int, body: Body, *, waiting: bool = False) -> None:
         """Takes the next image.
 
         Args:
-            view: what it shows.
+            view: of the image.
             stamp: of the image, ns; later than the one before.
             body: of the person.
             waiting: whether a track has still to start.
@@ -189,10 +189,10 @@ class Existence:
     def _cues(
         self, view: View, stamp: int, body: Body
     ) -> tuple[dict[str, tuple[float, Cue]], bool, bool]:
-        """What cues say by name, from -1, nobody, to 1; also of the image.
+        """Values of the cues by name, from -1, nobody, to 1, and two facts about the image.
 
         Returns:
-            The cues that say something; whether the silhouette can be used, as far as there is
+            The cues that are evidence; whether the silhouette can be used, as far as there is
             one; whether somebody is shown where the model is not.
         """
         cues, apart = {}, False

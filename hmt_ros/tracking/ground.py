@@ -2,8 +2,8 @@
 
     h(p) = n . p + d        height of a point p over the floor, camera frame, m
 
-with n the unit vector against gravity and d the height of the camera. What is not known is
-estimated from the track; see `GroundEstimator`.
+with n the unit vector against gravity and d the height of the camera. Unknown values are estimated
+from the track; see `GroundEstimator`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ CONTRARY = np.radians(10.0)
 
 @dataclass(frozen=True)
 class KnownGround:
-    """What is known of the ground besides the images.
+    """Gravity and floor, as far as they are known without the images.
 
     Attributes:
         up: (3,) unit vector against gravity in the camera frame; None: unknown.
@@ -117,13 +117,13 @@ def unit_vector(up: ArrayLike) -> Array:
 
 
 class GroundEstimator:
-    """Estimates the ground from what is known of it, from the scene and from a track.
+    """Estimates the ground from prior knowledge, from the scene and from a track.
 
     The height of the floor follows the lowest sole: a person stands on the floor for most of the
-    time, and jumps at times, so it is a high quantile of the last seconds. The vertical is the one
-    that is given. Where none is, it is the one that the lines of the scene show
-    (`image.vertical_lines`), and where they show none, it is near that of the image, and near the
-    axis of a body that stands, from the middle of the feet to the centre of mass. Errors of that
+    time, and jumps at times, so it is a high quantile of the last seconds. The vertical is the
+    given one. Without one it comes from the lines of the scene (`image.vertical_lines`); where they
+    show none, it is near the vertical of the image, and near the axis of a body that stands, from
+    the middle of the feet to the centre of mass. Errors of that
     axis last, so its images count as one per `AXIS_TIME`, and the deviation never goes below
     `AXIS_SIGMA`.
 
@@ -131,16 +131,16 @@ class GroundEstimator:
     vertical of the lines that jumps is believed when the next look shows it too.
 
     Args:
-        known: what is known; None: nothing.
+        known: gravity and floor without the images; None: unknown.
 
     Attributes:
-        known: what is known.
-        estimate: the present one.
+        known: gravity and floor without the images.
+        estimate: the present estimate.
         contradicted: whether the lines of the scene contradict the vertical that is given.
-        still: whether the motion of the camera is known, so that what rests has a known place in
-            its frame; set by who knows.
-        turning: whether a newer direction of gravity has told that the camera turns otherwise than
-            it was carried.
+        still: whether the motion of the camera is known, so that things at rest have known places
+            in its frame; set by the tracker.
+        turning: whether a newer direction of gravity contradicts the rotation of the camera that
+            was assumed.
     """
 
     def __init__(self, known: KnownGround | None = None) -> None:
@@ -150,7 +150,7 @@ class GroundEstimator:
         self.forget_scene()
 
     def forget_scene(self) -> None:
-        """Forgets what was estimated from images and from a track."""
+        """Forgets the estimates from images and from a track."""
         self._seen: Vertical | None = None
         self._newest: Array | None = None
         self._looked: int | None = None
@@ -158,7 +158,7 @@ class GroundEstimator:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets what was estimated from a track."""
+        """Forgets the estimates from a track."""
         self._mean, self._covariance = IMAGE_UP, np.eye(3) * UP_SIGMA**2
         self._levels: deque[tuple[float, float]] = deque()
         self._time = 0.0
@@ -166,7 +166,7 @@ class GroundEstimator:
         self._conclude()
 
     def carry(self, motion: CameraMotion) -> None:
-        """Takes what is known and estimated into the camera frame of the next image.
+        """Takes known and estimated values into the camera frame of the next image.
 
         A camera height that would not be positive any more is unknown from then on.
         """
@@ -313,7 +313,7 @@ class GroundEstimator:
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """What is known of gravity when a track starts; of the floor nothing is.
+    """Gravity as it is known when a track starts; the floor is unknown then.
 
     Attributes:
         plane: with the direction against gravity and its deviation; the height is not used.
@@ -340,8 +340,8 @@ class Gravity:
 def shortest_turn(start: Array, end: Array) -> Array:
     """The rotation (3, 3) by the least angle that takes a unit vector to another.
 
-    Of opposite ones, where no rotation is the shortest, that about the optical axis, as when the
-    camera hangs upside down; they lie in the plane of the image.
+    For opposite vectors in the plane of the image, where no rotation is the shortest, it is the one
+    about the optical axis, as when the camera hangs upside down.
     """
     cosine = float(start @ end)
     if cosine <= -1.0 + 1e-9:

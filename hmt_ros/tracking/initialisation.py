@@ -4,7 +4,7 @@
 
 u_j projects joint j of the pose x with the lengths l, which was seen at p_j; the norm is that of
 the keypoint's covariance. From several headings the pose is fitted together with the lengths, each
-length held by what was measured or by its spread over people, upright against gravity as far as
+length held by its measurement or by its spread over people, upright against gravity as far as
 that is known, and at the depths of a depth image, if there is one. The lengths are then fixed, the
 flips of all limbs that the image and the limits allow are enumerated and fitted again, and the best
 are the first mixture.
@@ -57,7 +57,7 @@ BOX_SIGMA = 0.15
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What a track starts from.
+    """Body and poses that a track starts from.
 
     Attributes:
         body: with the person's lengths.
@@ -86,9 +86,9 @@ def start_from_keypoints(
     Args:
         body: model of the person.
         camera: that the joints were seen by.
-        subject: joints, and what was measured of the person.
+        subject: joints, and measurements of the person.
         prior_weight: factor on the soft prior of the body.
-        upright: what is known of gravity; None: the root leans little against the camera's axes.
+        upright: gravity; None: unknown, and the root leans little against the camera's axes.
         depths: of the image that the joints were seen in; None: unknown. They are not used where
             they make a stature that people do not have, or do not show the surface of any pose.
 
@@ -238,13 +238,13 @@ def _poses_between(body: Body, camera: Camera, low: Array, high: Array) -> Array
 
 
 def _sized(body: Body, subject: Subject) -> Body:
-    """The body with what was measured on the person, and how well its lengths are known by that."""
+    """The body at the measured lengths of the person, with the uncertainty of its lengths."""
     if subject.stature is not None:
         body = body.with_stature(subject.stature)
     known = subject.segment_lengths
     names = body.skeleton.length_names
     if known:
-        # What was not measured scales with what was.
+        # Lengths without a measurement scale with the measured ones.
         factor = sum(known.values()) / sum(body.segment_lengths[x] for x in known)
         scaled = {x: body.segment_lengths[x] * factor for x in names if x not in known}
         body = body.with_segment_lengths({**scaled, **known})
@@ -258,7 +258,7 @@ def _sized(body: Body, subject: Subject) -> Body:
 
 
 def _is_a_stature(body: Body, lengths: Array) -> bool:
-    """Whether a person of a body's kind may have lengths (L,)."""
+    """Whether lengths (L,) make a stature that people have."""
     rates = body.stature_rates
     change = float(rates @ (lengths - body.skeleton.lengths))
     variance = float(rates @ body.length_covariance @ rates) + STATURE_MEASURED**2

@@ -1,17 +1,17 @@
 """The space that a robot keeps out of: capsules that hold the whole person over all modes.
 
-Each part of the flesh is a capsule. Of every mode it is as wide as the flesh, the error of the body
-model and what is not known of its place,
+Each part of the flesh is a capsule. In every mode its radius is the sum of the flesh, the error of
+the body model and the uncertainty of its place,
 
     r = r_flesh + MARGIN + q s,       q^2 the quantile `probability` of chi^2 with 3 dimensions
 
 s the deviation of its ends in the second direction in which they are known least; along the first,
 which is depth, it is repeated, side by side, over q times the deviation there. Modes are taken,
 heaviest first, until they weigh `probability` together. Capsules that others hold are left out.
-Whoever is lost may have moved since: all capsules are wider by `reach_after` the time since then.
+A lost person may have moved since: all capsules are wider by `reach_after` the time since then.
 
-What is promised is what `benchmarks/keep_out.py` measures on clips, and no more: people whom the
-tracker has lost without knowing, or who hold long things, are outside.
+The guarantee is the coverage that `benchmarks/keep_out.py` measures on clips, and no more: people
+whom the tracker has lost without knowing, and long things that people hold, are outside.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Capsules:
         return Capsules(self.starts[index], self.ends[index], self.radii[index])
 
     def depths(self, points: ArrayLike) -> Array:
-        """How deep points (P, 3) are inside of each capsule, (P, N) m; negative: outside."""
+        """Depth of points (P, 3) inside of each capsule, (P, N) m; negative: outside."""
         p = np.asarray(points, dtype=np.float64)[:, None]
         axes = self.ends - self.starts
         squares = np.maximum((axes * axes).sum(1), 1e-18)
@@ -72,7 +72,7 @@ class Capsules:
         return np.asarray(self.radii - np.linalg.norm(p - nearest, axis=2))
 
     def contain(self, points: ArrayLike) -> Mask:
-        """Which of points (P, 3) are in any of them, (P,)."""
+        """Whether each of points (P, 3) is in any capsule, (P,)."""
         return np.asarray((self.depths(points) >= 0.0).any(1))
 
     def volume(self, samples: int = 20_000, seed: int = 0) -> float:
@@ -84,7 +84,7 @@ class Capsules:
         return float(self.contain(points).mean() * np.prod(high - low))
 
     def without_held(self) -> Capsules:
-        """Those that are not inside of larger ones together, by a few points of their surface."""
+        """The capsules without those inside of larger ones together, by a few surface points."""
         order = np.argsort(-self._sizes, kind='stable')
         some = self[order]
         kept = _not_held(some.starts, some.ends, some.radii, some._surfaces())
@@ -119,7 +119,7 @@ class Capsules:
 
 
 def reach_after(time: float) -> float:
-    """How far any part of a person may be from where it was, m, after a time, s."""
+    """Maximum distance, m, that any part of a person moves in a time, s."""
     return min(FASTEST * time, ARM + RUNNER * time)
 
 
@@ -197,7 +197,7 @@ def _parts(body: Body) -> tuple[Index, Array, Array]:
 
 @njit(cache=True, nogil=True)
 def _not_held(starts, ends, radii, points):  # type: ignore[no-untyped-def]
-    """Which of N capsules, the largest first, have points (N, P, 3) outside of those before."""
+    """Whether each of N capsules, largest first, has points (N, P, 3) outside of those before."""
     n, count = points.shape[0], points.shape[1]
     outside = np.ones((n, count), np.bool_)
     left = np.full(n, count)

@@ -1,4 +1,4 @@
-"""What keypoints say of whether somebody is in view, and whether a track can start from them."""
+"""Evidence of keypoints for a person in view, and whether a track can start from them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ LEAST_MAGNIFICATION = 22.0
 
 
 def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
-    """How far a detector sees somebody, from -1, nobody, to 1.
+    """Evidence of a detector for a person in view, from -1, nobody, to 1.
 
-    It is 1 where the confidences sum to as much as the fewest keypoints that are a person have, and
-    -1 below a third of that. Fewer joints are no person; they are no empty image, either. Nor is a
-    person of a few pixels.
+    It is 1 where the confidences sum to as much as those of the fewest keypoints that are a person,
+    and -1 below a third of that. Fewer joints, and a person of a few pixels, are no evidence of a
+    person, nor of an empty image.
     """
     seen = keypoints.confidences[keypoints.seen]
     most = 0.0
@@ -36,7 +36,7 @@ def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
 
 
 def suffices(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints tell at once where a person is and which way the person faces.
+    """Whether keypoints of one image fix place and facing direction of a person.
 
     They do with all joints of the trunk but one.
     """
@@ -49,7 +49,7 @@ def suffices(keypoints: Keypoints | None, body: Body) -> bool:
 
 
 def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints are a person, and tell which way the person faces."""
+    """Whether keypoints are a person, and fix the facing direction."""
     if keypoints is None or keypoint_evidence(keypoints, body) <= 0.0:
         return False
     names = _confident(keypoints)

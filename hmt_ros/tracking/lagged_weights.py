@@ -1,15 +1,15 @@
-"""Weights of the modes of an image by what became of them in the L images after it.
+"""Weights of the modes of an image, smoothed over the L images after it.
 
     W_T(k) = w_k                                                        the newest image T  (1)
     W_t(j) = sum_k W_(t+1)(k) P(j | k)                                  T - L <= t < T      (2)
     P(j | k) = w_j p(x_k | x_j) / sum_l w_l p(x_k | x_l)
 
 This is the backward half of forward filtering, backward smoothing (Doucet, Godsill and Andrieu,
-"On sequential Monte Carlo sampling methods for Bayesian filtering", 2000). Whatever the image says
-of mode k, or the way that it faces (`classes`), is a factor of w_k alone: it cancels in P(j | k),
-the probability that the history of k went through j, and reaches image t by (1). So the lagged
-weights agree with the published ones, which are those of L = 0: they are what the sum over all
-histories of the modes gives. Where a mode stands for several hypotheses, P is their mean
+"On sequential Monte Carlo sampling methods for Bayesian filtering", 2000). The evidence of an image
+for mode k, or for the way that it faces (`classes`), is a factor of w_k alone: it cancels in
+P(j | k), the probability that the history of k went through j, and reaches image t by (1). So the
+lagged weights agree with the published ones, which are those of L = 0: they are the sum over all
+histories of the modes. Where a mode stands for several hypotheses, P is their mean
 (`weighting.pooled_origins`).
 """
 
@@ -23,7 +23,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 
 
 class Lagged(NamedTuple):
-    """What later images say of an image.
+    """The posterior of an image, with weights by later images.
 
     Attributes:
         stamp: of the image, ns.
@@ -46,7 +46,7 @@ class LaggedWeights:
         found += lagged.finish()
 
     Args:
-        lag: number of images, L; 0 gives back what was published.
+        lag: number of images, L; 0 gives back the published posteriors.
 
     Raises:
         ValueError: the lag is negative.
@@ -87,7 +87,7 @@ class LaggedWeights:
         return result
 
     def finish(self) -> list[Lagged]:
-        """The images that are left, with what is known of them: the last have fewer after them."""
+        """The images that are left; fewer than L images weigh these."""
         result, self._waiting = self._smoothed(), []
         return result
 

@@ -49,7 +49,7 @@ class Misfit(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Of all measurements together; 0 where there are none."""
+        """Share over all measurements together; 0 where there are none."""
         return float(self.shares @ self.counts / max(self.counts.sum(), 1.0))
 
 
@@ -62,17 +62,17 @@ def of_silhouette(
     costs: Array,
     points: SurfacePoints | None,
 ) -> dict[str, Misfit]:
-    """What modes leave of a silhouette and of its outline.
+    """Misfits of a silhouette and of its outline, given modes.
 
-    Nothing where there is none. An empty one only says that nobody is there, unless keypoints place
-    somebody.
+    There are none without a silhouette. An empty silhouette has no misfit of points, unless
+    keypoints place somebody.
 
     Args:
         body, camera, poses: the modes (K, d), heaviest first.
-        observation: whose outline is asked even where it is left out.
-        term: that samples of the outline cost poses by.
+        observation: of the image; its outline counts even where the likelihood leaves it out.
+        term: settings of the energies of the samples.
         costs: (K, M) of these samples in the likelihood.
-        points: that are seen of the modes, if they are known.
+        points: visible points of the modes, if they are known.
     """
     found: dict[str, Misfit] = {}
     foreground, beliefs = observation.foreground, observation.beliefs
@@ -92,8 +92,8 @@ def of_points(points: SurfacePoints, row: int, foreground: Mask) -> Misfit:
     """Visible points of a mode that are no foreground.
 
     Args:
-        points: that are seen of the modes.
-        row: of the mode that is believed.
+        points: visible points of the modes.
+        row: number of the chosen mode.
         foreground: (H, W).
     """
     n = int(points.counts[row])
@@ -109,8 +109,8 @@ def of_outline(costs: Array, term: TermSettings, belief: float) -> float:
     """Share of the samples of the silhouette's outline that the best mode does not explain.
 
     Args:
-        costs: (K, M) what each sample costs each mode.
-        term: that they cost it by: its weight, shared among the samples, and its kernel.
+        costs: (K, M) energies of the samples at the modes.
+        term: settings of these energies: the weight, shared among the samples, and the kernel.
         belief: factor on the weight.
     """
     if costs.size == 0:
@@ -123,12 +123,12 @@ def of_outline(costs: Array, term: TermSettings, belief: float) -> float:
 def outline_costs(
     body: Body, camera: Camera, poses: Array, foreground: Mask, term: TermSettings
 ) -> Array:
-    """What samples of the outline of a silhouette cost poses (K, d), (K, M).
+    """Energies (K, M) of samples of the outline of a silhouette at poses (K, d).
 
     Args:
         body, camera, poses: that it is compared with.
-        foreground: (H, W), of which the likelihood makes nothing.
-        term: that samples cost poses by.
+        foreground: (H, W), which the likelihood does not use.
+        term: settings of the energies.
     """
     if not foreground.any():
         return np.empty((len(poses), 0))
@@ -164,7 +164,7 @@ def of_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap) -> Arra
 
 
 def of_depth_at_best(body: Body, camera: Camera, pose: Array, depths: ImageMap) -> float:
-    """The same of one pose (d,), or of the pose moved to the depth that was measured.
+    """The same for one pose (d,), or for the pose moved to the measured depth.
 
     A track without depth is not at its distance.
     """

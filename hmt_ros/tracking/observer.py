@@ -1,9 +1,9 @@
-"""What a tracker takes from an image: a view of whoever is there, and what it says of the person.
+"""Inputs of a tracker from an image: a view of anybody who is there, and evidence on the person.
 
     view          silhouettes near the person and anywhere, keypoints     before a pose is known
     observation   evidence of every term of the likelihood that counts    near a pose
 
-A view is what existence and starts are decided by. The observation is made of it when it is known
+Existence and starts are decided from the view. The observation is made from it once it is known
 where the person is and whether the silhouettes of this track are believed.
 """
 
@@ -30,7 +30,7 @@ from hmt_ros.tracking.view import View
 
 
 class Observer:
-    """Takes from images what the terms of a likelihood need.
+    """Makes views and observations for the terms of a likelihood.
 
     Args:
         camera: that takes the images.
@@ -74,7 +74,7 @@ class Observer:
         others: Mask | None = None,
         depth: NDArray[np.floating] | None = None,
     ) -> View:
-        """What an image may show of a person.
+        """The view of a person in an image.
 
         Args:
             image: (H, W, 3) BGR uint8.
@@ -109,12 +109,12 @@ class Observer:
         return view._replace(silhouette=found.foreground, unsure=found.unsure)
 
     def observation(self, view: View, pose: Array | None, validity: Validity) -> Observation:
-        """What an image says of a person.
+        """The evidence of an image about a person.
 
         Args:
-            view: what it shows.
+            view: of the image.
             pose: (d,) that the person is about at; None: unknown.
-            validity: of the cues: what more likely is of something else is left out.
+            validity: of the cues; those that more likely show something else are left out.
         """
         likelihood = self._settings.likelihood
         weighed = [term for term in TERMS if getattr(likelihood, term.name).weight > 0]

@@ -19,7 +19,7 @@ from hmt_ros.tracking.weighting import Continuity
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What proposals and optima of one image are made from.
+    """Inputs of the proposals and optima of one image.
 
     Attributes:
         posterior: whose energy is minimised.
@@ -27,7 +27,7 @@ class Search:
         states: of the modes of the image before, predicted.
         precisions: (K, d, d) inverse covariances of their poses.
         continuity: with the modes of the image before.
-        plan: what the evaluations of the image are spent on.
+        plan: allocation of the evaluations of the image.
     """
 
     posterior: Posterior
@@ -56,6 +56,6 @@ class Search:
         return Optimised(hypotheses, solved)
 
     def evidence(self, optimised: Optimised) -> Array:
-        """What the image adds to minus the log weights (N,), nats."""
+        """Energies (N,) that the image adds to minus the log weights, nats."""
         exchanges = self.posterior.exchanges_of(optimised.hypotheses)
         return self.posterior.evidence(optimised.minima.x, self.observation, exchanges, self.dt)

@@ -1,4 +1,4 @@
-"""What a person covers in an image, and which pieces of a silhouette may be a person."""
+"""Area of a person in an image, and pieces of a silhouette that may be a person."""
 
 from __future__ import annotations
 

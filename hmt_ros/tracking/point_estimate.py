@@ -1,17 +1,17 @@
-"""One pose for those who want one: that of the motion which faces the likelier way.
+"""The point estimate: the pose of the motion which faces the likelier way.
 
     z = sum_k w_k x_k,    R = sum_k w_k R_k        over the modes that face as the motion does  (1)
     (x, v) ~ N(A (x, v), A P A' + Q)                                                            (2)
     (x, v) <- (x, v) + G (z - x),    G = P_.x (P_xx + R)^-1                                     (3)
 
 The modes of an image that face alike go on as one motion: a Gaussian over pose and velocity, moved
-by the dynamics of the tracker (2) and conditioned on what the image found (3). R_k are the
+by the dynamics of the tracker (2) and conditioned on the mean of the image's modes (3). R_k are the
 covariances of the modes, which believe only a share of an image, because errors last: how far the
-pose follows an image depends on what the image fixes, and on the time since the last one. What the
-modes disagree in is not in R: their weights know all images, not this one alone.
+pose follows an image depends on the information in the image, and on the time since the last one.
+Differences between the modes are not in R: their weights know all images, not this one alone.
 
 A mean over poses that face opposite ways is no pose. The motion keeps its way as long as the weight
-of the other one is within what a single image may say by mistake, and then turns at once.
+of the other one is within the error of a single image, and then turns at once.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class PointEstimate:
         self._covariance = propagated(whole[None], self._covariance[None])[0]
 
     def expect(self, body: Body, dynamics: LinearGaussianDynamics, dt: float) -> None:
-        """Shows where the motion goes in dt seconds after its last image, in which none is seen."""
+        """Predicts the pose dt seconds after the last image, without another image."""
         moved, _ = self._predicted(dynamics, dt)
         self.pose = np.clip(moved[: body.dimension], body.lower, body.upper)
 
@@ -126,7 +126,7 @@ def _moments(body: Body, posterior: GaussianMixture, leader: Array) -> tuple[Arr
 
 
 def _faces_as(body: Body, poses: Array, reference: Array) -> Mask:
-    """Which of poses (N, d) are turned by at most 90 degrees from a reference pose (d,)."""
+    """Whether poses (N, d) are turned by at most 90 degrees from a reference pose (d,)."""
     if not body.trunk_pairs:
         return np.ones(len(poses), dtype=np.bool_)
     left = left_directions(body, np.concatenate([reference[None], poses]))

@@ -4,17 +4,17 @@
            + E_ground(x) + E_extra(x)
 
 E_motion is a Gaussian around the expected pose.
-E_ground is what is known of gravity, floor and feet (`body.ground_terms`), E_extra are terms that
-the user of a tracker adds.
+E_ground are the terms of gravity, floor and feet (`body.ground_terms`), E_extra are terms that the
+user of a tracker adds.
 
-What a detector takes for what: exchange of left and right, in each mode from image to image.
+Exchange of left and right by the detector, in each mode from image to image:
 
     p(e_t | m) = sum_e' p(e_t | e') p(e' | ancestor of m),     p(e_t | e') = [exp(Q dt)]_e'e
     p(e_t | m, keypoints) ~ p(e_t | m) exp(-E_e(x_m))
 
 Q are the rates at which detectors begin and cease to exchange sides (`image.keypoint_schemes`). A
 person who is turned about and whose sides are exchanged looks the same to the keypoints as one who
-is not: what tells the two apart is that people turn slowly and detectors change their mind at once.
+is not: the two differ in that people turn slowly and detectors change their mind at once.
 """
 
 from __future__ import annotations
@@ -70,8 +70,7 @@ class SideExchanges:
 
         Args:
             ancestors: modes of the image before.
-            anew: (N,) hypotheses that say that the track was wrong: what it took the detector for
-                was wrong as well.
+            anew: (N,) hypotheses that the track was wrong: its exchanges were wrong as well.
         """
         usual = np.repeat(usual_exchanges(), len(ancestors), axis=0)
         if self.prior is None:
@@ -122,7 +121,7 @@ AT_LIMIT = 0.05
 
 @dataclass(frozen=True, eq=False)
 class ImageFit:
-    """How poses (K, d) explain an image, without regard to what was expected.
+    """Fit of poses (K, d) to an image, without the motion prior.
 
     Attributes:
         energy: with the priors of the body.
@@ -147,10 +146,10 @@ class Posterior:
     """Energies of poses of one body before one camera, and their minima.
 
     Args:
-        body, camera: who is seen by what.
+        body, camera: the person, and the camera that sees the person.
         settings: of the tracker.
         extra: further terms.
-        ground: gravity and floor; None: nothing is made of them.
+        ground: gravity and floor; None: not used.
 
     Attributes:
         evaluations: of the likelihood, so far.
@@ -177,12 +176,12 @@ class Posterior:
 
     @cached_property
     def likelihood(self) -> ImageLikelihood:
-        """Of images."""
+        """The likelihood of images."""
         s = self.settings
         return ImageLikelihood(self.body, self.camera, s.likelihood, threads=s.threads)
 
     def of_image(self, observation: Observation, exchanges: Array | None = None) -> PoseEnergy:
-        """The energy without what was expected; its evaluations are counted.
+        """The energy without the motion prior; its evaluations are counted.
 
         Args:
             observation: of the image.
@@ -198,7 +197,7 @@ class Posterior:
 
     @property
     def known(self) -> tuple[FrameTerm, ...]:
-        """What is known besides image and body: terms that were added, gravity and floor."""
+        """Terms besides those of image and body: those that were added, gravity and floor."""
         if self.ground is None:
             return self.extra
         plane = self.ground.plane
@@ -246,7 +245,7 @@ class Posterior:
         )  # fmt: skip
 
     def fit(self, poses: Array, observation: Observation, lifted_share: float = 1.0) -> ImageFit:
-        """How poses (K, d) explain an image; `lifted_share` as for `keypoint_term`."""
+        """Fit of poses (K, d) to an image; `lifted_share` as for `keypoint_term`."""
         seen = observation.keypoints
         share = 1.0 if seen is None or seen.lifted is None else lifted_share
         last = self._last_fit
@@ -273,10 +272,10 @@ class Posterior:
         return -energies
 
     def given_way(self, poses: Array, observation: Observation) -> tuple[Array, Array]:
-        """How poses (K, d) give way when something else changes, without what was expected.
+        """Response of poses (K, d) to other changes, without the motion prior.
 
         Returns:
-            Gradients (K, d) of the energy of the image and of what is known of the body, 0 for
+            Gradients (K, d) of the energy of the image and of the prior of the body, 0 for
             variables that rest on a limit, and inverse Hessians (K, d, d), in which they do not
             move.
         """
@@ -300,10 +299,10 @@ class Posterior:
     def evidence(
         self, poses: Array, observation: Observation, exchanges: Array, dt: float
     ) -> Array:
-        """What an image adds to minus the log weights of poses (N, d), (N,) nats.
+        """Energies (N,), nats, that an image adds to minus the log weights of poses (N, d).
 
-        What a detector takes for what is a chain (`SideExchanges`): its prior counts whole, the
-        energies by their share.
+        The exchange of sides is a chain (`SideExchanges`): its prior counts whole, the energies by
+        their share.
 
         Args:
             poses: (N, d).

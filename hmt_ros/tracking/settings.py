@@ -107,7 +107,7 @@ class TrackerSettings:
 
     @cached_property
     def plan(self) -> EvaluationPlan:
-        """What the evaluations of an image are spent on."""
+        """Allocation of the evaluations of an image."""
         return plan_of(self)
 
     @cached_property

@@ -6,13 +6,12 @@
     P = (P_0^-1 + A / (1 + c n))^-1,    theta = P b / (1 + c n)
 
 theta is the shape (see `body.shape`), x_k the pose of mode k, h and H are gradient and Gauss-Newton
-Hessian of the energy of one image over both. A pose gives way to a wrong shape: what is left of the
-information when it does is the Schur complement S. Of every image only the share tau is believed,
-as its errors are those of its neighbours, and of all images together no more than 1 / c of one
-(`inference.error_model`): clothes, and what else the model lacks, are the same in all of them, and
-would in the end outweigh what is known of people. What is not known of the shape
-is not known of the pose either: J P J' is added to the covariances of modes (a consider covariance,
-[Schmidt 1966]).
+Hessian of the energy of one image over both. A pose gives way to a wrong shape: the information
+left when it does is the Schur complement S. Every image counts with the share tau, as its errors
+are those of its neighbours, and all images together with no more than 1 / c of one
+(`inference.error_model`): clothes, and all else that the model lacks, are the same in all of them,
+and would in the end outweigh the prior over people. Uncertainty of the shape makes the pose
+uncertain: J P J' is added to the covariances of modes (a consider covariance, [Schmidt 1966]).
 """
 
 from __future__ import annotations
@@ -97,7 +96,7 @@ class ShapeEstimate:
 
     @property
     def deviations(self) -> dict[str, tuple[float, float]]:
-        """By the name of a variable: how far it is from the start, and its standard deviation."""
+        """Difference from the start and standard deviation, by the name of the variable."""
         sigma = np.sqrt(np.diagonal(self.covariance))
         rows = zip(self._space.names, self._offset, sigma, strict=True)
         return {name: (float(x), float(s)) for name, x, s in rows}
@@ -161,7 +160,7 @@ class ShapeEstimate:
         poses: Array,
         covariances: Array,
     ) -> Array:
-        """What the uncertain shape adds to the covariances of modes: J P J', (K, d, d).
+        """Covariance of modes due to the uncertain shape: J P J', (K, d, d).
 
         Arguments as for `update`.
         """
@@ -174,8 +173,8 @@ class ShapeEstimate:
     ) -> Linearised:
         """The energy of the contours and keypoints of an image around poses (N, d).
 
-        Of the last image it is kept: covariances and shape ask for the same modes, first all and
-        then the best.
+        The result for the last image is kept: covariances and shape ask for the same modes, first
+        all and then the best.
         """
         n = len(poses)
         if self._seen is observation and self._known is not None:

@@ -1,8 +1,8 @@
-"""Where the silhouette of an image comes from, and whether the background is to be trusted.
+"""Source of the silhouette of an image, and whether the background is to be trusted.
 
-A mask of a segmenter is taken as it is, else the background is subtracted. One that was learned
+A mask of a segmenter is taken as it is, else the background is subtracted. A background learned
 while the person stood in it is worse than none: the person is missing in the silhouettes, and where
-the person stood something is left behind. When a track starts, the pose is known, and
+the person stood a ghost is left. When a track starts, the pose is known, and
 
     f = |foreground and area of the body| / |area of the body|
 
@@ -46,7 +46,7 @@ class Silhouettes:
         shared: whether the background is that of other people, too: somebody else learns it.
 
     Attributes:
-        background: as it is known so far.
+        background: as far as it is known.
         share: f, the share of the person that was foreground when it was last asked; NaN: never.
         watch: tells whether the camera has moved since the background was taken.
         doubted: whether the background was learned with the person in it, and is not known again.
@@ -63,7 +63,7 @@ class Silhouettes:
 
     @property
     def known(self) -> str:
-        """What is known of the background, in a few words."""
+        """State of the background, in a few words."""
         unknown = self.background.unknown
         if unknown is not None:
             return f'forgotten, {1 - unknown.mean():.0%} known again'
@@ -130,7 +130,7 @@ class Silhouettes:
     def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
         """Doubts the background if too little of the person, in poses (K, d), is foreground.
 
-        One that was given and not learned is the empty scene: then nobody is there.
+        A background that was given, not learned, is the empty scene: then nobody is there.
         """
         if not self.background.frames or not self._learning:
             return

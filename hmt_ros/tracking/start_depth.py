@@ -1,11 +1,11 @@
-"""What a depth image tells a start: how far away joints are, whose pixels are known.
+"""Depths of joints from a depth image, for a start: the pixels of the joints are known.
 
 A joint lies behind the skin that its pixel shows, by about the radius of the flesh there:
 
     z_j = D(u_j) + r_j +- sigma_j,   sigma_j^2 = (r_j / 2)^2 + SIGMA^2
 
 D is a low quantile of the depths around the pixel, as limbs are thin and the background is behind
-them. What stands before the joint, or was measured beside it, is an outlier; kernels are robust.
+them. A thing before the joint, or a depth beside it, is an outlier; kernels are robust.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hmt_ros.inference.arrays import Array, Index
 
 # Pixels on every side of a joint's that are looked at, and the quantile of their depths.
 AROUND, QUANTILE = 2, 0.25
-# What joints are uncertain by besides their flesh, m.
+# Standard deviation of the depth of a joint besides its flesh, m.
 SIGMA = 0.03
 # Width of the Geman-McClure kernel, in standard deviations.
 SCALE = 4.0
@@ -45,7 +45,7 @@ def depths_of(depth: NDArray[np.floating] | None) -> ImageMap | None:
 
 @dataclass(frozen=True, eq=False)
 class JointDepths:
-    """Depths of some joints, as a depth image tells them.
+    """Depths of some joints from a depth image.
 
     Attributes:
         joints: (M,) of the skeleton.
@@ -79,7 +79,7 @@ def joint_depths(body: Body, keypoints: Keypoints, depths: ImageMap | None) -> J
 def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | None) -> Array:
     """Poses (N, d) moved along their rays to where the depth image shows their trunks.
 
-    A pose of which too little was measured stays where it is.
+    A pose with too few measurements stays where it is.
     """
     names = [name for pair in body.trunk_pairs for name in pair]
     if depths is None or not names:
@@ -105,7 +105,7 @@ def _depths_at(depths: ImageMap, pixels: Array) -> Array:
     values = depths.values[0]
     height, width = values.shape
     steps = np.arange(-AROUND, AROUND + 1)
-    # What is far outside, or behind the camera, stays outside.
+    # Pixels far outside, or behind the camera, stay outside.
     centres = np.clip(np.nan_to_num(pixels, nan=-1e6), -1e6, 1e6)
     columns, rows = (np.rint(centres) - [depths.left, depths.top]).astype(np.intp).T
     rows = (rows[:, None, None] + steps[:, None]).repeat(len(steps), axis=2)

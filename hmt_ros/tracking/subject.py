@@ -1,4 +1,4 @@
-"""Subject files: a person's joints in one image, and what is known of the person's size."""
+"""Subject files: a person's joints in one image, and measurements of the person's size."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ KEYS = ('stamp_ns', 'sigma_px', 'keypoints', 'segment_lengths_m', 'stature_m')
 
 
 class SubjectError(ValueError):
-    """A subject file that can not be used; one line that says what was seen and what was wanted."""
+    """A subject file that can not be used; one line with the content seen and wanted."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What starts a track.
+    """The content of a subject file, from which a track starts.
 
     Attributes:
         stamp_ns: of the image in which the joints were seen.

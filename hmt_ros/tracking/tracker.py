@@ -57,7 +57,7 @@ class Tracker:
     Args:
         body: model of the person; a subject's lengths replace the model's when a track starts.
         camera: calibrated.
-        settings: how.
+        settings: of the tracking.
         background: the empty scene; None, or a model that has learned nothing: learned from images
             before the track starts, and if there are none the silhouette is not used.
         seed: of all randomness. The same images, settings and seed give the same numbers.
@@ -66,7 +66,7 @@ class Tracker:
         shared_background: whether the background is that of several trackers; none learns it.
 
     Attributes:
-        silhouettes: where those of the images come from.
+        silhouettes: source of the silhouettes of the images.
         ground: the present estimate of gravity and of the floor.
         contacts: probabilities that the feet stand on the floor, by name.
         evaluations: of the likelihood in the last image.
@@ -76,7 +76,7 @@ class Tracker:
         shape_covariance: (d, d) of the errors that poses of all images share, because the lengths
             and the flesh of the person are not known exactly; that likelihood does not hold them.
         track_id: number of the present track, or of the last one; 0 before the first.
-        started_from: what that track began from; None before the first.
+        started_from: the input that this track began from; None before the first.
     """
 
     def __init__(
@@ -179,10 +179,10 @@ class Tracker:
             mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
                 all false: it sees nobody; None: unknown.
             nobody_predicted: whether that regression saw nobody in this image.
-            others: (H, W) pixels that somebody else covers or may cover: they speak neither for a
-                pose nor against it; None: there are none.
-            depth: (H, W) depth of what each pixel shows, along the axis of the camera, m; 0, NaN
-                and what is out of range says nothing. None: unknown.
+            others: (H, W) pixels that somebody else covers or may cover: no evidence for a
+                pose or against it; None: there are none.
+            depth: (H, W) depth at each pixel, along the axis of the camera, m; 0, NaN and values
+                out of range are no evidence. None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t), undiscounted (see
@@ -224,7 +224,7 @@ class Tracker:
 
     @property
     def status(self) -> Status:
-        """What the tracker is doing."""
+        """State of the tracker."""
         if self._nobody:
             return Status.NOBODY
         if not self._track.begun:
@@ -239,7 +239,7 @@ class Tracker:
 
     @property
     def body(self) -> Body:
-        """The person, with what has been estimated of lengths and flesh."""
+        """The person, with the present estimate of lengths and flesh."""
         return self._track.body
 
     @property
@@ -319,7 +319,7 @@ class Tracker:
 
     @property
     def point_estimate(self) -> Array:
-        """The pose (d,) of the likeliest motion, for those who want one; see `PointEstimate`.
+        """The pose (d,) of the likeliest motion; see `PointEstimate`.
 
         Raises:
             ValueError: there is no track.
@@ -376,7 +376,7 @@ class Tracker:
         return self.modes.mixture
 
     def _move_camera(self, stamp: int) -> None:
-        """Carries what is known into the camera frame of the next image; takes newer gravity."""
+        """Carries the estimates into the camera frame of the next image; takes newer gravity."""
         pose, self._camera_pose = self._camera_pose, None
         motion = self._camera_path.advance(stamp, pose)
         if motion is not None:
@@ -392,7 +392,7 @@ class Tracker:
             self.silhouettes.see_from(pose, self.camera)
 
     def _lifted(self, keypoints: Keypoints | None, stamp: int) -> Keypoints | None:
-        """Keypoints with what experts, and a detector that lifts, say of the whole pose."""
+        """Keypoints with the mixture over whole poses by experts, or by a detector that lifts."""
         if keypoints is None or not keypoints.seen.any():
             return keypoints
         opinions = []
@@ -408,7 +408,7 @@ class Tracker:
 
     @property
     def _gravity(self) -> Gravity | None:
-        """What a start knows of gravity; None: nothing, or nothing is made of it."""
+        """Gravity for a start; None: it is unknown, or not used."""
         weight, known = self.settings.ground.upright_weight, self._ground.vertical_known
         return Gravity(self._ground.plane, weight) if known and weight > 0 else None
 
@@ -476,7 +476,7 @@ class Tracker:
     def _start_track(
         self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
     ) -> Observation | None:
-        """Starts a track, if it starts at this image; returns what it was started with."""
+        """Starts a track, if it starts at this image; returns the observation it started with."""
         # Before the first track a background may still be learned: its silhouettes are no start.
         known = masked or self._nobody
         self._existence.look(
@@ -559,5 +559,5 @@ class Tracker:
         return poses_to_search(self.body, self.camera, observation, prediction, self._gravity)
 
     def _observe(self, view: View, pose: Array | None) -> Observation:
-        """What an image says of a person who is about at a pose (d,), if it is known."""
+        """The evidence of an image about a person near a pose (d,), if the pose is known."""
         return self._observer.observation(view, pose, self.validity)

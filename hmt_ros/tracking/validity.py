@@ -1,4 +1,4 @@
-"""Which cues of the images are about the person, and whether the track is: two-state chains.
+"""Whether cues of the images, and the track, are about the person: two-state chains.
 
     P <- [exp(Q dt)] x ... x [exp(Q dt)] P          the track and each cue fail, and come back   (1)
     e_g = E_outlier - E_inlier = N (u - m_g)        m_g: share of cue g that is not explained    (2)
@@ -6,11 +6,11 @@
 
 P is the joint probability of v = (v_0, v_1, ..), 1 where a mode of the track is about where the
 person is (v_0) and where cue g shows the person (v_g); a(dt) = tanh(dt / (2 tau)) is the share that
-is left to an image because misfits last (`error_model`). What is not explained is put down to the
-cue or to the track, whichever of the two is less likely with all that the others say: (3) is exact,
-and summed over v_g it is minus the energy -log(p exp(-E_inlier) + (1 - p) exp(-E_outlier)).
-e_0 is what the outline of the silhouette says of the track, whether the silhouette is whole or not:
-clothes in the colours of the room leave holes in it, and the rest of it is where the person is.
+is left to an image because misfits last (`error_model`). A misfit is put down to the cue or to the
+track, whichever of the two is less likely given all other cues: (3) is exact, and summed over v_g
+it is minus the energy -log(p exp(-E_inlier) + (1 - p) exp(-E_outlier)). e_0 is the evidence of the
+outline of the silhouette for the track, whether the silhouette is whole or not: clothes in the
+colours of the room leave holes in it, and the rest of it is where the person is.
 
 A part of the body may be misplaced in a mode of a track that is right, and cover anything: the e_g
 of parts is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way.
@@ -23,13 +23,13 @@ stands for the states without the silhouette:
 A pose that was moved to fit a cue is no evidence for that cue. t is how well the pose went on from
 the image before (`weighting`) when the two parted.
 
-Depths, whose misfit is that of a pose moved to where they place it, say nothing of the track: they
+Depths, whose misfit is that of a pose moved to where they place it, do not test the track: they
 have a chain of their own, which takes in log(P(v_0) exp(e_g) + 1 - P(v_0)).
 
 In an image each cue counts with the energy p_g E_g, to which the energy above is equal in first
 order around E_outlier, with the p_g of (1), before the image: weights and optima hold the same sum.
-What more likely is of something else as a whole is left out: a silhouette, depths, a detection. The
-p_g of groups of keypoints are those of a detector that sees the person.
+A cue that as a whole more likely shows something else is left out: a silhouette, depths, a
+detection. The p_g of groups of keypoints are those of a detector that sees the person.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ FAILS, RECOVERS = 0.05, 1.0
 USUAL = RECOVERS / (FAILS + RECOVERS)
 # The same of a detector as a whole, which sees somebody else, 1/s.
 DETECTOR_FAILS = 0.02
-# What a cue says that is wholly explained or not at all, N u and N (1 - u), nats in all, and how
-# many of its measurements say so much: neighbours err together.
+# Evidence of a cue that is wholly explained or not at all, N u and N (1 - u), nats in all, and the
+# number of its measurements that give it: neighbours err together.
 NATS, ENOUGH = 16.0, 4
 # How long misfits last, s.
 TAU = 0.1
-# What one image can say of a cue at most, nats: it may be of something that nobody has thought of.
+# Maximum evidence of one image about a cue, nats: it may be wrong in unforeseen ways.
 MOST = 3.5
 
 DEPTH = 'depth'
@@ -81,9 +81,9 @@ class ByKeypoints(NamedTuple):
     """A pose by keypoints alone, where modes that follow the silhouette miss too many of them.
 
     Attributes:
-        keypoints: what it leaves of them.
-        gain: how much better than the heaviest mode it went on when the two parted, nats, in the
-            first image that is told of.
+        keypoints: its misfit to them.
+        gain: log ratio of its transition to that of the heaviest mode when the two parted, nats, in
+            the first image that reports them.
     """
 
     keypoints: Misfit
@@ -91,7 +91,7 @@ class ByKeypoints(NamedTuple):
 
 
 class Validity:
-    """What is believed of the cues of one track, and of the track.
+    """Probabilities that the cues of one track, and the track, are valid.
 
     Attributes:
         joint: (2, .., 2) probability of the track, of the detector and of the cues of `AXES`.
@@ -112,12 +112,12 @@ class Validity:
     def cues(self) -> dict[str, Array]:
         """By name the probabilities that the groups of a cue show the person.
 
-        Of the silhouette (1,), of keypoints by group (3,) and of depths (1,).
+        Shapes: silhouette (1,), keypoints by group (3,), depths (1,).
         """
         return {name: self._chains[axes] for name, axes in AXES.items()} | {DEPTH: self.depth}
 
     def believes(self, cue: str) -> bool:
-        """Whether a cue is more likely to show the person than not; who is lost asks all."""
+        """Whether a cue more likely than not shows the person; a lost track uses all cues."""
         return self.lost or bool(self.cues[cue].max() >= 0.5)
 
     @property
@@ -166,7 +166,7 @@ class Validity:
     def update(
         self, misfits: Mapping[str, Misfit], dt: float, alone: ByKeypoints | None = None
     ) -> None:
-        """Takes in how far the modes explain the cues of an image.
+        """Takes in the misfits of the modes to the cues of an image.
 
         Args:
             misfits: by cue, and of the outline of the silhouette.

@@ -1,4 +1,4 @@
-"""What an image may show of a person, before a pose is known."""
+"""The view of a person in an image, before a pose is known."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hmt_ros.inference.arrays import Image, Mask
 
 
 class View(NamedTuple):
-    """What an image may show of a person.
+    """The view of a person in an image.
 
     Attributes:
         image: (H, W, 3) BGR.
@@ -25,8 +25,8 @@ class View(NamedTuple):
             answered, or there is none.
         predicted: whether a predictor expects somebody by this image; None: it has not answered, or
             there is none.
-        unsure: (H, W) what may be the person or a shadow; None: nothing.
-        others: (H, W) what somebody else covers; None: nothing.
+        unsure: (H, W) pixels of the person or of a shadow; None: none.
+        others: (H, W) pixels that somebody else covers; None: none.
         depth: (H, W) depth along the axis of the camera, m; None: unknown.
     """
 

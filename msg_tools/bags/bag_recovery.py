@@ -38,7 +38,7 @@ _OF_ROS_2 = 'cdr'
 
 @dataclass(frozen=True)
 class Recovery:
-    """What became of a bag.
+    """Result of the recovery of a bag.
 
     Attributes:
         path: the new bag.
@@ -159,7 +159,7 @@ def _line(file: McapSalvage, loss: Loss) -> str:
     return text
 
 
-# What lies where
+# Files of a damaged bag
 
 
 def _files(source: Path) -> tuple[list[Path], list[str]]:
@@ -243,7 +243,7 @@ def _opened(source: Path, paths: list[Path], losses: list[str]) -> Iterator[list
 
 
 def _decompressed(path: Path, plain: Path) -> list[str]:
-    """Decompresses as much of a file as can be; what was wrong."""
+    """Decompresses as much of a file as can be; returns the faults."""
     with path.open('rb') as compressed, plain.open('wb') as target:
         try:
             for piece in decompress_file(compressed):

@@ -11,7 +11,7 @@ from msg_tools.files.error_line import error_line
 
 
 class Channel(NamedTuple):
-    """What a bag says about the messages of one topic.
+    """Description of the messages of one topic in a bag.
 
     Attributes:
         topic: as written, with or without a leading slash.

@@ -134,7 +134,7 @@ def decompress_file(file: BinaryIO) -> Iterator[bytes]:
 
 
 class DamageError(Exception):
-    """What is wrong with a file, as the end of a sentence that starts with its name."""
+    """Damage of a file, as the end of a sentence that starts with its name."""
 
 
 class Fields:

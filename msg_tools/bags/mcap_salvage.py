@@ -35,7 +35,7 @@ from msg_tools.bags.mcap_records import (
     records_in,
 )
 
-# What stands before the summary.
+# Records before the summary.
 _DATA_RECORDS = (
     Opcode.HEADER,
     Opcode.SCHEMA,
@@ -49,7 +49,7 @@ _DATA_RECORDS = (
 _DATA_END_BYTES = 4
 # As many bytes of the mark at the start may be wrong.
 _WRONG_BYTES = 2
-# What stands behind the fixed fields of a compressed chunk.
+# Bytes behind the fixed fields of a compressed chunk.
 _COMPRESSIONS = (b'\x04\x00\x00\x00zstd', b'\x03\x00\x00\x00lz4')
 _SEARCHED_BYTES = 2**20
 
@@ -114,7 +114,7 @@ class McapSalvage:
     Attributes:
         name: as given.
         profile: 'ros2' for recordings of ROS 2.
-        losses: what could not be saved, of what has been read so far.
+        losses: stretches that could not be saved, as far as the file has been read.
         announced: how many messages the file had when it was complete; None where it does not tell.
     """
 
@@ -140,7 +140,7 @@ class McapSalvage:
         """All that is whole; channels come before their messages.
 
         Raises:
-            BagError: the disk does not give what it has.
+            BagError: the disk can not be read.
         """
         try:
             with self._path.open('rb') as file:
@@ -160,7 +160,7 @@ class McapSalvage:
             self.losses.append(Loss(0, len(MAGIC), 'has a damaged mark at its start'))
 
     def _read_what_helps(self, file: BinaryIO, size: int) -> None:
-        """Header and summary; what is wrong with them is found by whoever reads up to there."""
+        """Reads header and summary; their faults are found when `content` reads up to there."""
         with suppress(DamageError):
             opcode, length = record_head(file, len(MAGIC), size)
             if opcode == Opcode.HEADER:
@@ -220,7 +220,7 @@ class McapSalvage:
             self.losses.append(Loss(size, size, f'breaks off after {size} bytes'))
 
     def _record(self, file: BinaryIO, opcode: int, length: int, offset: int) -> Iterator[Saved]:
-        """What a record of the data holds, all of it or an error."""
+        """Content of a record of the data, all of it or an error."""
         if opcode not in _DATA_RECORDS or length > MAX_BYTES:
             raise DamageError(
                 f'is damaged at byte {offset}: record of type {opcode} with {length} bytes'

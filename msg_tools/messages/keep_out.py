@@ -29,7 +29,7 @@ _POINT = 1e-6
 
 
 class KeepOutState(IntEnum):
-    """What is known of the person; the constants of hmt_msgs/KeepOut."""
+    """State of the person; the constants of hmt_msgs/KeepOut."""
 
     UNKNOWN = 0
     TRACKING = 1
@@ -44,7 +44,7 @@ class KeepOut:
 
     Attributes:
         stamp_ns, frame_id: time that it is about, and frame.
-        state: what is known of the person.
+        state: of the person.
         starts, ends: (N, 3) ends of the axes of capsules, m.
         radii: (N,) m.
         track_id: number of the track; 0: none.

@@ -58,7 +58,7 @@ class MixtureKind(IntEnum):
 
 
 class TrackState(IntEnum):
-    """What is known of the person in view; the constants of PoseMixture.msg."""
+    """State of the person in view; the constants of PoseMixture.msg."""
 
     UNKNOWN = 0
     TRACKING = 1
@@ -102,7 +102,7 @@ class PoseMixture:
         error_share: share of the evidence of one image that is independent, in (0, 1], beside a
             likelihood; NaN: unknown, as in bags older than this field.
         error_time: time for which errors last, s; NaN: unknown.
-        shape_covariance: (d, d) of what poses of all images err by alike, because the lengths and
+        shape_covariance: (d, d) of the errors shared by poses of all images, as the lengths and
             the flesh of the person are not known exactly, beside a likelihood; None: unknown, as in
             bags older than this field.
 
@@ -283,7 +283,7 @@ class PoseMixture:
 
 
 def _joint_covariances(body: Body, jacobians: Array, covariances: Array) -> Array:
-    """Covariances (K, J, 3, 3) of joints: of the poses, and what the body errs by in every pose.
+    """Covariances (K, J, 3, 3) of joints: of the poses, and of the body model in every pose.
 
     Args:
         jacobians: (K, J, 3, d) of the positions.
@@ -350,7 +350,7 @@ def pose_mixture_of(
     (see `PoseMixture`) is understood; `PoseMixture.mixture` wants the first two.
 
     Args:
-        dof_names, joint_names: what it has to be about, in this order; None: anything.
+        dof_names, joint_names: that it has to have, in this order; None: any.
 
     Raises:
         MessageError: names that differ, arrays whose lengths contradict each other, weights that

@@ -1,4 +1,4 @@
-"""import-video: writes a video, its camera and what a detector found in it into a bag for replay.
+"""import-video: writes a video, its camera and the output of a detector into a bag for replay.
 
 The bag has the topics `/image/compressed` and `/camera_info`, and as far as they are known
 `/keypoints`, `/keypoints_3d` and `/mask`, with the stamp of the frame that they belong to.
@@ -100,7 +100,7 @@ class ImportOptions:
 
 @dataclass
 class Imported:
-    """What was written.
+    """Counts of the images and keypoints that were written.
 
     Attributes:
         with_keypoints: number of images in which keypoints were seen; None: none were given.
@@ -137,7 +137,7 @@ def _parser() -> CommandParser:
 
 
 def add_camera_arguments(parser: CommandParser) -> None:
-    """Adds the arguments that say what the camera is, for `camera_of`."""
+    """Adds the arguments that describe the camera, for `camera_of`."""
     camera = parser.add_argument_group('camera, one of these')
     camera = camera.add_mutually_exclusive_group(required=True)
     angle = number(1, 150, what='an angle', unit=' degrees')
@@ -155,7 +155,7 @@ def add_camera_arguments(parser: CommandParser) -> None:
 
 
 def add_video_arguments(parser: CommandParser) -> None:
-    """Adds the arguments that say what to import."""
+    """Adds the arguments that select the input."""
     parser.add_argument(
         'source', type=Path, metavar='SOURCE', help='video file, or folder of images'
     )
@@ -278,7 +278,7 @@ Seer = Callable[[Frame, int], tuple[Keypoints | None, Mask | None]]
 
 
 def _seer(options: ImportOptions, found: FoundPersons | None, masks: Masks | None) -> Seer:
-    """What is known of a frame with a stamp: keypoints and mask."""
+    """The function that gives keypoints and mask of a frame with a stamp."""
     chooser = Chooser(options.person)
     detector = None
     if options.detector is not None:

@@ -55,7 +55,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Selection:
-    """Which frames of a source are wanted.
+    """A selection of the frames of a source.
 
     Attributes:
         start, end: times since the first frame of the source, s; the end is not included.
@@ -86,7 +86,7 @@ class FrameSource(ABC):
 
     Args:
         names: of the files of its frames in their order; empty for a video file.
-        first_number: number of the first frame for those who number frames.
+        first_number: number of the first frame in labels.
 
     Attributes:
         claimed: number of frames that the source announces; 0: it does not tell.
@@ -362,7 +362,7 @@ class Masks:
 def mask_in(image: Image) -> Mask:
     """(H, W) where a picture (H, W, 3) shows the person.
 
-    That is where its brightest channel is above 127, or above 0 in a picture of zeros and ones.
+    The brightest channel is above 127 there, or above 0 in a picture of zeros and ones.
     """
     brightest = image.max(2)
     result: Mask = brightest > (_HALF if brightest.max() > 1 else 0)

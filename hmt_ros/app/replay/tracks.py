@@ -91,7 +91,7 @@ class OfflineTrack(PlayedTrack):
         return result if self._smoother is None else _together(result, self._smoother.finish())
 
     def _hand_to_filter(self, result: Handled) -> Handled:
-        """What has been predicted."""
+        """Hands the predictions to the filter."""
         predicted, self._predicted = self._predicted, []
         for topic, _, data in predicted:
             read = deserialise(data, bme_session.TOPICS[topic].msgtype)
@@ -99,7 +99,7 @@ class OfflineTrack(PlayedTrack):
         return result
 
     def _hand_on(self, result: Handled) -> Handled:
-        """What the filter has published, to smoother and BME."""
+        """Hands the messages of the filter to smoother and BME."""
         handed, self._handed = self._handed, []
         for topic, _, data in handed:
             read = deserialise(data, track_messages.TOPICS[topic].msgtype)
@@ -194,7 +194,7 @@ class LiveTrack(PlayedTrack):
                 names = [name for name, own in every if own is not None]
                 process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', names)
             live = partial(LiveNode, player, opened, within=process, write=self._write)
-            # Of the namespace that both share: whatever comes must not be lost.
+            # Topics of the namespace that both share: none of their messages must be lost.
             sensors = (f'/{topic}', '/camera_info', *(f'/{source}' for source in given))
             if self._parameters.bme is not None:
                 self._bme = live(

@@ -1,4 +1,4 @@
-"""What a detector that lifts says of the person itself, as a skeleton beside the mixtures."""
+"""Skeletons of a detector that lifts by itself, beside the mixtures."""
 
 from __future__ import annotations
 

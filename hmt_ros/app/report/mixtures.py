@@ -48,7 +48,7 @@ def angles_of(body: Body | None) -> tuple[str, ...]:
 
 
 def ground_at(grounds: Mapping[int, GroundState], stamp_ns: int) -> GroundState | None:
-    """What is known of the floor at a time, or else at the first time of all; None: nothing."""
+    """The ground at a time, or else at the first time of all; None: unknown."""
     return grounds.get(stamp_ns) or next(iter(grounds.values()), None)
 
 
@@ -60,7 +60,7 @@ def heights_of(joints: Array, ground: GroundState | None) -> Array:
 
 
 def marginals_of(content: PoseMixture, body: Body | None, ground: GroundState | None) -> Array:
-    """What each component says of heights of joints, m, and of angles, degrees.
+    """Marginals of each component over heights of joints, m, and angles, degrees.
 
     Returns:
         (2, K, J + A) means and standard deviations; (2, K, 0) where a covariance is not known.
@@ -245,7 +245,7 @@ def read_mixtures(
         path: path of the bag.
         topics: names of the topics to read; empty: all with mixtures except ground truth.
         body_model: name or file of the body model, for a bag whose own name for it is unknown.
-        grounds: what is known of the floor, by stamp, for heights.
+        grounds: the ground by stamp, for heights.
         progress: called with the number of messages that were read.
 
     Raises:

@@ -57,8 +57,8 @@ class Content:
         images: images at some of them.
         truth: true joint positions; None if unknown.
         scores: by topic; empty without truth.
-        notes: what the page does not show, and why.
-        grounds: what is known of the floor and of contacts, by stamp; empty: nothing.
+        notes: contents that the page leaves out, and why.
+        grounds: floor and contacts by stamp; empty: unknown.
         detector: skeletons of a detector that lifts; None: there are none.
     """
 
@@ -239,7 +239,7 @@ def _regions(moments: Sequence[Moment]) -> str | None:
 
 
 def _beliefs(moments: Sequence[Moment | None]) -> dict[str, Any]:
-    """What is believed over time: `existence`, None if unknown, and the `cues` by name."""
+    """Probabilities over time: `existence`, None if unknown, and the `cues` by name."""
     existence = [None if one is None else _probability(one.existence) for one in moments]
     names = dict.fromkeys(name for one in moments if one is not None for name in one.cues)
     return {

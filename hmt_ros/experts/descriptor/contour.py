@@ -123,7 +123,7 @@ def person_blob(mask: ArrayLike) -> PersonBlob:
 
 
 def _belonging(stats: NDArray[np.int32]) -> tuple[Mask, int]:
-    """Which blobs belong to the person (n,), and the number of other notable ones."""
+    """Mask (n,) of the blobs that belong to the person, and the number of other notable ones."""
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
     width, height = (stats[:, i].astype(float) for i in (cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT))
     like = np.maximum(width / height, height / width) <= LONGEST

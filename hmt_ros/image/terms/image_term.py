@@ -1,7 +1,7 @@
-"""What a term of the image likelihood is made of.
+"""The parts of a term of the image likelihood.
 
-A term is one file: its default settings, what it takes from an image (the evidence), its compiled
-kernel, and one `ImageTerm` that names them. `registry` lists the terms; nothing else knows them.
+A term is one file: its default settings, its evidence from an image, its compiled kernel, and one
+`ImageTerm` that names them. `registry` lists the terms; nothing else knows them.
 """
 
 from __future__ import annotations
@@ -125,12 +125,12 @@ class PoseView(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What else a term is asked for by a call.
+    """Arguments of a call, the same for all terms.
 
     Attributes:
         poses: number of poses, N.
-        explained: (N, M) or (1, M) what each sample of the outline costs at most, because something
-            else explains it; None: nothing does.
+        explained: (N, M) or (1, M) maximum energy of each sample of the outline, because something
+            else explains it; None: unlimited.
     """
 
     poses: int
@@ -143,10 +143,10 @@ class ImageTerm:
 
     Attributes:
         name: of the term, of its settings and of its evidence.
-        meaning: what it compares, which opens the descriptions of its parameters.
+        meaning: quantities that it compares, which opens the descriptions of its parameters.
         settings: defaults.
-        evidence: takes from an image what the term compares poses with; None: the image lacks it.
-        inputs: what the kernel reads: a NamedTuple whose first field is the `Weighting`. Without
+        evidence: takes the evidence of the term from an image; None: the image lacks it.
+        inputs: makes the kernel's inputs: a NamedTuple that starts with the `Weighting`. Without
             evidence (None) it has weight 0 and empty arrays of the same types.
         kernel: compiled `kernel(view, inputs, wrenches, stiffnesses)`: adds the residuals of one
             pose to the sums of the segments, returns the energy.

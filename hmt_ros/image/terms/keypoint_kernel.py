@@ -2,8 +2,8 @@
 
     E(x) = -log sum_e p_e exp(-sum_g E_g,e(x))          e: exchange, g: group of landmarks
 
-Given what a detector takes for what, groups add; over what it may take for what, likelihoods do.
-To what the groups cost comes what the whole pose does, by a mixture over depths (`lifted_poses`).
+Given an exchange of sides, the energies of groups add; over the exchanges, likelihoods add. The
+energy of the whole pose by a mixture over depths (`lifted_poses`) is added to those of the groups.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Ints = NDArray[np.int64]
 
 
 class Points(NamedTuple):
-    """Keypoints (P,), each with the landmark that it is, and the one it is if sides are exchanged.
+    """Keypoints (P,), each with its landmark, and its landmark if sides are exchanged.
 
     Attributes:
         segments: (P, 2) that carry the landmarks.
@@ -43,7 +43,7 @@ class Points(NamedTuple):
 
 
 class Lifted(NamedTuple):
-    """How far joints (J,) are behind the middle of the hips, by a mixture of C components.
+    """Depths of joints (J,) behind the middle of the hips, a mixture of C components.
 
     Attributes:
         segments: (J,) that carry the joints.
@@ -56,7 +56,7 @@ class Lifted(NamedTuple):
         precisions: (2, C, J) square roots, 1/m.
         readings: (E,) 0 or 1: how an exchange of sides reads the mixture.
         weight: factor on the energy; 0: there is no mixture.
-        scale: of the kernel, in standard deviations: a joint that is elsewhere costs no more.
+        scale: of the kernel, in standard deviations; it bounds the energy of a joint.
     """
 
     segments: Ints
@@ -72,7 +72,7 @@ class Lifted(NamedTuple):
 
 
 class KeypointInputs(NamedTuple):
-    """What the energy of keypoints reads.
+    """Inputs of the energy of keypoints.
 
     Attributes:
         points: that were measured.
@@ -174,8 +174,8 @@ def add_lifted(  # type: ignore[no-untyped-def]
 ):
     """Adds the derivatives of the mixture at one pose.
 
-    A joint moves against the middle of the hips, so that what moves these counts as if it turned
-    about them and shifted nothing.
+    A joint moves against the middle of the hips, so that variables that move the hips count as if
+    they turned about them and shifted nothing.
 
     Args:
         lifted, tree: the mixture, and the skeleton.

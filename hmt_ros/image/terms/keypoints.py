@@ -6,7 +6,7 @@
 u_k,e projects the landmark that keypoint k shows, seen at p_k with covariance S_k (px^2) and noise
 s_k on the person (m, at the magnification m, px/m). Detectors take left for right: in the exchange
 e, of prior probability p_e, the keypoints of all limbs, of the arms or of the legs show the
-landmarks of the other side. What a detector says of depth counts by the slopes of bones.
+landmarks of the other side. Depths of a detector count by the slopes of bones.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ class Keypoints:
         confidences: (n,) from 0, ignore, to 1, sure.
         positions: (n, 3) of a detector that lifts, m, along the axes of the camera from an origin
             that all share; NaN where there is none. None: it does not lift.
-        landmarks: (n,) canonical names of what was seen (`keypoint_schemes`), '' for joints; None:
+        landmarks: (n,) canonical names of landmarks (`keypoint_schemes`), '' for joints; None:
             all names are those of joints.
         scheme: of the detector, once it is known.
-        lifted: what is made of keypoints or positions: a mixture over whole poses, of which depths
-            count, because what it says across the line of sight the keypoints say themselves.
-        offsets: (n, 3) of what was seen from the joint in the frame of its segment, m; None: joints
+        lifted: mixture over whole poses from keypoints or positions; only its depths count, because
+            across the line of sight the keypoints themselves are the evidence.
+        offsets: (n, 3) of the landmarks from the joint in the frame of its segment, m; None: joints
             were seen.
         noise: (n,) standard deviation beside the covariances, m on the person; it accounts for the
             confidences. None: none, and confidences divide the precisions.
@@ -128,7 +128,7 @@ class Keypoints:
         )  # fmt: skip
 
     def named_for(self, body: Body, scheme: str = 'auto') -> tuple[Keypoints, list[str]]:
-        """Those that are at joints of a body, under the body's names, and the names of the others.
+        """Keypoints at joints of a body, under the body's names, and the names of the others.
 
         Unknown covariances become those that are learned for keypoints of a scheme.
 
@@ -178,7 +178,7 @@ class Keypoints:
         return renamed, strange
 
     def magnification(self) -> float:
-        """About how many px a metre has at the person, by how far the keypoints reach."""
+        """Approximate px of a metre at the person, by the extent of the keypoints."""
         seen = self.pixels[self.seen]
         if len(seen) < 2:
             return 1.0
@@ -192,7 +192,7 @@ class KeypointTerm:
     Keypoints that were not seen (NaN) or have no confidence do not count.
 
     Attributes:
-        skeleton, camera: who is seen by what.
+        skeleton, camera: the person, and the camera that sees the person.
         keypoints: that were seen.
         settings: weight w, factor on the standard deviations, and scale of the kernel; inf: least
             squares.
@@ -232,7 +232,7 @@ class KeypointTerm:
 
     @property
     def compiled(self) -> KeypointInputs:
-        """As compiled code reads it."""
+        """The term as compiled code reads it."""
         exchanges = np.zeros((1, 1)) if self.exchanges is None else self.exchanges
         measured = self.measured
         return KeypointInputs(
@@ -298,7 +298,7 @@ class KeypointTerm:
         return np.asarray(np.linalg.norm(errors, axis=2))
 
     def _priors(self, rows: Index, count: int) -> tuple[NDArray[np.int64], Array]:
-        """Which groups each exchange exchanges (E, G), and log priors (N, E)."""
+        """Groups that each exchange exchanges (E, G), and log priors (N, E)."""
         if self.exchanges is None:
             return EXCHANGED[:1], np.zeros((count, 1))
         chosen = self.exchanges[rows] if len(self.exchanges) > 1 else self.exchanges[[0] * count]
@@ -317,14 +317,14 @@ class KeypointTerm:
 
     @property
     def measured(self) -> MeasuredKeypoints:
-        """What the keypoints say of the skeleton, whatever its pose."""
+        """The keypoints as inputs of the kernel, the same for all poses of the skeleton."""
         sigma = self.settings.sigma
         return _measured(self.skeleton, self.camera, self.keypoints, sigma, self.magnification)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredKeypoints:
-    """What P keypoints that count say of a skeleton, whatever its pose.
+    """P keypoints that count, as inputs of the kernel, the same for all poses of a skeleton.
 
     Attributes:
         joints: (P, 2) of the skeleton that they show, as they are called and exchanged.
@@ -398,7 +398,7 @@ def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lift
 
 
 def group_of(skeleton: Skeleton, segment: int) -> int:
-    """Group that what lies on a segment is exchanged with."""
+    """Group that landmarks on a segment are exchanged with."""
     for chain, segments in skeleton.chains.items():
         if segment in segments:
             return {'arm': ARMS, 'leg': LEGS}.get(chain.rpartition('_')[2], CENTRE)

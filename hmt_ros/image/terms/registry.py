@@ -30,7 +30,7 @@ TERMS: tuple[ImageTerm, ...] = (COVERAGE, EDGES, DEPTH)
 
 
 class Model(NamedTuple):
-    """What the compiled code reads of the body and the camera.
+    """Body and camera as compiled code reads them.
 
     Attributes:
         tree, flesh, lens: skeleton, parts and rings, camera.
@@ -120,7 +120,7 @@ def add_energies(  # type: ignore[no-untyped-def]
 
     Args:
         first, last: range of poses.
-        model, placement: what is compared with the image.
+        model, placement: body and poses that are compared with the image.
         inputs: of the kernels, one entry a term, in the order of `TERMS`.
         shape: whether the contour is traced.
         energies: (N, terms) result.

@@ -52,13 +52,13 @@ class Outline(NamedTuple):
 
 
 class CoverageInputs(NamedTuple):
-    """What the kernel of the coverage reads.
+    """Inputs of the kernel of the coverage.
 
     Attributes:
         term: weighting.
         outline: samples.
-        explained: (X, M) what samples cost at most; a row a pose, or one row for all.
-        costs: (N, M) result: what each sample costs.
+        explained: (X, M) maximum energy of samples; a row a pose, or one row for all.
+        costs: (N, M) result: energy of each sample.
     """
 
     term: Weighting
@@ -159,7 +159,7 @@ def _nearest(pixels, normals, places, directions, use):  # type: ignore[no-untyp
 
 @njit(cache=True, nogil=True)
 def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
-    """Samples of the outline pay their distance to the nearest contour; see `ImageTerm.kernel`.
+    """Energy of the distances from outline samples to the contour; see `ImageTerm.kernel`.
 
     Nearest by position and direction, among contour points that no other part covers.
     """
