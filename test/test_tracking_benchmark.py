@@ -778,7 +778,8 @@ def test_intervals_over_few_seeds_hold_the_mean_as_often_as_they_say():
 def test_settings_are_compared_on_the_same_runs(quick_runs, monkeypatch):
     monkeypatch.setenv('HMT_SHARED', 'nowhere')
     changes = (('max_hypotheses', 2), ('iterations', 5))
-    result = tracking.measure(inputs=[IMAGES], seeds=(0,), parts=(), against=changes)
+    asked = {'only': ['reach'], 'inputs': [IMAGES], 'seeds': (0,), 'parts': ()}
+    result = tracking.measure(**asked, against=changes)
     assert [one.changes for one in quick_runs] == [(), changes]
     found = result['against']
     (entry,) = found['groups'][0]['clips']
@@ -793,7 +794,7 @@ def test_settings_are_compared_on_the_same_runs(quick_runs, monkeypatch):
     text = tracking.as_text(result)
     assert 'max_hypotheses=2, iterations=5 minus the usual settings' in text
     assert f'{entry["best_mm"]:+.1f}' in text
-    same = tracking.measure(inputs=[IMAGES], seeds=(0,), parts=(), against=(('max_hypotheses', 4),))
+    same = tracking.measure(**asked, against=(('max_hypotheses', 4),))
     assert same['against']['means'][0]['heaviest_mm'][0] == 0.0
 
 
