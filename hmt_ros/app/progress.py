@@ -24,7 +24,7 @@ from hmt_ros.compiled_code import compiling
 
 Item = TypeVar('Item')
 
-INTERVAL = 4.0  # s, between two lines; a bar shows the time every second
+INTERVAL = 3.0  # s, between two lines; a bar shows the time every second
 
 
 class ProgressLines:
