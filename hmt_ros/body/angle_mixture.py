@@ -223,9 +223,10 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     if missing or str(arrays['format']) != FORMAT:
         seen = f'it lacks {missing[0]}' if missing else f'its format is {str(arrays["format"])!r}'
         raise ValueError(f'{path}: not a pose prior ({seen}); learn one with `learn-prior`')
-    if str(arrays['version']) != str(VERSION):
+    version = str(arrays['version'])
+    if version != str(VERSION):
         raise ValueError(
-            f'{path}: pose prior of version {arrays["version"]}, wanted {VERSION}; learn it again'
+            f'{path}: pose prior of version {version!r}, wanted {VERSION}; learn it again'
         )
     return arrays
 

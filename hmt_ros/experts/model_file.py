@@ -57,11 +57,11 @@ def check_header(arrays: Mapping[str, NDArray[Any]], kind: str | None, where: st
     version = str(arrays['version'])
     if version != str(VERSION):
         raise ValueError(
-            f'{where}: model file of version {version}, wanted {VERSION}; train it again'
+            f'{where}: model file of version {version!r}, wanted {VERSION}; train it again'
         )
     found = str(arrays['kind'])
     if kind is not None and found != kind:
-        raise ValueError(f'{where}: a model of kind {found!r}, wanted {kind!r}; load it as {found}')
+        raise ValueError(f'{where}: a model of kind {found!r}, wanted {kind!r}; load it as such')
 
 
 def parameters_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

@@ -242,7 +242,7 @@ def test_a_file_gives_the_mixture_back(tmp_path):
     [
         ({'format': np.array('other')}, r"not a pose prior \(its format is 'other'\)"),
         ({'weights': None}, r'not a pose prior \(it lacks weights\)'),
-        ({'version': np.array(7)}, 'pose prior of version 7, wanted 1'),
+        ({'version': np.array(7)}, "pose prior of version '7', wanted 1"),
         ({'body': np.array('human34')}, "of the body 'human34', wanted one of 'human37'"),
         ({'mounts': np.zeros((2, 3, 3))}, 'frames at rest'),
         ({'mounts': np.full(HUMAN.skeleton.mounts.shape, 'none')}, 'frames at rest'),

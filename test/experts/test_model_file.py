@@ -20,7 +20,7 @@ def test_same_model_same_bytes(model, tmp_path):
 
 def test_other_version_is_refused(model, tmp_path):
     path = write_arrays(tmp_path / 'm.npz', model.to_arrays() | {'version': np.array(99)})
-    with pytest.raises(ValueError, match='version 99, wanted 1; train it again'):
+    with pytest.raises(ValueError, match="version '99', wanted 1; train it again"):
         NearestNeighbours.load(path)
 
 
@@ -28,6 +28,14 @@ def test_other_kind_is_refused(model, tmp_path):
     path = model.save(tmp_path / 'm')
     with pytest.raises(ValueError, match="'nearest_neighbours', wanted 'joint_experts'"):
         JointExperts.load(path)
+
+
+@pytest.mark.parametrize('name', ['kind', 'version'])
+def test_a_damaged_header_makes_one_line(name, model, tmp_path):
+    path = write_arrays(tmp_path / 'm.npz', model.to_arrays() | {name: np.array('a\nb\x85')})
+    with pytest.raises(ValueError, match='wanted') as error:
+        NearestNeighbours.load(path)
+    assert len(str(error.value).splitlines()) == 1
 
 
 def test_missing_file_is_named(tmp_path):
