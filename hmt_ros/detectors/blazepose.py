@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 SCHEME = 'mediapipe33'
 LANDMARKS = 33
-# After such an interval without an image the person is sought anew, ns.
+# Interval without images after which the whole image is searched again, ns.
 _LONGEST_INTERVAL = 1_000_000_000
 # Sides of what the networks see, px, and of the heat maps of landmarks.
 _PERSON_SIZE, _LANDMARK_SIZE, _HEAT_SIZE = 224, 256, 64

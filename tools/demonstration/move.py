@@ -23,6 +23,8 @@ from hmt_ros.motion.procedural_motion import procedural_motion
 
 FPS = 15.0
 SOLE = 0.012  # m, of a shoe
+WIDTH, HEIGHT = 480, 360
+HALF_ANGLE = np.radians(24.0)  # of view, horizontal
 VIEWPOINT = Viewpoint(distance=3.7, height=1.3, pitch=np.radians(5.0))
 SIDES = (('left', 'Left'), ('right', 'Right'))
 # Joints of our body, and the bones of the avatar at whose heads they are.
@@ -70,7 +72,10 @@ def main(argv: list[str]) -> int:
         joints=np.stack([joints[name] for name in body.joint_names], axis=1) + up,
         poses=poses,
         lengths=np.array([body.segment_lengths[x] for x in body.skeleton.length_names]),
+        motion=motion,
         fps=FPS,
+        size=[WIDTH, HEIGHT],
+        half_angle=HALF_ANGLE,
         rotation=VIEWPOINT.rotation,
         place=[VIEWPOINT.distance, VIEWPOINT.height, VIEWPOINT.pitch],
     )

@@ -31,7 +31,6 @@ from msg_tools.messages.images import compressed_image_message, decode_image
 from msg_tools.messages.keypoints import keypoints_message, positions_message
 
 NOISE, QUALITY = 1.5, 80
-HALF_ANGLE = np.radians(24.0)  # of view, horizontal
 
 
 def main(argv: list[str]) -> int:
@@ -40,8 +39,8 @@ def main(argv: list[str]) -> int:
     body = load_body('human37')
     body = body.with_segment_lengths(dict(zip(body.skeleton.length_names, motion['lengths'])))
     empty = cv2.imread(str(images / 'empty.png'))
-    height, width = empty.shape[:2]
-    focal = 0.5 * width / np.tan(HALF_ANGLE)
+    width, height = motion['size'].tolist()
+    focal = 0.5 * width / np.tan(motion['half_angle'])
     camera = Camera(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
     viewpoint = Viewpoint(*motion['place'].tolist())
     joints = viewpoint.to_camera(motion['joints'])
@@ -66,7 +65,7 @@ def main(argv: list[str]) -> int:
                 bag.write('keypoints_3d', stamp, lifted)
             true = ground_truth(messages, body, motion['poses'][number], joints[number], stamp)
             bag.write('ground_truth', stamp, true)
-    take = Take('reach', body, motion['poses'], float(motion['fps']))
+    take = Take(str(motion['motion']), body, motion['poses'], float(motion['fps']))
     subject = subject_text(take, camera, camera.project(joints[:1])[0], 0)
     (target / 'subject.yaml').write_text(subject, 'utf-8')
     cv2.imwrite(str(target / 'background.png'), empty)

@@ -16,8 +16,6 @@ import mathutils
 import numpy as np
 from avatar import Avatar
 
-WIDTH, HEIGHT = 480, 360
-HALF_ANGLE = math.radians(24.0)  # of view, horizontal
 SAMPLES = 8
 SEED = 5
 
@@ -50,7 +48,7 @@ def settings(motion) -> None:
     """The camera and the renderer."""
     scene = bpy.context.scene
     camera = bpy.data.cameras.new('camera')
-    camera.sensor_fit, camera.angle_x = 'HORIZONTAL', 2.0 * HALF_ANGLE
+    camera.sensor_fit, camera.angle_x = 'HORIZONTAL', 2.0 * float(motion['half_angle'])
     thing = bpy.data.objects.new('camera', camera)
     scene.collection.objects.link(thing)
     distance, height, _ = motion['place']
@@ -63,7 +61,8 @@ def settings(motion) -> None:
     render, cycles = scene.render, scene.cycles
     render.engine, cycles.device = 'CYCLES', 'CPU'
     cycles.samples, cycles.use_denoising, cycles.max_bounces = SAMPLES, True, 3
-    render.resolution_x, render.resolution_y, render.resolution_percentage = WIDTH, HEIGHT, 100
+    render.resolution_x, render.resolution_y = motion['size'].tolist()
+    render.resolution_percentage = 100
     render.use_persistent_data = True
     render.image_settings.file_format = 'PNG'
     scene.view_settings.view_transform = 'Standard'
