@@ -215,7 +215,7 @@ def test_files_that_are_no_predictors(predictor: PosePredictor, tmp_path: Path) 
         assert '\n' not in str(caught.value)
     with pytest.raises(FileNotFoundError, match='no such model'):
         PosePredictor.load(tmp_path / 'absent.npz')
-    with pytest.raises(ValueError, match='version 99'):
+    with pytest.raises(ValueError, match="of version '99'"):
         PosePredictor.load(_changed(path, tmp_path / 'v.npz', version=99))
     other = NearestNeighbours(1).fit(np.eye(4), np.eye(4)).save(tmp_path / 'nn.npz')
     with pytest.raises(ValueError, match="kind 'nearest_neighbours'"):
