@@ -611,7 +611,16 @@ def policy():
     root = ET.parse(ROOT / 'security' / 'sros2_policy.xml').getroot()
     assert (root.tag, root.attrib) == ('policy', {'version': '0.2.0'})
     result = {}
-    for enclave in root.findall('./enclaves/enclave'):
+    *apart, together = root.findall('./enclaves/enclave')
+    # All nodes in one process: the profiles of the enclaves before.
+    (included,) = together.findall('./profiles/*')
+    assert together.attrib['path'] == f'{NAMESPACE}/person_node'
+    assert included.tag == '{http://www.w3.org/2001/XInclude}include'
+    assert included.attrib == {
+        'href': '',
+        'xpointer': 'xpointer(/policy/enclaves/enclave[position() < last()]/profiles/profile)',
+    }
+    for enclave in apart:
         (profile,) = enclave.findall('./profiles/profile')
         name = profile.attrib['node']
         assert profile.attrib['ns'] == NAMESPACE
