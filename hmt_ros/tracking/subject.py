@@ -14,6 +14,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 LARGEST_PIXEL = 1e5
+LONGEST = 3.0  # m
 KEYS = ('stamp_ns', 'sigma_px', 'keypoints', 'segment_lengths_m', 'stature_m')
 
 
@@ -85,10 +86,12 @@ def parse_subject(content: Any, body: Body) -> Subject:
     if not isinstance(lengths, dict):
         raise SubjectError(f'segment_lengths_m must map names to metres, saw {lengths!r}')
     _check_names(lengths, body.skeleton.length_names, 'length', body.name)
-    checked = {name: _positive(value, f'length {name}', 3.0) for name, value in lengths.items()}
+    deviations = np.sqrt(np.diag(body.length_covariance))
+    signed = dict(zip(body.skeleton.length_names, deviations > body.skeleton.lengths))
+    checked = {name: _length(value, name, signed[name]) for name, value in lengths.items()}
     stature = content.get('stature_m')
     if stature is not None:
-        stature = _positive(stature, 'stature_m', 3.0)
+        stature = _positive(stature, 'stature_m', LONGEST)
     return Subject(stamp, keypoints, checked, stature)
 
 
@@ -102,6 +105,17 @@ def _positive(value: Any, name: str, largest: float = LARGEST_PIXEL) -> float:
     if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= largest:
         return float(value)
     raise SubjectError(f'{name} must be a number above 0 and at most {largest:g}, saw {value!r}')
+
+
+def _length(value: Any, name: str, signed: bool) -> float:
+    """A length, m; one that people differ in by more than itself, as of an offset, has a sign."""
+    if not signed:
+        return _positive(value, f'length {name}', LONGEST)
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LONGEST:
+        return float(value)
+    raise SubjectError(
+        f'length {name} must be a number from {-LONGEST:g} to {LONGEST:g}, saw {value!r}'
+    )
 
 
 def _pixel(name: str, value: Any) -> tuple[float, float]:

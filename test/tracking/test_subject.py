@@ -67,6 +67,19 @@ def test_writing_and_reading_gives_the_same(body, tmp_path):
     assert (read.segment_lengths, read.stature) == (parsed.segment_lengths, parsed.stature)
 
 
+@pytest.mark.parametrize('rise', [-0.03, 0, 0.02])
+def test_shoulders_may_lie_below_the_neck(rise):
+    measured = {'shoulder_rise': rise, 'trunk': 0.4}
+    found = parse_subject(content(segment_lengths_m=measured), load_body('human37'))
+    assert found.segment_lengths == measured
+
+
+@pytest.mark.parametrize('rise', [-3.1, float('nan'), 'low', True])
+def test_a_rise_that_is_none(rise):
+    with pytest.raises(SubjectError, match='shoulder_rise must be a number from -3 to 3, saw'):
+        parse_subject(content(segment_lengths_m={'shoulder_rise': rise}), load_body('human37'))
+
+
 def one_line(caught) -> str:
     text = str(caught.value)
     assert '\n' not in text
