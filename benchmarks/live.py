@@ -206,11 +206,10 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
         camera.spin(player, lambda: len(arrived[topic]) > 2, START_SECONDS)
         shift, start_ns = camera.begin(player)
         before = [cpu_seconds(node) for node in processes]
-        at_first = sum(memory(node) for node in processes)
         received = _received(player, nodes[0])
         camera.spin(
             player, camera.ended, len(stamps) / rate + PATIENCE,
-            every=lambda: memories.append(sum(memory(node) for node in processes)),
+            every=lambda: memories.append(sum(memory(node, 'Pss_Anon') for node in processes)),
         )  # fmt: skip
         spent = [cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)]
         memory_mb = sum(memory(node) for node in processes)
@@ -247,8 +246,8 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
             float(np.median(part)) for part in (latencies[: count // 4], latencies[-count // 4 :])
         ],
         'memory_mb': memory_mb,
-        'grown_mb': memory_mb - at_first,
-        # Of the second half, by when everything has happened once.
+        # In all, and in the second half, by when everything has happened once.
+        'grown_mb': memories[-1] - memories[0] if memories else 0.0,
         'grown_later_mb': memories[-1] - memories[len(memories) // 2] if memories else 0.0,
         'cpu_s': dict(zip((node.name for node in processes), spent, strict=True)),
         'cpu_ms_per_pose': 1e3 * sum(spent) / count,

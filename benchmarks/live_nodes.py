@@ -222,10 +222,16 @@ def cpu_seconds(node: LiveNode) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
-def memory(node: LiveNode) -> float:
-    """Memory of the process of a node that no other shares, MB."""
+def memory(node: LiveNode, part: str = 'Pss') -> float:
+    """Memory of the process of a node, MB.
+
+    Args:
+        part: 'Pss', with its share of files that other processes have in memory, too, or
+            'Pss_Anon', without any: other processes do not change that.
+    """
     text = Path(f'/proc/{node.process.pid}/smaps_rollup').read_text('utf-8')
-    return sum(int(line.split()[1]) for line in text.splitlines() if line.startswith('Pss:')) / 1e3
+    (line,) = (line for line in text.splitlines() if line.startswith(f'{part}:'))
+    return int(line.split()[1]) / 1e3
 
 
 def _ignored(topic: str, stamp: int, data: bytes) -> None:
