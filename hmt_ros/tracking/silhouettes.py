@@ -43,7 +43,7 @@ class Silhouettes:
 
     Args:
         background: the empty scene, or a model that is to learn it.
-        shared: whether the background is that of other people, too: somebody else learns it.
+        shared: whether other people share the background; it is then learned elsewhere.
 
     Attributes:
         background: as far as it is known.
