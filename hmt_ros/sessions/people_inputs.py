@@ -61,7 +61,7 @@ class PeopleReader:
         """The people in a message.
 
         Args:
-            sigma_px: standard deviation of keypoints without covariances, px; 0: as is learned.
+            sigma_px: standard deviation of keypoints without covariances, px; 0: learned ones.
 
         Raises:
             MessageError: it can not be used.
