@@ -67,7 +67,7 @@ CORE = tuple(
     LANDMARKS.index(name)
     for name in ('left_shoulder', 'right_shoulder', 'left_hip', 'right_hip', 'mid_hip')
 )
-# Joints of our bodies that a keypoint without a scheme may be called.
+# Joints of our bodies that may name a keypoint without a scheme.
 OF_JOINTS = {'pelvis': 'mid_hip', 'neck': 'neck_base', 'head': 'centre_of_head'}
 # Lengths of a person whose proportions are inputs; a rise of the shoulders has none.
 PROPORTIONED = (
@@ -261,7 +261,7 @@ class Lifter:
     """Predicts mixtures over whole poses from windows of keypoints.
 
     Args:
-        usual: body with the usual lengths, whose joints they are.
+        usual: body with the usual lengths, to which the joints belong.
     """
 
     def __init__(
