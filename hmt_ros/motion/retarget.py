@@ -3,7 +3,7 @@
 Every motion file has a skeleton of its own. The lengths are measured on the recorded joints; a
 closed-form start follows the limbs outwards (the descending solution of KJS 3); then all frames at
 once are refined on the joint positions within the joint limits. Sweeps that pull every frame
-towards its neighbours determine what joint positions leave open, the twist of a straight limb.
+towards its neighbours determine the twist of a straight limb, which joint positions leave open.
 """
 
 from __future__ import annotations
