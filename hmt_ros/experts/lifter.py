@@ -172,7 +172,7 @@ def window_inputs(
     """Inputs of N windows of S images with L landmarks.
 
     Args:
-        rays: (N, S, L, 2) x / z and y / z of the rays of the landmarks; any where there is none.
+        rays: (N, S, L, 2) x / z and y / z of the rays of the landmarks; any without a landmark.
         confidences: (N, S, L) from 0, not seen, to 1.
         times: (N, S) of the images relative to now, s.
         ups: (N, 3) unit vectors against gravity, camera frame; 0: unknown.

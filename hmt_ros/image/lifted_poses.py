@@ -108,8 +108,8 @@ class LiftedPoses:
 def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
     """One mixture of several opinions of one pose, each of which counts the same.
 
-    They read the same image, so that none confirms another: the density is the mean of theirs. Of
-    joints that one opinion lacks it says that they may be anywhere.
+    They read the same image, so that none confirms another: the density is the mean of theirs. A
+    joint that one opinion lacks may, by that opinion, be anywhere.
     """
     first = opinions[0]
     if len(opinions) == 1:
