@@ -151,7 +151,7 @@ def own_skeletons(
 ) -> tuple[tuple[str, ...], Array]:
     """The people with a skeleton of their own, each once, and its relative lengths (n, L).
 
-    Motions are often put on a skeleton that many share; of such a skeleton nothing is learned.
+    Motions are often put on a skeleton that many share; nothing is learned from such a skeleton.
 
     Args:
         people: (N,) whose skeleton each is.
