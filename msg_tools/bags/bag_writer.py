@@ -97,7 +97,7 @@ class BagFolder:
             type_hash: RIHS01 hash of the type, or ''.
 
         Returns:
-            What `add_message` wants.
+            Number of the channel, for `add_message`.
         """
         with self.dropping_on_error():
             schema = 0
