@@ -97,7 +97,7 @@ def body_from_motion(motion: Motion, body: Body) -> Body:
 def hip_drop_share(body: Body) -> float:
     """Length `hip_drop` over the distance from the pelvis to the middle of the hips."""
     if not set(HIPS) <= set(body.joint_names):
-        return 1.0  # who needs more than the joints says what
+        return 1.0  # a caller that needs more than these joints names what is missing
     rest = body.joint_positions(np.zeros((1, body.dimension)))[0]
     pelvis, left, right = rest[body.skeleton.joint_index(HIPS)]
     distance = float(np.linalg.norm(0.5 * (left + right) - pelvis))

@@ -371,7 +371,7 @@ def _ranges(start: Index, stop: Index) -> tuple[Index, Index]:
 Depth = NDArray[np.floating]
 
 # Standard deviation and step of the disparity, divided by focal length and distance of the eyes:
-# what the square of a depth is multiplied with, 1/m.
+# factors on the square of a depth, 1/m.
 NOISE, STEP = 0.0020, 0.0008
 # Standard deviation of the blur that makes neighbouring errors alike, px.
 BLUR = 1.5
