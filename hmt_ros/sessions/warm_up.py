@@ -1,6 +1,6 @@
 """The warm-up of sessions before the first message, so that no message waits for compiled code.
 
-numba compiles a kernel, or loads what was compiled, at its first call. A short film, and mixtures
+numba compiles a kernel, or loads its compiled code, at its first call. A short film, and mixtures
 as if of one, run all of them; only the compiled code is kept (`Session.prepare`).
 """
 

@@ -73,8 +73,8 @@ class MixtureSmoother:
         dynamics: of the state.
         lower, upper: (d,) limits of the pose at every time; None: none.
         max_trajectories: components of the result at most.
-        adapt: what the descent of the free energy changes: some of 'weights', 'means', 'inflation',
-            'covariances'; empty: nothing.
+        adapt: variables of the descent of the free energy: some of 'weights', 'means', 'inflation',
+            'covariances'; empty: no descent.
         start: 'laplace' weighs optima by their mass, 'peak' by their height, as VMS does.
         max_iterations: of the descent of the free energy.
         through_modes: whether, besides the best paths between the ends, those through every single

@@ -265,7 +265,7 @@ def poses_to_search(
     """Poses (N, d) of a person from an image alone; None: it shows none.
 
     The body keeps its lengths and flesh. From keypoints come all poses that explain them, from
-    a silhouette mean poses of several headings at its place, and what was predicted.
+    a silhouette mean poses of several headings at its place, and predicted poses.
     """
     found = []
     keypoints, depths = observation.keypoints, observation.evidence.get(DEPTH.name)

@@ -23,7 +23,7 @@ person does so in every image that shows the same. People move, if only a little
 
 An image that has changed for the most part is no evidence: a covered lens, a flash, noise. The
 colours of a track are no evidence against somebody when the camera has moved: they may have been
-those of a thing. For a person whom others hide only the keypoints that are seen count. So only an
+those of a thing. For a person hidden by others, only evidence for the person counts. So only an
 image that shows the place empty ends a track: without it r tends to b / (b + l), which is far above
 `ABSENT`.
 """
@@ -124,8 +124,8 @@ class Existence:
         seen: whether the last image shows a filter something to follow: a cue shows somebody, or
             none shows nobody and the image can be used.
         hidden: whether others hid most of the person in the last image.
-        elsewhere: whether it shows somebody where no mode is, or after so long that the modes tell
-            nothing: the track has to search.
+        elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
+            of no use: the track has to search.
     """
 
     def __init__(self, probability: float = NOBODY_YET) -> None:

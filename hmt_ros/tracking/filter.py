@@ -306,7 +306,7 @@ class MixtureFilter:
         self.check_depths(body, modes.poses[0], observation.depths, self._dt)
 
     def check_depths(self, body: Body, pose: Array, depths: ImageMap | None, dt: float) -> None:
-        """Takes in how far depths, if there are some, show a body at a pose (d,).
+        """Takes in the misfit of depths, if there are some, to a body at a pose (d,).
 
         Args:
             body, pose: of the best mode.

@@ -123,7 +123,7 @@ def posterior_modes(
 def likelihood_modes(
     modes: Modes, posterior: Posterior, observation: Observation, shape: ShapeEstimate
 ) -> Likelihood:
-    """The modes of the likelihood alone, without what was known from the images before.
+    """The modes of the likelihood alone, without information from the images before.
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
     parabola; its minimum and curvature make a component, its depth and its volume the weight, of at

@@ -1,6 +1,6 @@
 """States of modes, poses with their velocities: predicted, and corrected by where poses were found.
 
-A mode's pose x and velocity v have one Gaussian. An image tells only of x: when it has been found
+A mode's pose x and velocity v have one Gaussian. An image shows only x: when it has been found
 at x* with the covariance P*, the prediction N((x, v), P) is conditioned on it,
 
     G = P_vx P_xx^-1,    v* = v + G (x* - x),    P*_vv = P_vv - G P_xv + G P* G',    P*_vx = G P*

@@ -101,7 +101,7 @@ def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | 
 
 
 def _depths_at(depths: ImageMap, pixels: Array) -> Array:
-    """Depths (P,) of what lies in front around pixels (P, 2), m; 0 where nothing was measured."""
+    """Depths (P,) of the front surface around pixels (P, 2), m; 0 where nothing was measured."""
     values = depths.values[0]
     height, width = values.shape
     steps = np.arange(-AROUND, AROUND + 1)

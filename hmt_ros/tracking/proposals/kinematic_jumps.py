@@ -1,7 +1,7 @@
 """Kinematic jump sampling: other configurations of the limbs and of the trunk (KJS 3, 4).
 
 For each trunk that the modes have, every limb has alternatives: those of the modes, all their
-flips, and, where no keypoints show it or the image is surprising, what a search of the image found.
+flips, and, where no keypoints show it or the image is surprising, the results of an image search.
 Combinations of alternatives are rated on the trunk as it is, with limbs exchanged that were taken
 for each other, and with the torso flipped; the best that stand for all become candidates.
 

@@ -60,7 +60,7 @@ class PosePrediction:
         )
 
     def both_ways(self, body: Body) -> GaussianMixture:
-        """As `seen_as`, with the reversal in depth, which a silhouette does not tell from it."""
+        """As `seen_as`, with the reversals in depth, which have nearly the same silhouettes."""
         seen = self.seen_as(body)
         return GaussianMixture(
             np.tile(0.5 * seen.weights, 2),
