@@ -88,7 +88,7 @@ def folder_in_use() -> str:
 
 
 class CompiledFunctions:
-    """Functions that numba compiles from now on; those that it loads are none of them."""
+    """Functions that numba compiles from now on; those that it loads do not count."""
 
     def __init__(self) -> None:
         from numba.core import event

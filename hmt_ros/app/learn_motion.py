@@ -249,7 +249,7 @@ def _groups(body: Body) -> list[list[int]]:
 
 
 def _moments(pairs: Array, interval: float) -> tuple[float, float, float, float]:
-    """Interval, variance and covariance of pairs (N, 2, m), and how many independent ones count."""
+    """Interval, variance and covariance of pairs (N, 2, m), and number of independent ones."""
     variance = float(np.mean(pairs**2))
     # Intervals overlap.
     count = len(pairs) * INTERVALS[0] / (interval * len(INTERVALS))

@@ -52,7 +52,7 @@ FRAME_ID = 'camera_optical_frame'
 # The world, z up and 0 on the floor.
 WORLD = 'odom'
 START_NS = 1_700_000_000 * SECOND_NS  # stamp of the first image
-# Of two people each has an own file of the truth.
+# Each of two people has a file of the truth.
 FILES_BESIDE = ('background.png', 'subject.yaml', 'truth.npz', 'truth_a.npz', 'truth_b.npz')
 CLICK_SIGMA = 2.0  # px
 OF_CLICKS = 5  # stream of random numbers of a seed; `hmt_ros.image` uses others

@@ -84,8 +84,8 @@ class FloorPlane:
         up_sigma: standard deviation of its angle, rad.
         height: of the camera over the floor, m; None: unknown.
         height_sigma: standard deviation of the floor's height where the person is, m.
-        measured: whether the height is known apart from the person's own feet. If not, it says
-            where they have stood, and nothing of where they are.
+        measured: whether the height is known apart from the person's own feet. If not, it shows
+            where they stood before, not where they are.
     """
 
     up: Array

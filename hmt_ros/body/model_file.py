@@ -34,7 +34,7 @@ AXES = {
     'tx': (0, False), 'ty': (1, False), 'tz': (2, False),
 }  # fmt: skip
 MIRROR = np.array([-1.0, 1.0, 1.0])
-DIFFUSION = (0.25, 1.4)  # of a root whose model file says nothing, m and rad after one second
+DIFFUSION = (0.25, 1.4)  # of a root that the model file gives none, m and rad after one second
 LARGEST_FILE = 1_000_000  # bytes; a body is a few kB
 
 

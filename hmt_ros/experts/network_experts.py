@@ -107,7 +107,7 @@ class NetworkExperts(ConditionalDensity):
         centres: Array,
         spacing: float,
     ) -> None:
-        """Takes what has been learned.
+        """Takes the results of learning.
 
         Args:
             layers: with the outputs gates (M), log widths (M) and means (M D).

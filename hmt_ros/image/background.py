@@ -102,7 +102,7 @@ class BackgroundModel:
         self.changed = 0.0
         self._shape: tuple[int, ...] = ()
         self._nearby: tuple[Image, Image] | None = None
-        # The last image and what was found in it: several people ask for the same.
+        # The last image and its result: several people ask for the same.
         self._last: tuple[Image, Image] | None = None
         self._parts: _Parts | None = None
 

@@ -37,7 +37,7 @@ SIGMA, SHARE = 1.5, 0.15
 SCALE = 2.0
 # Fewer points than this do not make each of them count more.
 FEWEST = 20
-# Flow of smaller images is none, px.
+# Smaller images, px, have a flow of 0.
 SMALLEST = 32
 
 

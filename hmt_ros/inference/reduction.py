@@ -176,7 +176,7 @@ def _squared_distances(w: Array, m: Array, s: Array, log_det: Array, pairs: Inde
 def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> GaussianMixture:
     """At most `count` components: clusters of means, then descent of the bound of `assignment`.
 
-    Where pairwise merging opens with a lower bound than the clusters, it is what descends.
+    Where pairwise merging gives a lower bound than the clusters, the descent starts from it.
 
     Raises:
         ValueError: count < 1.

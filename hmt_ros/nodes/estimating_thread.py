@@ -120,7 +120,7 @@ class InputQueue:
             return None if self._closed else self._take_out()
 
     def close(self) -> Arrived:
-        """Ends every `get`; returns what waited."""
+        """Ends every `get`; returns the waiting messages."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -241,7 +241,7 @@ class EstimatingThread:
         return [self._durations.popleft() for _ in range(len(self._durations))]
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Ends the thread after the present message; drops what waits, except a restart.
+        """Ends the thread after the present message; drops waiting ones, except a restart.
 
         Returns:
             Whether the thread has ended within `timeout` s.

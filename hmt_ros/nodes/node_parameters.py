@@ -106,7 +106,7 @@ def next_step(node: Node, error: ValueError, checked: Iterable[str]) -> str:
 def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
     """Warnings of parameter files in which a node is not named as it is called.
 
-    A file for other nodes is none: one file may serve many nodes.
+    A file for other nodes gives no warning: one file may serve many nodes.
 
     Args:
         node: its full name.

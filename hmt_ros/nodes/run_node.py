@@ -68,7 +68,7 @@ def run_together(
     def stop(*_: object) -> None:
         stopped.set()
         if any(node.preparing for node in nodes):
-            # Nothing is lost: what has been compiled is kept, function by function.
+            # Nothing is lost: compiled code is kept, function by function.
             sys.stderr.flush()
             os._exit(0)
 

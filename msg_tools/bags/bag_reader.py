@@ -159,7 +159,7 @@ class BagMessage:
         are zero or empty.
 
         Raises:
-            BagError: its bytes are not what its type wants, or the type is not known.
+            BagError: its bytes do not fit its type, or the type is not known.
         """
         return self._deserialise(self)
 

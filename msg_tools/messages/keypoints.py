@@ -81,7 +81,7 @@ def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
 def checked_keypoints(
     names: tuple[str, ...], pixels: Array, confidences: Array, covariances: Array | None = None
 ) -> Keypoints:
-    """Keypoints as a detector tells them; those that were not seen lose the rest.
+    """Keypoints as a detector reports them; those that were not seen lose their other values.
 
     Args:
         names: (n,), each once.

@@ -43,7 +43,7 @@ class Outline(NamedTuple):
     Attributes:
         pixels: (M, 2).
         normals: (M, 2) unit vectors out of the silhouette.
-        beliefs: (M,) how far each is believed, 0 to 1.
+        beliefs: (M,) belief in each, 0 to 1.
     """
 
     pixels: Array
