@@ -154,7 +154,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """The topics to subscribe to, the one that sets the pace last."""
 
     def _messages_of_others(self, settings: Parameters) -> Mapping[str, str]:
-        """Types of messages of packages that need not be installed, each with its user.
+        """Types of messages of packages that need not be installed, each with its consumer.
 
         Raises:
             ValueError: none of those that would do is installed.

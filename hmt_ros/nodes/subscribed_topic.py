@@ -100,7 +100,7 @@ def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
 
 
 def types_of_others(rows: Iterable[ImageInput], source: str) -> dict[str, str]:
-    """Types of messages of other packages that a `source` needs, each with its user."""
+    """Types of messages of other packages that a `source` needs, each with its consumer."""
     return {row.types[DETECTIONS]: f'source {source}' for row in rows if DETECTIONS in row.types}
 
 
@@ -124,7 +124,7 @@ def read_installed_messages(msgtype: str, needed_by: str) -> None:
     """Reads the definitions of a package of messages, as it is installed.
 
     Args:
-        needed_by: its user, for the error.
+        needed_by: consumer of the messages, for the error.
 
     Raises:
         ValueError: the package is not installed.

@@ -190,7 +190,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             previous = self._seen(mask, shown.camera, previous).mixture
 
     def _forget(self) -> None:
-        # The learned background is kept.
+        # The known background is kept.
         self._previous = None
         self._looked = self._tracked = None
         self._by_keypoints = None

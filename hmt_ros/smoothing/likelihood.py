@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Modes whose density is below exp(-60) of the greatest are left out: less than rounding.
 NEGLIGIBLE = 60.0
 # Probability that the pose is none of the modes of an image. Such an image says next to nothing,
-# which costs 50 nats and more in 37 dimensions; compared with that its value hardly matters.
+# which costs 50 nats and more in 37 dimensions: beside that, this probability hardly matters.
 MISSED = 0.01
 
 
