@@ -1,8 +1,8 @@
-"""Where compiled kernels are kept: by the state of many sources, and not by that of one file alone.
+"""The folder of compiled kernels: it follows from the state of many sources, not of one file alone.
 
 numba compiles a kernel anew when its own file changes. A kernel holds code of other files, too, and
-names types of them: what was compiled before one of these changed must not be loaded. All of them
-lie in `FOLDERS`, so that other changes compile nothing.
+names their types: code from before one of these changed must not be loaded. All of them lie in
+`FOLDERS`, so that other changes compile nothing.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ INTERVAL, _GLANCE = 5.0, 0.1
 
 
 def keep_compiled_code_apart(package: Path) -> None:
-    """Has numba keep what it compiles in a folder of this state of a package.
+    """Makes numba keep compiled code in a folder for this state of a package.
 
     The folder is in the package, or in the user's cache where that can not be written. There it
-    begins with a copy of what was compiled when the package was installed: numba loads nothing
+    begins with a copy of the code compiled when the package was installed: numba loads nothing
     from a folder that it can not write. One that the environment names (`NUMBA_CACHE_DIR`) is used
     as it is.
     """
@@ -83,12 +83,12 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def folder_in_use() -> str:
-    """Where code that is compiled now is kept."""
+    """The folder in which code that is compiled now is kept."""
     return os.environ.get(VARIABLE, '')
 
 
 class CompiledFunctions:
-    """Functions that numba compiles from now on; those that it loads are none of them."""
+    """Functions that numba compiles from now on; those that it loads do not count."""
 
     def __init__(self) -> None:
         from numba.core import event
@@ -120,10 +120,10 @@ def compiling() -> bool:
 
 
 def prepare(work: Callable[[], None], tell: Callable[[str], None]) -> None:
-    """Does work that compiles kernels, or loads them, and tells of it while it takes long.
+    """Does work that compiles kernels, or loads them, and reports it while it takes long.
 
     Args:
-        work: what runs them.
+        work: runs them.
         tell: takes lines of text: when a kernel begins to be compiled, every `INTERVAL` s from then
             on, and at the end. It is called from another thread, too, but never at the same time.
     """

@@ -8,7 +8,7 @@ import sys
 import hmt_ros
 from hmt_ros.app.command_line import until_nobody_reads
 
-# Command: (module, what it does). A module is imported when its command runs.
+# Command: (module, description). A module is imported when its command runs.
 COMMANDS = {
     'track-video': ('hmt_ros.app.track_video', 'import a video, track the person, write a report'),
     'import-video': (

@@ -212,7 +212,7 @@ def until_nobody_reads(printing: Callable[[], int]) -> int:
 def number(
     low: float, high: float, *, what: str = 'a number', unit: str = ''
 ) -> Callable[[str], float]:
-    """Reader of a number in a range; errors name what is wanted and its unit."""
+    """Reader of a number in a range; errors name the range and the unit."""
 
     def read(text: str) -> float:
         try:

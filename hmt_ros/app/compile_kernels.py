@@ -1,6 +1,6 @@
 """compile: compiles all kernels, so that the first image of a node or a command does not wait.
 
-What it runs is what the nodes run before they are active. What is compiled is kept (see
+It runs the same work as the nodes do before they are active. Compiled code is kept (see
 `hmt_ros.compiled_code`).
 """
 

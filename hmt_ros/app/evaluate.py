@@ -234,7 +234,7 @@ def score_bag(
 
 
 def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
-    """Scores of the verticals in a bag, by topic; those of which nothing is true are left out.
+    """Scores of the verticals in a bag, by topic; those without a true one are left out.
 
     Raises:
         ValueError: messages that can not be understood.

@@ -83,7 +83,7 @@ def _lengths(path: Path, body: Body) -> tuple[str, Array]:
     return path.stem, lengths
 
 
-# How many people the spreads of the body model count as.
+# Number of people that the spreads of the body model count as.
 USUAL_PEOPLE = 10.0
 ADDITIVE = ('shoulder_rise',)
 # Lengths that do not change with the pose in any skeleton, and how alike they are in copies of one.
@@ -151,7 +151,7 @@ def own_skeletons(
 ) -> tuple[tuple[str, ...], Array]:
     """The people with a skeleton of their own, each once, and its relative lengths (n, L).
 
-    Motions are often put on a skeleton that many share; of such a skeleton nothing is learned.
+    Motions are often put on a skeleton that many share; nothing is learned from such a skeleton.
 
     Args:
         people: (N,) whose skeleton each is.
@@ -177,7 +177,7 @@ def learned_spread(
     Args:
         relative: (N, L) relative lengths of N people.
         usual: before any people.
-        usual_people: how many people that counts as, m.
+        usual_people: number of people that it counts as, m.
 
     Raises:
         ValueError: fewer than two people.

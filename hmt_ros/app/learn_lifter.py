@@ -138,7 +138,7 @@ def _learn(options: argparse.Namespace) -> int:
 def _scores(
     body: Body, tested: list[PoseSequence], lifter: Lifter, windows: WindowSettings
 ) -> dict[str, str]:
-    """Scores on motions of other people, as text by what the keypoints are."""
+    """Scores on motions of other people, as text by kind of keypoints."""
     tracks = keypoint_tracks(body, tested, [1.0] * len(tested), variants=1)
     known = replace(
         windows, cut=0.0, causal=0.0, gravity_spread=0.0, lengths_spread=0.0, lengths=1.0

@@ -51,7 +51,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.motion_file import read_motion
 from msg_tools.files.error_line import error_line
 
-# Relative difference of a motion's rate from that of the poses which is put up with.
+# Largest accepted relative difference of a motion's rate from that of the poses.
 SAME_RATE = 0.01
 
 Item = TypeVar('Item')
@@ -178,7 +178,7 @@ def data_card(sequences: list[PoseSequence], acknowledgement: str) -> str:
 # Intervals, in frames of 30 Hz, and the one that couplings are measured at.
 INTERVALS = (1, 2, 3, 4, 5, 6)
 COUPLED = 3
-# Displacements are cut at this quantile of their size: what exceeds it are faults of recordings.
+# Displacements are cut at this quantile of their size: larger ones are faults of recordings.
 USUAL = 0.995
 # How far correlations are shrunk to 0.
 SHRINKAGE = 0.05
@@ -249,7 +249,7 @@ def _groups(body: Body) -> list[list[int]]:
 
 
 def _moments(pairs: Array, interval: float) -> tuple[float, float, float, float]:
-    """Interval, variance and covariance of pairs (N, 2, m), and how many independent ones count."""
+    """Interval, variance and covariance of pairs (N, 2, m), and number of independent ones."""
     variance = float(np.mean(pairs**2))
     # Intervals overlap.
     count = len(pairs) * INTERVALS[0] / (interval * len(INTERVALS))

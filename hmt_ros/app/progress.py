@@ -33,8 +33,8 @@ class ProgressLines:
     A context manager with the interface of tqdm, as far as it is used here.
 
     Args:
-        what: what is made, the beginning of each line.
-        unit: what is counted, in the plural; '' if nothing is.
+        what: name of the product, the beginning of each line.
+        unit: name of the unit, in the plural; '' if nothing is counted.
         total: number of units of the whole; None if unknown; may be set later.
         file: where the lines go; None: stderr.
         clock: gives the time, s.
@@ -75,7 +75,7 @@ class ProgressLines:
         self._count += n
 
     def line(self) -> str:
-        """How much of how many is done, at what rate, and how much time is left."""
+        """Units that are done, of the total, with their rate and the time left."""
         spent = self._clock() - self._start
         so_far = f'{_duration(spent)} so far'
         if compiling():
@@ -130,8 +130,8 @@ def show_progress(
     """The progress of a command, as a bar or as lines.
 
     Args:
-        what: what is made: a name of a file, or a verb such as 'reading'.
-        unit: what is counted, in the plural; '' if nothing is.
+        what: name of a file that is made, or a verb such as 'reading'.
+        unit: name of the unit, in the plural; '' if nothing is counted.
         total: number of units of the whole; None if unknown.
     """
     if quiet or _is_wide_terminal():

@@ -9,7 +9,7 @@ height of the camera). `/tf_static` tells where the camera is in `odom`, as a ro
 A bag of several people, such as two who walk past each other, has instead of `/ground_truth` and
 `/body` the topics `/humans/bodies/a/ground_truth`, `.../b/ground_truth` and `/detections`
 (hmt_msgs/People2D: COCO keypoints of all, without identities). A keypoint that another person hides
-is not detected, and somebody of whom fewer than `FEWEST` keypoints are seen is not detected at all.
+is not detected, and a person with fewer than `FEWEST` visible keypoints is not detected at all.
 The order of the people in a message is random. Beside it are `background.png`, and `truth_a.npz`
 and `truth_b.npz`, without silhouettes.
 """
@@ -52,7 +52,7 @@ FRAME_ID = 'camera_optical_frame'
 # The world, z up and 0 on the floor.
 WORLD = 'odom'
 START_NS = 1_700_000_000 * SECOND_NS  # stamp of the first image
-# Of two people each has an own file of the truth.
+# Each of two people has a file of the truth.
 FILES_BESIDE = ('background.png', 'subject.yaml', 'truth.npz', 'truth_a.npz', 'truth_b.npz')
 CLICK_SIGMA = 2.0  # px
 OF_CLICKS = 5  # stream of random numbers of a seed; `hmt_ros.image` uses others
@@ -64,7 +64,7 @@ MEASURED = (
 
 CROSSING = 'crossing'
 PEOPLE = ('a', 'b')
-# How far one walks before the other, m, and the most that each turns from walking straight across.
+# Distance by which one walks before the other, m; largest turn of each from straight across.
 BEFORE = 0.9
 TURN = np.radians(12.0)
 # Statures, as a share of the model's.
@@ -160,7 +160,7 @@ def _write_truth(
     scene: Scene,
     masks: NDArray[np.uint8] | None = None,
 ) -> None:
-    """Writes what is true of a motion; without silhouettes where there are none."""
+    """Writes the ground truth of a motion; without silhouettes where there are none."""
     silhouettes: dict[str, Any] = {} if masks is None else {'masks': masks}
     count = len(take.poses)
     np.savez_compressed(
@@ -342,7 +342,7 @@ def detection(
     points = frames.points(skeleton.joint_segments[at], local)[:, :, 0]
     exact = camera.project(points)
     pixels = exact + rng.normal(0.0, NOISE, exact.shape) * (camera.fx / points[:, 2:])
-    # What lies on the edge of the person belongs to it.
+    # A keypoint on the edge of the person belongs to it.
     near = cv2.dilate(own.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     column, row = np.nan_to_num(np.round(exact), nan=-1.0).astype(int).T
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)

@@ -87,7 +87,7 @@ class PartShape:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A person: what a pose vector means, and what it looks like.
+    """A person: the meaning of a pose vector, and the shape of the flesh.
 
     Poses have shape (N, d): root translation in the camera optical frame (m), root rotation, joint
     angles (rad). Made by `load_body`.
@@ -98,14 +98,14 @@ class Body:
         prior_mean, prior_sigma: (d,) Gaussian prior of each degree of freedom; sigma is inf where
             there is none.
         rates: (d,) variance that each degree of freedom gains per second by itself, m^2 or rad^2.
-        length_covariance: (L, L) of the lengths over people, or of what is known of this person's,
+        length_covariance: (L, L) of the lengths over people, or of the estimate for this person,
             m^2.
         stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
             at the default lengths; it scales with them).
         default_lengths: (L,) lengths of the model file, m.
         symmetries: poses that a camera takes for each other, by map; see `Symmetry`.
         joint_errors: (J,) standard deviation of a coordinate of each joint, relative to the pelvis,
-            that is wrong in every pose, because people's joints are not exactly the model's, m.
+            that all poses share, because people's joints are not exactly the model's, m.
         growth: (B, 5) how each part differs from the model's; see `GROWTH`.
     """
 
@@ -253,7 +253,7 @@ class Body:
         return kinematics.joint_positions(self.skeleton, poses)
 
     def relative_joints(self, poses: ArrayLike) -> Array:
-        """Joints (N, J, 3) of poses (N, d) relative to the first, m: what poses are compared by."""
+        """Joints (N, J, 3) of poses (N, d) relative to the first, m, for comparisons of poses."""
         joints = self.joint_positions(poses)
         return joints - joints[:, :1]
 
@@ -351,7 +351,7 @@ def symmetries_of(entries: Mapping[str, Any]) -> Mapping[str, Symmetry]:
     """The table of a model file: rates by map.
 
     Raises:
-        ValueError: a map that there is not, one that is missing, or a rate that is not positive.
+        ValueError: a map that is unknown or missing, or a rate that is not positive.
     """
     if set(entries) != set(MAPS):
         raise ValueError(f'symmetries: wanted rates of {list(MAPS)}, saw {list(entries)}')

@@ -47,7 +47,7 @@ LEAN_TAILS, FLOOR_TAILS = 2.0, 4.0
 
 @dataclass(frozen=True)
 class GroundSettings:
-    """How far what is known of gravity and floor counts.
+    """Weights of the known gravity and floor.
 
     Attributes:
         upright_weight: Factor on the prior of the lean of pelvis and trunk against the vertical; it
@@ -84,8 +84,8 @@ class FloorPlane:
         up_sigma: standard deviation of its angle, rad.
         height: of the camera over the floor, m; None: unknown.
         height_sigma: standard deviation of the floor's height where the person is, m.
-        measured: whether the height is known apart from the person's own feet. If not, it says
-            where they have stood, and nothing of where they are.
+        measured: whether the height is known apart from the person's own feet. If not, it shows
+            where they stood before, not where they are.
     """
 
     up: Array
@@ -283,7 +283,7 @@ def soles(body: Body) -> Soles:
             points = np.array([heel, own]) + ANKLE_HEIGHT * body.stature * down
         for sign in (-1.0, 1.0):
             lowest = points @ (np.cos(PITCH) * down + sign * np.sin(PITCH) * ahead)
-            # The middle of the points that are lowest alike: left and right of the middle line.
+            # The middle of the equally low points: left and right of the middle line.
             local.append(points[lowest > lowest.max() - 1e-6].mean(0))
             segments.append(carrier)
     feet = np.array([0, 0, 1, 1], dtype=np.intp)

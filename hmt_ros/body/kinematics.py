@@ -143,7 +143,7 @@ def _checked(skeleton: Skeleton, poses: ArrayLike) -> Array:
     Raises:
         ValueError: they do not have d columns or are not finite.
     """
-    # Writable: compiled code is compiled again for what can not be written.
+    # Writable: kernels are compiled again for read-only arrays.
     q = np.require(poses, np.float64, ('C', 'W'))
     if q.ndim != 2 or q.shape[1] != skeleton.dimension:
         raise ValueError(

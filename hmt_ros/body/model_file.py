@@ -6,7 +6,7 @@ Lengths vary over people by a common stature, and by proportions of their own:
     S_l = L0 (t^2 1 1' + diag(p^2)) L0,    L0 = diag(l0)
 
 to first order in the spreads. t is the spread of the stature, p_i that of the proportion of a
-length. What is measured on a person holds linear functions of the lengths, H l:
+length. Measurements of a person fix linear functions of the lengths, H l, with the covariance R:
 
     S_l <- S_l - S_l H' (H S_l H' + R)^-1 H S_l
 """
@@ -34,7 +34,7 @@ AXES = {
     'tx': (0, False), 'ty': (1, False), 'tz': (2, False),
 }  # fmt: skip
 MIRROR = np.array([-1.0, 1.0, 1.0])
-DIFFUSION = (0.25, 1.4)  # of a root whose model file says nothing, m and rad after one second
+DIFFUSION = (0.25, 1.4)  # of a root that the model file gives none, m and rad after one second
 LARGEST_FILE = 1_000_000  # bytes; a body is a few kB
 
 
@@ -82,7 +82,7 @@ def named_body(name: str) -> Body:
 
 
 def _read(source: str | Path) -> dict[str, Any]:
-    """The content of a model file, with what it extends."""
+    """The content of a model file, with that of the file it extends."""
     if str(source) in model_names():
         return deepcopy(_shipped(str(source)))
     path = Path(source)
@@ -140,7 +140,7 @@ def _whole(content: Any) -> dict[str, Any]:
 
 
 def _sides(template: str) -> list[tuple[str, str]]:
-    """Names that a template stands for, each with its side; what has no side is as on the right."""
+    """Names that a template stands for, each with its side; without a side, as on the right."""
     sides = ('left', 'right') if '{side}' in template else ('right',)
     return [(template.format(side=side), side) for side in sides]
 

@@ -2,8 +2,8 @@
 
     E(x) = max log p - log p(a(x)) + 1/2 sum_j ((x_j - mean_j) / sigma_j)^2
 
-p is a mixture over the angles a of a pose (`angle_mixture`); the other degrees of freedom j, the
-lean of the root and what the recordings do not show, keep the Gaussians of the model file. With the
+p is a mixture over the angles a of a pose (`angle_mixture`); the other degrees of freedom j (lean
+of the root, angles that recordings do not show) keep the Gaussians of the model file. With the
 responsibilities r_c of the components c, their precisions P_c and g_c = P_c (a - m_c):
 
     dE = sum_c r_c g_c,     H = sum_c r_c P_c,     d2E = H - sum_c r_c g_c g_c' + dE dE'

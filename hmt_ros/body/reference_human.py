@@ -58,7 +58,7 @@ NEEDED = (
         for joint in ('hip', 'knee', 'ankle', 'shoulder', 'elbow', 'wrist')
     ),
 )
-# Sine of the angle below which two bones have one direction, and lengths that are none, m.
+# Sine of the angle below which two bones have one direction, and length that counts as 0, m.
 _STRAIGHT, _NOTHING = 1e-4, 1e-3
 # Angle at which the hips lie before the line down from the pelvis joint, rad: that of our bodies.
 HIPS_AHEAD = np.arctan(0.33)

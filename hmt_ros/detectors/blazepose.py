@@ -33,7 +33,7 @@ SCHEME = 'mediapipe33'
 LANDMARKS = 33
 # Interval without images after which the whole image is searched again, ns.
 _LONGEST_INTERVAL = 1_000_000_000
-# Sides of what the networks see, px, and of the heat maps of landmarks.
+# Sides of the inputs of the networks, px, and of the heat maps of landmarks.
 _PERSON_SIZE, _LANDMARK_SIZE, _HEAT_SIZE = 224, 256, 64
 # Cells of the first network, px, and predictions of each; the overlap from which two are one.
 _STRIDES, _PREDICTIONS, _SAME = (8, 16, 32), (2, 2, 6), 0.3
@@ -43,7 +43,7 @@ _SEEN = 0.5
 _MARGIN = 1.25
 # Half the side of the window of a heat map about its landmark; its least peak.
 _HEAT_REACH, _HEAT_PEAK = 4, 0.5
-# Cutoffs of the one-euro filters, Hz, and what velocities add to them.
+# Cutoffs f_0 of the one-euro filters, Hz, and factors b on velocities, which raise them.
 _VELOCITY_CUTOFF = 1.0
 _LANDMARK_CUTOFF, _CIRCLE_CUTOFF, _POSITION_CUTOFF = (0.05, 80.0), (0.01, 10.0), (0.1, 40.0)
 # The share of an image in the smoothed visibility.

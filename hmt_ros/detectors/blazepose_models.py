@@ -56,7 +56,7 @@ def has_networks() -> bool:
 
 
 def has_runtime() -> bool:
-    """Whether this Python has what runs them."""
+    """Whether this Python has the package that runs them."""
     return importlib.util.find_spec(RUNTIME_MODULE) is not None
 
 

@@ -9,7 +9,7 @@ pelvis. A component N(m, S) over poses becomes one over joint positions by linea
 The diagonal D holds the errors that every pose of the body has, because its joints are not exactly
 those of the person (`Body.joint_errors`), as published covariances of joints do. Without it the
 density would be confined to a surface: 13 joints have 39 coordinates, and fewer degrees of freedom
-move them. s is what an evaluator adds, usually 0.
+move them. s is added by an evaluator, usually 0.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ class Scores:
         return Scores(parts[0].names, *(joined(field.name) for field in fields(Scores)[1:]))
 
     def summary(self) -> dict[str, Any]:
-        """Means over the frames, errors in mm; None for what needs unknown covariances."""
+        """Means over the frames, errors in mm; None for scores that need unknown covariances."""
         errors = {
             key: 1e3 * value.mean(1)
             for key, value in (

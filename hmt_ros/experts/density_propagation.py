@@ -96,7 +96,7 @@ def propagate_by_dynamics(
         predicted: p(x_t | r_t).
         equilibrium: p(x_t). The division by a single Gaussian is exact where that is wider than the
             product; else each product is weighted by 1 / p at its mean.
-        share: of what the observation tells that observations before have not told: the ratio
+        share: of the information of the observation that is new, given those before: the ratio
             p(x_t | r_t) / p(x_t) counts to this power (`inference.error_model`).
         forgotten: probability that the past tells nothing, so that a wrong one is left.
         n_components: Number of components of the result; None takes that of `predicted`.

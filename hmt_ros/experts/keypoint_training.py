@@ -58,7 +58,7 @@ OF_LEGS = BELOW_KNEE | np.array([name in HIPS for name in LANDMARKS])
 
 # Tracks of each motion; from the third on angles wander and trunks are mixed.
 VARIANTS, PLAIN = 4, 2
-# Where landmarks lie differs over people, clothes and detectors by at least so much, m.
+# Least deviation of the places of landmarks over people, clothes and detectors, m.
 LEAST_SIGMA = 0.022
 # Share of the spread of lengths over people by which a variant differs; a length keeps this share.
 OF_SPREAD, SHORTEST_LENGTH = 0.8, 0.4
@@ -218,7 +218,7 @@ def _varied(body: Body, poses: Array, others: Sequence[Array], rng: np.random.Ge
 
 
 def _places(body: Body, poses: Array, rng: np.random.Generator | None) -> Array:
-    """Landmarks and centres (T, L + C, 3) of a person; rng: where they lie differs by person."""
+    """Landmarks and centres (T, L + C, 3) of a person; rng: their places vary by person."""
     names = (*LANDMARKS, *CENTRES)
     joints, offsets = landmark_offsets(body, names)
     if rng is not None:

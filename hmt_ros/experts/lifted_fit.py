@@ -4,10 +4,10 @@
            + E_prior(x)
 
 J_j is joint j of the pose x, a the axes of the person's view, t the middle of the hips; P_l is
-landmark l, A_l what it is across the ray of its keypoint, whose noise is n_l. A closed form gives
-the start (`motion.limb_angles`); linear least squares place it where the landmarks are seen;
-Newton's method within the limits gives the minimum, its Hessian the covariance. How far away the
-person is hardly shows: the spread of people's size is added along the line of sight.
+landmark l, A_l the projection across the ray of its keypoint, whose noise is n_l. A closed form
+gives the start (`motion.limb_angles`); linear least squares place it where the landmarks are seen;
+Newton's method within the limits gives the minimum, its Hessian the covariance. The distance of the
+person hardly shows: the spread of people's size is added along the line of sight.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from hmt_ros.motion.limb_angles import limb_angles
 
 # Where the hips are until they are placed, m before the camera.
 AWAY = np.array([0.0, 0.0, 5.0])
-# Weight of the prior of the body, and of its means: what lifted joints leave open, such as twists.
+# Weight of the prior of the body, for angles that lifted joints leave open, such as twists.
 PRIOR_WEIGHT = 0.3
 ITERATIONS, TOLERANCE = 12, 0.05
 # Factor on deviations across the line of sight, which the keypoints themselves show, and scale of
@@ -158,7 +158,7 @@ def _fitted(
     whiten = (axes[:, None] / deviations[..., None]).transpose(1, 2, 3, 0)
     segments, local = _marks(body)
     m, count = confidences.shape
-    # How far x and y are from those of the ray, a z and b z, m.
+    # Offsets of x and y from those of the ray, a z and b z, m.
     across = np.zeros((count, 3, 3, m))
     across[:, 0, 0] = across[:, 1, 1] = 1.0
     across[:, 0, 2], across[:, 1, 2] = -rays[..., 0].T, -rays[..., 1].T

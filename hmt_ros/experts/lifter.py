@@ -67,7 +67,7 @@ CORE = tuple(
     LANDMARKS.index(name)
     for name in ('left_shoulder', 'right_shoulder', 'left_hip', 'right_hip', 'mid_hip')
 )
-# Joints of our bodies that a keypoint without a scheme may be called.
+# Joints of our bodies that may name a keypoint without a scheme.
 OF_JOINTS = {'pelvis': 'mid_hip', 'neck': 'neck_base', 'head': 'centre_of_head'}
 # Lengths of a person whose proportions are inputs; a rise of the shoulders has none.
 PROPORTIONED = (
@@ -172,7 +172,7 @@ def window_inputs(
     """Inputs of N windows of S images with L landmarks.
 
     Args:
-        rays: (N, S, L, 2) x / z and y / z of the rays of the landmarks; any where there is none.
+        rays: (N, S, L, 2) x / z and y / z of the rays of the landmarks; any without a landmark.
         confidences: (N, S, L) from 0, not seen, to 1.
         times: (N, S) of the images relative to now, s.
         ups: (N, 3) unit vectors against gravity, camera frame; 0: unknown.
@@ -261,7 +261,7 @@ class Lifter:
     """Predicts mixtures over whole poses from windows of keypoints.
 
     Args:
-        usual: body with the usual lengths, whose joints they are.
+        usual: body with the usual lengths, to which the joints belong.
     """
 
     def __init__(

@@ -2,9 +2,9 @@
 
     p(x | r) = sum_i g_i(r) N(x; f_i(r), c_i(r) O_i)                       (BME 10 and 12)
 
-A kernel model keeps samples, and grows with them; a network has its size whatever it learns from,
-so that all motions that there are can be seen from everywhere. Here c_i may be below 1: an expert
-says itself how sure it is.
+A kernel model keeps samples, and grows with them; the size of a network does not depend on them, so
+that it can learn from all motions, seen from everywhere. Here c_i may be below 1: an expert itself
+predicts how certain it is.
 
 Learning needs JAX and Optax (`network_learning`), prediction neither.
 """
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 
 # Limits of log sqrt(c).
 WIDTHS = 2.0
-# Least samples; what the support of an input is measured from.
+# Least number of samples; clusters that give the support of an input, and samples for them.
 FEWEST, CENTRES, FOR_CENTRES = 20, 200, 20_000
-# Factor a on the distances of means, and exponent b of densities in who answers.
+# Factor a on the distances of means, and exponent b of densities in the responsibilities.
 DISTANCE, SHARPNESS = 5.0, 0.5
 
 
@@ -107,10 +107,10 @@ class NetworkExperts(ConditionalDensity):
         centres: Array,
         spacing: float,
     ) -> None:
-        """Takes what has been learned.
+        """Takes the results of learning.
 
         Args:
-            layers: whose numbers are gates (M), log widths (M) and means (M D).
+            layers: with the outputs gates (M), log widths (M) and means (M D).
             of_inputs, of_targets: before and after the layers; targets have one scale.
             noise: (M, D, D) O.
             centres, spacing: (C, p) clusters of the inputs, and the spread of one.
@@ -199,7 +199,7 @@ class NetworkExperts(ConditionalDensity):
 
 
 def _read(out: Any, m: int, d: int) -> tuple[Any, Any, Any]:
-    """Gates, means (n, M, D) and log widths of what the last layer says (n, M (2 + D))."""
+    """Gates, means (n, M, D) and log widths from outputs of the last layer (n, M (2 + D))."""
     return out[:, :m], out[:, 2 * m :].reshape(len(out), m, d), out[:, m : 2 * m]
 
 

@@ -56,14 +56,14 @@ SHIPPED = 'silhouettes'
 KIND = 'pose_predictor'
 MAX_COMPONENTS = 8
 LIGHTEST = 1e-3  # weight below which a component is dropped
-# Of the sequences that rule (1) learns from, s.
+# Time step of the sequences that rule (1) learns from, s.
 STEP = 1.0 / RATE
 JITTER = 1e-9  # variance that is added to poses, m^2 and rad^2
 # How a mixture is propagated: by rule (9), by rule (1), or not at all.
 BY_DYNAMICS, BY_EXPERTS, ALONE = 'dynamics', 'experts', 'none'
 PROPAGATIONS = (BY_DYNAMICS, BY_EXPERTS, ALONE)
-# Rate at which a past turns out to be wrong, per second: a track that is lost recovers. How long
-# what silhouettes get wrong stays wrong, s. Chosen.
+# Rate at which a past turns out to be wrong, per second: a track that is lost recovers. Time for
+# which errors of silhouettes last, s. Both are chosen.
 FORGETTING, LASTING = 5.0, 0.02
 # Axes of unit length have no spread along themselves, and those that are predicted have no unit
 # length: variance that is added to both.
@@ -240,10 +240,10 @@ class PosePredictor:
             raise ValueError(f'no propagation {propagation!r}, wanted one of {PROPAGATIONS}')
         if self.dynamics is None:
             raise ValueError('the predictor has no model for rule (1): train it with --dynamics')
-        # By what exceeds the step that the model has learned, poses change as the body may.
+        # Beyond the step that the model has learned, poses follow the motion prior of the body.
         before = self._to_targets(self._expected(previous, max(interval - STEP, 0.0)))
-        # Where experts are steep, what is uncertain would grow from step to step without end: it is
-        # no wider than p(x).
+        # Where experts are steep, uncertainty would grow from step to step without end: it is kept
+        # below that of p(x).
         known = np.linalg.inv(before.covariances) + np.linalg.inv(self.equilibrium.covariances)
         before = GaussianMixture(before.weights, before.means, np.linalg.inv(known))
         after = propagate(

@@ -3,8 +3,8 @@
 The reports are those of BME 3: affinity matrices of poses and of descriptors (fig. 7), and the
 number of clusters of poses under one cluster of descriptors (fig. 6).
 
-How many experts a model has, how stiff they are and how many components of the descriptor it sees
-was chosen on motions of other people, so numbers on those motions are optimistic.
+The numbers of experts and of components of the descriptor, and the stiffness of the experts, were
+chosen on motions of other people, so numbers on those motions are optimistic.
 """
 
 from __future__ import annotations

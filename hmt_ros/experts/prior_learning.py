@@ -1,7 +1,7 @@
 """Learns the prior of the poses of a body from motions (`hmt_ros.body.pose_prior`).
 
-Motions become poses of the body, and poses that are nearly equal are dropped. Long motions count as
-much as those of some poses, and a person with many motions by the square root of their number.
+Motions become poses of the body, and poses that are nearly equal are dropped. The number of poses
+of a motion is limited, and the weight of a person is the square root of the number of poses.
 Every pose counts as its mirror image as well. The number of components is that with the largest
 likelihood of people who are left out; their mean is over people.
 
@@ -248,7 +248,7 @@ class PriorData:
         )
 
     def samples(self, dofs: Index) -> MirroredSamples:
-        """The poses as samples of some angles; a person counts by the root of the number of theirs.
+        """The poses as samples of some angles; a person's weight is the root of their number.
 
         Args:
             dofs: (n,) degrees of freedom.

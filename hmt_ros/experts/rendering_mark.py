@@ -15,7 +15,7 @@ Bytes = NDArray[np.uint8]
 
 
 class RenderingMark:
-    """Keeps rendered silhouettes in a file, and how many there are in another one.
+    """Keeps rendered silhouettes in a file, and their number in another one.
 
     Args:
         path: file (.npy) of the silhouettes; the other one is `path` with the suffix .json.

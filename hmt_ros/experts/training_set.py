@@ -216,7 +216,7 @@ def training_set(
     Args:
         body: Body of the poses, with flesh.
         shares: Share of the poses of each motion that are taken; None: all.
-        mark: Takes what has been rendered, and gives it where a rendering was broken off.
+        mark: Keeps rendered silhouettes, and returns them after an interrupted rendering.
 
     Raises:
         ValueError: there are no motions, the body has no flesh or another root, or the mark is of

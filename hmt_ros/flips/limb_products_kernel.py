@@ -227,7 +227,7 @@ def fill_configurations(tree, limbs, modes, found, found_counts, flipped, price,
     sources = len(modes) + found.shape[1] + most_leaves
     angles = np.zeros((sources * most_leaves, width))
     result.trunks[0] = lead
-    # The limbs as they are: the modes', what was found, the other side's place, and all flips.
+    # Limbs on the first trunk: of the modes, those found, in the other side's place, all flips.
     for c in range(limit):
         n = 0
         for g in range(len(modes)):

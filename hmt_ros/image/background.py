@@ -102,7 +102,7 @@ class BackgroundModel:
         self.changed = 0.0
         self._shape: tuple[int, ...] = ()
         self._nearby: tuple[Image, Image] | None = None
-        # The last image and what was found in it: several people ask for the same.
+        # The last image and its result: several people ask for the same.
         self._last: tuple[Image, Image] | None = None
         self._parts: _Parts | None = None
 
@@ -383,7 +383,7 @@ WIDTH, REACH = 320, 24
 STRONGEST, SMOOTHING = 200.0, 1.0
 # One image in so many is looked at, and so many in a row must agree.
 EVERY, IN_A_ROW = 10, 2
-# Least correlation that says something, and by how much it exceeds that of no shift.
+# Least correlation that counts, and its least excess over that of no shift.
 LEAST, MARGIN = 0.3, 0.05
 # Below this fraction of the first correlation without a shift the scene is another.
 LEFT = 0.4

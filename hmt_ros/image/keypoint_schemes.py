@@ -167,7 +167,7 @@ class DetectorErrors:
         hidden, always_hidden: Shares of the landmarks that are unsure for a while, and always.
         hidden_time: Half of that while, s.
         hidden_factor: Largest factor on the errors of an unsure landmark.
-        heavy: Share of the landmarks that err as much and do not say so.
+        heavy: Share of the landmarks that err as much although they seem sure.
         unconfident: Share of detectors that have no confidences.
         missing: Share of landmarks, of single keypoints and of images that are missing.
         cut: Share of windows in which the border of the image cuts the person.

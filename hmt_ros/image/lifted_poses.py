@@ -1,13 +1,13 @@
-"""Whole poses that somebody has lifted from an image: a mixture over joints relative to the hips.
+"""Whole poses that were lifted from an image: a mixture over joints relative to the hips.
 
     p(y) = sum_c w_c prod_ja N(y_ja; m_cja, s_cja^2),    y_j: joint j from the middle of the hips
 
 The axes a are those of a person: across the line of sight, and along it. Experts (`experts.lifter`)
-give several components; a network that guesses one pose gives one, and says nothing of how far it
-is to be believed, which is learned (`keypoint_schemes.yaml`).
+give several components; a network that guesses one pose gives one without its uncertainty, which
+is learned (`keypoint_schemes.yaml`).
 
-Positions are those of a person of some lengths. What counts are the directions of bones: for a
-person of other lengths every bone is scaled to its own length.
+Positions are those of a person of some lengths. Only the directions of bones count: for a person
+of other lengths every bone is scaled to its own length.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WHOLE = {
     *(f'{side}_{name}' for name in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
       for side in ('left', 'right')),
 }  # fmt: skip
-# Deviation of a joint of which nothing is said, m.
+# Deviation of a joint without an estimate, m.
 UNKNOWN = 0.5
 HIPS = ('left_hip', 'right_hip')
 # The joint that each joint hangs on by a bone; the others hang on the middle of the hips.
@@ -96,7 +96,7 @@ class LiftedPoses:
         return self._with_lengths(np.array(own))
 
     def exchanged(self) -> LiftedPoses:
-        """As a person looks whose sides were exchanged: left for right, and away for towards."""
+        """The mixture with exchanged sides: left for right, and away for towards."""
         swapped = [self.joints.index(other_side(name)) for name in self.joints]
         mirror = np.array([1.0, 1.0, -1.0])
         return LiftedPoses(
@@ -108,8 +108,8 @@ class LiftedPoses:
 def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
     """One mixture of several opinions of one pose, each of which counts the same.
 
-    They read the same image, so that none confirms another: the density is the mean of theirs. Of
-    joints that one opinion lacks it says that they may be anywhere.
+    They read the same image, so that none confirms another: the density is the mean of theirs. A
+    joint that one opinion lacks may, by that opinion, be anywhere.
     """
     first = opinions[0]
     if len(opinions) == 1:
@@ -136,8 +136,8 @@ def from_positions(
     """The one pose that a network guesses; None: it has no hips, or nothing else.
 
     Args:
-        joints: (n,) names of joints; of several of one name the first counts. One whose other side
-            is unknown does not: exchanged, it would be the other.
+        joints: (n,) names of joints; of several of one name the first counts. A joint whose other
+            side is unknown does not count: exchanged, it would be the other.
         positions: (n, 3) m, along the axes of the camera from any origin; NaN: unknown.
         axes: (3, 3) of the person's view, in rows, camera frame.
         deviations: of the depths of joints, by their kind, m.

@@ -31,13 +31,13 @@ from hmt_ros.image.terms.residuals import (
 from hmt_ros.inference.arrays import Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
-# Standard deviation of the flow, px, and what it errs by besides, as a share of the displacement.
+# Standard deviation of the flow, px, and its further error, as a share of the displacement.
 SIGMA, SHARE = 1.5, 0.15
 # Width of the Geman-McClure kernel, in standard deviations.
 SCALE = 2.0
 # Fewer points than this do not make each of them count more.
 FEWEST = 20
-# Flow of smaller images is none, px.
+# Smaller images, px, have a flow of 0.
 SMALLEST = 32
 
 
@@ -136,7 +136,7 @@ def add_flow(  # type: ignore[no-untyped-def]
             fu, _, _ = sample(values, left, top, 0, u, v)
             fv, _, _ = sample(values, left, top, 1, u, v)
             if np.isnan(fu):
-                # Somebody else hides it: it costs what is usual, wherever it is.
+                # Somebody else hides it: it has the usual cost, wherever it is.
                 value[n] += geman_mcclure(1.0, SCALE, each)[0]
                 continue
             inverse = 1.0 / (SIGMA + SHARE * np.sqrt(fu * fu + fv * fv))

@@ -1,4 +1,4 @@
-"""Points of the body's surface that a camera sees at a pose, which flow and silhouette tell of."""
+"""Points of the body's surface that a camera sees at a pose, for flow and silhouette."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ observations fill the diagonal blocks, the dynamics couple neighbours,
 
 Elimination forwards is filtering, substitution backwards is smoothing. The cost is O(T n^3) and
 there is never a dense (T n, T n) array: the matrix is kept in LAPACK's band storage, whose width
-follows from the coupling; where E_t is diagonal it is half of what full blocks need.
+follows from the coupling; where E_t is diagonal it is half of that for full blocks.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ def minimise(
     lower, upper = (np.asarray(limit, dtype=np.float64) for limit in (lower, upper))
     x = np.clip(np.array(x, dtype=np.float64, ndmin=2), lower, upper)
     n, d = x.shape
-    # Copies: compiled code is compiled again for every layout and for what can not be written.
+    # Copies: kernels are compiled again for every layout and for read-only arrays.
     lower, upper = (np.array(np.broadcast_to(limit, (n, d)), order='C') for limit in (lower, upper))
     metric = np.full(d, np.asarray(step_scale, dtype=np.float64) ** -2.0)
 

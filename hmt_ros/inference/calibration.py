@@ -70,7 +70,7 @@ def marginal_log_densities(mixture: GaussianMixture, points: ArrayLike, size: in
     each = np.einsum('kgns,kgns->kgn', white, white)
     each *= -0.5
     each += (log_scale - 0.5 * size * np.log(2 * np.pi) + log_weights[:, None])[:, :, None]
-    # scipy's logsumexp, without what it spends on axes and signs.
+    # scipy's logsumexp, without its overhead for axes and signs.
     top = each.max(0)
     each -= top
     np.exp(each, out=each)

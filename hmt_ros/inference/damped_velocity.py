@@ -93,7 +93,7 @@ class DampedVelocity(LinearGaussianDynamics):
         return moved, noise
 
     def _decay(self, interval: float) -> tuple[Array, Array]:
-        """a and b (d,): what a velocity moves the pose by, and what of it lasts."""
+        """a and b (d,): shift of the pose per velocity, and share of the velocity that lasts."""
         lost: Array = -np.expm1(-self.damping * interval)
         return lost / self.damping, 1.0 - lost
 

@@ -1,16 +1,16 @@
-"""How much measurements say whose errors last: neighbours in space and in time repeat each other.
+"""Information of measurements whose errors last: neighbours in space and time repeat each other.
 
     energy of cue g in an image     s_g E_g                        s_g: share that is independent
     its share in time               a_g(dt) = (1 - rho) / (1 + rho) = tanh(dt / (2 tau_g)),
                                     rho = exp(-dt / tau_g)
 
 An error that lasts for tau is an AR(1) process: between two measurements dt apart its correlation
-is rho. n measurements in a row tell as much of a constant as a(dt) n independent ones (n large), so
-that each counts with the share a(dt) [Bartlett 1946]. For small dt the share is dt / (2 tau): what
-is told in a second does not depend on the rate of the measurements. For large dt it is 1.
+is rho. About a constant, n measurements in a row (n large) have the information of a(dt) n
+independent ones, so that each counts with the share a(dt) [Bartlett 1946]. For small dt it is
+dt / (2 tau): the information per second does not depend on the rate. For large dt it is 1.
 
-What lasts moves along: how a pose changes from one measurement to the next they tell better, by the
-new part of the error alone, 1 - rho^2 of its variance.
+A lasting error cancels in differences: the change of a pose from one measurement to the next is
+measured with the new part of the error alone, 1 - rho^2 of its variance.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ def share_of_time(dt: float, tau: float) -> float:
 
 @dataclass(frozen=True)
 class CueErrors:
-    """How the errors of a cue last.
+    """Duration of the errors of a cue.
 
     Attributes:
         independent: Share of the cue's energy in one image that is independent.
         time: Time for which errors of the cue last, s.
-        constant: Share c of the variance of what an image tells that is the same in all images.
+        constant: Share c of the error variance of one image that is common to all images.
     """
 
     independent: float
@@ -68,9 +68,9 @@ class CueErrors:
         return share_of_time(dt, self.time)
 
     def together(self, count: float) -> float:
-        """Factor on what images tell together of what does not change.
+        """Factor on the summed information of images about a constant.
 
-        The mean of n of them has the variance 1 / n + c: they tell n / (1 + c n) of one.
+        The mean of n of them has the variance 1 / n + c: n / (1 + c n) times the information of 1.
 
         Args:
             count: n, the sum of their shares.
@@ -80,7 +80,7 @@ class CueErrors:
     def of_changes(self, dt: float) -> float:
         """Share of the curvature by which an image tells how a pose has changed in dt s.
 
-        An error that lasts has not changed: s / (1 - rho^2), the variance of what is new of it.
+        A lasting error has not changed: s / (1 - rho^2), by the variance of its new part.
         """
         new = -math.expm1(-2.0 * dt / self.time) if self.time > 0.0 else 1.0
         return self.independent / new
@@ -95,10 +95,10 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
 
         s = sum_g c_g s_g / C,    s / tau = sum_g c_g s_g / tau_g / C,    C = sum_g c_g
 
-    c_g is how much cue g brings to the likelihood: of the curvature, the number of variables that
-    it determines. At low rates the likelihood then counts with the mean of the shares of its cues,
-    and at high rates a second of images tells what the cues tell in a second; in between the share
-    is an approximation, and exact where all tau_g are one.
+    c_g is the contribution of cue g to the likelihood: the number of variables that its curvature
+    determines. At low rates the likelihood then counts with the mean of the shares of its cues, and
+    at high rates a second of images has the information of its cues; in between the share is an
+    approximation, and exact where all tau_g are one.
 
     Args:
         amounts: c_g by name of the cue in `ERRORS`, none negative, not all 0.
@@ -117,15 +117,15 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
     return CueErrors(share, share / rate)
 
 
-# What all images so far leave of the covariance of a pose, as a share of what the last one leaves
-# by itself, of which only its own share of the evidence is believed: `benchmarks/joint_errors.py`.
+# Covariance of a pose given all images so far, relative to that given the last one by itself, which
+# counts with its own share of the evidence: `benchmarks/joint_errors.py`.
 TOGETHER = 0.29
 
 # Chosen, not learned, at 30 and 3 images a second (docs/tracking.md). The prior of the pose is
-# counted like a cue, because the same pose is judged again in every image. `lifted` is what experts
-# say of depths, beside a weight of their own. `shape` is what an image says of lengths and flesh:
-# poses that differ tell of these apart, but not of clothes. Its constant share was chosen on clips
-# that are shown back and forth for 45 s: 0.03, 0.12 and 0.3 were tried.
+# counted like a cue, because the same pose is judged again in every image. `lifted` are the depths
+# of experts, beside a weight of their own. `shape` is the evidence of images on lengths and flesh:
+# different poses are independent evidence on these, but not on clothes. Its constant share was
+# chosen on clips that are shown back and forth for 45 s: 0.03, 0.12 and 0.3 were tried.
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     {
         'image': CueErrors(0.15, 0.019),
@@ -135,8 +135,8 @@ ERRORS: Mapping[str, CueErrors] = MappingProxyType(
         'shape': CueErrors(0.35, 0.053, 0.12),
     }
 )
-# Factor on what experts say where it is counted as keypoints are: the ratio of what both tell in a
-# second of many images.
+# Factor on the depths of experts where they are counted like keypoints: the ratio of the
+# information of both in a second of many images.
 LIFTED_AS_KEYPOINTS = (
     ERRORS['lifted'].independent / ERRORS['lifted'].time
     * ERRORS['keypoints'].time / ERRORS['keypoints'].independent

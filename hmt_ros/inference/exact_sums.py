@@ -1,7 +1,7 @@
 """Scalar products for compiled functions, in vector registers and in an order that is fixed.
 
-A compiler that may reassociate a sum makes of it what suits the code around, and so the last bits
-depend on what was compiled before. Without that freedom numba adds one product after the other.
+A compiler that may reassociate a sum arranges it to suit the surrounding code, so the last bits
+depend on earlier compilations. Without that freedom numba adds one product after the other.
 Here the partial sums are laid out by hand: every cache of compiled functions and every machine give
 the same bits, and smoothing takes two thirds of the time that it takes with loops over the same
 partial sums (the products do not fill vector registers there).

@@ -85,7 +85,7 @@ def _whitened_pairs(
 ) -> None:
     """Cholesky factors and forward substitution of four pairs at a time, two columns at a time.
 
-    The last row of each factor is the offset: what becomes of it is the whitened offset.
+    The last row of each factor is the offset, which becomes the whitened offset.
     """
     d = means_a.shape[1]
     f = np.empty((d + 1, d, LANES))

@@ -4,7 +4,7 @@ Components are merged into one Gaussian with their weight, mean and covariance,
 
     w = sum_i w_i,   m = sum_i w_i m_i / w,   S = sum_i w_i (S_i + (m_i - m) (m_i - m)') / w,
 
-so that the mean and the covariance of the whole mixture stay. What is merged differs:
+so that the mean and the covariance of the whole mixture stay. The choice of components differs:
 
 - `merged_pairwise`: the pair that costs least by the upper bound on the Kullback-Leibler divergence
   that its merge causes [Runnalls, IEEE TAES 2007], until few are left,
@@ -12,7 +12,7 @@ so that the mean and the covariance of the whole mixture stay. What is merged di
       B(i, j) = 1/2 ((w_i + w_j) log|S_ij| - w_i log|S_i| - w_j log|S_j|);
 
 - `merged_if_close`: the closest pair, until none is closer than a distance;
-- `led`: what is near a heavier component, which stays as it is and gets the weight;
+- `led`: components near a heavier one, which stays as it is and gets their weight;
 - `reduced`: clusters of means, which then descend a bound on the divergence from the large mixture
   to the small one [Goldberger and Roweis, NIPS 2004].
 """
@@ -32,7 +32,7 @@ NEGLIGIBLE = 1e-8
 
 
 def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
-    """The mixture whose components have the moments of what they stand for.
+    """The mixture whose components have the moments of those that they stand for.
 
     Args:
         share: (K, B) share of each component that goes to each of B new ones; a new one that gets
@@ -103,7 +103,7 @@ def leaders(
 
 
 def led(weights: Array, points: Array, least: float, count: int) -> tuple[Array, Index]:
-    """Indices of components that are apart, and their weights with those of what is near them.
+    """Indices of components that are apart, and their weights with those of their neighbours.
 
     Nothing is averaged: a mean over motions trembles as their weights do.
 
@@ -176,7 +176,7 @@ def _squared_distances(w: Array, m: Array, s: Array, log_det: Array, pairs: Inde
 def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> GaussianMixture:
     """At most `count` components: clusters of means, then descent of the bound of `assignment`.
 
-    Where pairwise merging opens with a lower bound than the clusters, it is what descends.
+    Where pairwise merging gives a lower bound than the clusters, the descent starts from it.
 
     Raises:
         ValueError: count < 1.

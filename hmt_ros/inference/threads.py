@@ -1,4 +1,4 @@
-"""Work that is shared among threads: of what releases the interpreter lock, with the same results.
+"""Work shared among threads, in calls that release the interpreter lock, with the same results.
 
 Each piece is worked on alone and stays in its place, so that nothing depends on their number.
 """
@@ -31,8 +31,8 @@ def in_threads(
     Args:
         work: on the poses from one number up to another.
         least: number of poses that are worth a thread.
-        threads: their number at most; 0: one a core, up to `MOST_THREADS`, but one core, where a
-            camera, a smoother and whoever listens run.
+        threads: their number at most; 0: one a core, up to `MOST_THREADS`, but for one core that is
+            left to a camera, a smoother and subscribers.
     """
     threads = min(threads or _cores(), _most, count // least)
     if threads < 2:

@@ -144,7 +144,7 @@ def _regular_frames(lines: Sequence[str], skeleton: Acclaim) -> Array | None:
 
 
 def _any_frames(path: Path, lines: Sequence[str], at: int, skeleton: Acclaim) -> Array:
-    """The values line by line, with the line of whatever is wrong."""
+    """The values line by line; errors name the line."""
     frames: list[Array] = []
     missing: set[str] = set()
     first_frame = 0

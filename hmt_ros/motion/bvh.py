@@ -179,7 +179,7 @@ def _motion(path: Path, lines: list[str], at: int, count: int) -> tuple[Array, f
             return values, frame_time
     except ValueError:
         pass
-    seen_frames = 0  # what is wrong, and where
+    seen_frames = 0  # find the error and its line
     for i in range(at, len(lines)):
         words = lines[i].split()
         if words:

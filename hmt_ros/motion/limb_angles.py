@@ -5,9 +5,9 @@ seen from its frame before its rotations,
 
     v = (sin b, -sin a cos b, cos a cos b)
 
-gives the first two angles, whatever the lengths. The third, the twist, shows in what hangs on the
-segment; where that is straight, in the frames around. The result lies within the limits, and is
-exact for a body of the same lengths that can take the pose; for others it is near.
+gives the first two angles, whatever the lengths. The third, the twist, shows in the next segments;
+where these are straight, in neighbouring frames. The result lies within the limits, and is exact
+for a body of the same lengths that can take the pose; for others it is near.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.rig import ARM, LEG, SIDES
 
-# Weights of what shows the twist of a limb; a hinge bent by a right angle has weight 1.
+# Weights of the cues for the twist of a limb; a hinge bent by a right angle has weight 1.
 FOOT = 0.3  # a foot, for its leg
 AROUND, AROUND_TIME = 0.2, 0.2  # the frames around; standard deviation of their distance, s
 REST = 1e-3  # no twist
@@ -162,7 +162,7 @@ def _aligned(rest: Array, seen: Array, weights: Array) -> Array:
 def _twist(
     skeleton: Skeleton, s: int, turn: Array, place: Mapping[str, Array], next_end: str, fps: float
 ) -> Array:
-    """The third angle of a spherical joint, from what hangs on the segment.
+    """The third angle of a spherical joint, from the next segments.
 
     The hinge of a limb shows it as far as it is bent; a foot shows it where the leg is straight;
     elsewhere the twist is that of the frames around. For the trunk it is the line of the shoulders.

@@ -98,7 +98,7 @@ def reaching_posture(
 
 
 def _solve(body: Body, upper: Array, fore: Array) -> tuple[dict[str, Array], Array]:
-    """Angles (N,) of both arms, by name, for directions (N, 2, 3), and what they miss (N,), m."""
+    """Angles (N,) of both arms, by name, for directions (N, 2, 3), and their errors (N,), m."""
     skeleton = body.skeleton
     rest = body.joint_positions(np.zeros((1, body.dimension)))
     shoulders = rest[0, skeleton.joint_index([f'{side}_shoulder' for side in SIDES])]

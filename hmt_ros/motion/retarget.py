@@ -3,7 +3,7 @@
 Every motion file has a skeleton of its own. The lengths are measured on the recorded joints; a
 closed-form start follows the limbs outwards (the descending solution of KJS 3); then all frames at
 once are refined on the joint positions within the joint limits. Sweeps that pull every frame
-towards its neighbours determine what joint positions leave open, the twist of a straight limb.
+towards its neighbours determine the twist of a straight limb, which joint positions leave open.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def body_from_motion(motion: Motion, body: Body) -> Body:
 def hip_drop_share(body: Body) -> float:
     """Length `hip_drop` over the distance from the pelvis to the middle of the hips."""
     if not set(HIPS) <= set(body.joint_names):
-        return 1.0  # who needs more than the joints says what
+        return 1.0  # a caller that needs more than these joints names what is missing
     rest = body.joint_positions(np.zeros((1, body.dimension)))[0]
     pelvis, left, right = rest[body.skeleton.joint_index(HIPS)]
     distance = float(np.linalg.norm(0.5 * (left + right) - pelvis))

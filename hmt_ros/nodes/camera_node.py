@@ -41,9 +41,9 @@ NAME = 'camera_node'
 FRAME_ID = 'camera_optical_frame'
 # Field of view of a common webcam from left to right, degrees.
 USUAL_FOV = 60.0
-# Images a second of a file that does not tell.
+# Images a second of a file that does not give its rate.
 _USUAL_RATE = 30.0
-# A device that gives no image for so long has gone, s.
+# Time without an image after which a device counts as gone, s.
 _PATIENCE = 5.0
 _GLANCE, _CONNECTING = 0.05, 0.5
 

@@ -22,7 +22,7 @@ from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import stamp_in
 
 _RESTART = 'restart'
-# Dropped images that are told of one by one, the newest; the others are only counted.
+# Number of dropped images, the newest, that are reported one by one; the others are only counted.
 _ANSWERED = 100
 # Arrivals of messages that are remembered until their estimates.
 _REMEMBERED = 1000
@@ -120,7 +120,7 @@ class InputQueue:
             return None if self._closed else self._take_out()
 
     def close(self) -> Arrived:
-        """Ends every `get`; returns what waited."""
+        """Ends every `get`; returns the waiting messages."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -241,7 +241,7 @@ class EstimatingThread:
         return [self._durations.popleft() for _ in range(len(self._durations))]
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Ends the thread after the present message; drops what waits, except a restart.
+        """Ends the thread after the present message; drops waiting ones, except a restart.
 
         Returns:
             Whether the thread has ended within `timeout` s.
@@ -276,7 +276,7 @@ class EstimatingThread:
         try:
             self._handle(waiting, more=more)
         except Exception as error:  # noqa: BLE001
-            # A fault of ours. What comes next may not suffer from it.
+            # A fault of ours: later messages must not suffer from it.
             self._inner_faults.add(error)
             self._log_error(''.join(traceback.format_exception(error)))
             text = f'the node itself failed: {self._inner_faults.last}'

@@ -56,7 +56,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        # Of bodies: by topic. They belong to the thread that estimates.
+        # Publishers of bodies, by topic. They belong to the thread that estimates.
         self._of_bodies: dict[str, Any] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._search = self.create_timer(_SEARCH, self._look_for_people, clock=steady)

@@ -55,7 +55,7 @@ class LocalTopics:
         self._changing = threading.Lock()
 
     def offer(self, topic: str) -> None:
-        """A node of this process publishes a topic; to be told before anybody listens."""
+        """Notes a topic that a node of this process publishes, before anybody listens."""
         self._offered.add(topic)
 
     def listen(self, listener: Listener) -> None:
@@ -81,7 +81,7 @@ class LocalTopics:
         return subscription
 
     def read(self, data: bytes, msgtype: str) -> Any:
-        """The message in bytes; the same object for all who got the same large bytes."""
+        """The message in bytes; the same object for all nodes that got the same large bytes."""
         for known, message in tuple(self._read):
             if known is data:
                 return message
@@ -91,7 +91,7 @@ class LocalTopics:
         return message
 
     def decode(self, message: Any) -> Image:
-        """The picture of an image, as `decode_image`; decoded once for all who share a message."""
+        """The picture of an image, as `decode_image`; decoded once for all nodes that share it."""
         for known, image in tuple(self._decoded):
             if known is message:
                 return image
@@ -100,7 +100,7 @@ class LocalTopics:
         return image
 
     def deliver(self, topic: str, data: bytes) -> None:
-        """Hands a message to all who listen."""
+        """Hands a message to all listeners."""
         for listener in self._listeners.get(topic, ()):
             listener.receive(data)
 

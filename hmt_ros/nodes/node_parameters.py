@@ -25,7 +25,7 @@ from msg_tools.files.plain_yaml import read_plain_yaml
 QOS_OVERRIDES = 'qos_overrides.'
 _LARGEST_FILE = 1_000_000  # bytes
 _KEY = 'ros__parameters'
-# How alike a name must be to be meant; that of a node more, or one of ours would be another's.
+# Least likeness of a name to the one that is meant; more for nodes, as their names are alike.
 _ALIKE, _ALIKE_NODE = 0.5, 0.8
 
 
@@ -106,7 +106,7 @@ def next_step(node: Node, error: ValueError, checked: Iterable[str]) -> str:
 def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
     """Warnings of parameter files in which a node is not named as it is called.
 
-    A file for other nodes is none: one file may serve many nodes.
+    A file for other nodes gives no warning: one file may serve many nodes.
 
     Args:
         node: its full name.

@@ -1,6 +1,6 @@
 """people_adapter_node: mixtures in, people as other packages know them out.
 
-It publishes what is installed: people_msgs/People, vision_msgs/Detection3DArray, or both.
+It publishes the installed types: people_msgs/People, vision_msgs/Detection3DArray, or both.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """person_node: filter, smoother, experts and a detector in one process.
 
 The nodes are the same as in processes of their own: names, parameters, topics, services and bytes.
-What one publishes another gets without the middleware (`hmt_ros.nodes.local_topics`), images come
-in once, and the libraries are in memory once. Which nodes run is said by their names on the command
-line; what they use of each other is the default of their parameters.
+Messages go from one to another without the middleware (`hmt_ros.nodes.local_topics`), images come
+in once, and the libraries are in memory once. Names on the command line select the nodes; by the
+defaults of their parameters they use each other's results.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ The filter uses the predictions of bme_node, and the keypoints of a detector, wh
 
 
 def used_of_each_other(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Parameters by node that follow from which nodes run together."""
+    """Parameters by node that follow from the nodes that run together."""
     values: dict[str, dict[str, Any]] = {name: {} for name in names}
     if FilterNode.NAME in names:
         used = {

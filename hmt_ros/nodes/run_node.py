@@ -68,7 +68,7 @@ def run_together(
     def stop(*_: object) -> None:
         stopped.set()
         if any(node.preparing for node in nodes):
-            # Nothing is lost: what has been compiled is kept, function by function.
+            # Nothing is lost: compiled code is kept, function by function.
             sys.stderr.flush()
             os._exit(0)
 
@@ -128,13 +128,13 @@ def _new_executor() -> Executor:
 
 def _spin_once(executor: Executor, nodes: Sequence[SessionNode[Any, Any]]) -> None:
     try:
-        # A signal does not wake who waits for messages.
+        # A signal does not wake a thread that waits for messages.
         executor.spin_once(timeout_sec=0.2)
     except Exception as error:  # noqa: BLE001
         # rclpy itself raises where /clock goes below zero, for example: the node lives.
         text = f'{type(error).__name__}: {error_line(error)}'
         nodes[0].get_logger().error(f'a callback failed: {text}', throttle_duration_sec=1.0)
-        # What came together with this would not be looked at any more: unread messages are
+        # Messages that came together with this one would stay unread: unread messages are
         # counted anew.
         for node in nodes:
             executor.remove_node(node)

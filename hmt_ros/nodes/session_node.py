@@ -1,8 +1,8 @@
 """A lifecycle node around a session: messages in, messages out, one thread that estimates.
 
 The executor's thread only puts messages into a queue and answers services; one other thread
-estimates. Messages pass as bytes in both directions: what a bag or a wire holds is read and written
-by the same code as offline.
+estimates. Messages pass as bytes in both directions: the same code as offline reads and writes the
+bytes of a bag or a wire.
 
 `~/handled` (hmt_msgs/Handled) reports on every message that was received, after all that it led to
 has been published. A player that waits for it feeds the node in lock step.
@@ -72,7 +72,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     Attributes:
         NAME: of the node.
-        SUBJECT: what the diagnostics are about.
+        SUBJECT: subject of the diagnostics.
         SESSION: class of the session.
         DEFAULTS: parameters with their default values.
         preparing: whether kernels are being compiled or loaded, which may take a minute.
@@ -115,7 +115,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         for topic in self._offered_topics():
             if not topic.startswith('/'):
                 self._local.offer(self._local_name(topic))
-        # Topics that the node both publishes and subscribes to, and what it published there.
+        # Topics that the node both publishes and subscribes to, and its own messages there.
         self._heard: set[str] = set()
         self._own = OwnMessages()
         self._failure = ''
@@ -135,7 +135,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._diagnose_period, clock=steady)
 
-    # What a node decides.
+    # Choices of each node.
 
     def _offered_topics(self) -> Iterable[str]:
         """Topics that nodes of this process get from this node and nobody else."""
@@ -154,14 +154,14 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """The topics to subscribe to, the one that sets the pace last."""
 
     def _messages_of_others(self, settings: Parameters) -> Mapping[str, str]:
-        """Types of messages of packages that need not be installed, and what needs each.
+        """Types of messages of packages that need not be installed, each with its consumer.
 
         Raises:
             ValueError: none of those that would do is installed.
         """
         return {}
 
-    # What all nodes do.
+    # Common to all nodes.
 
     def start(self) -> None:
         """Configures and activates the node, unless it is to wait for its services."""
@@ -416,7 +416,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return int(others) + self._local.listeners(self._local_name(topic))
 
     def _local_name(self, topic: str) -> str:
-        """Name of a topic among nodes of this process; those of all, as /tf, go over ROS."""
+        """Name of a topic among nodes of this process; shared ones, as /tf, go over ROS."""
         if topic not in self._local_names:
             own = f'{self.get_fully_qualified_name()} {topic}'
             name = own if topic.startswith('/') else self.resolve_topic_name(topic)

@@ -20,7 +20,7 @@ from hmt_ros.sessions.session import NeededInput, kind_of
 
 # Time without a message after which a topic is silent, and between two warnings of one text, s.
 SILENCE, REPEAT = 3.0, 30.0
-# Topics that are named as meant instead, and how alike their names are at least.
+# Number of topics that are suggested instead, and least likeness of their names.
 _MOST_NAMED, _ALIKE = 3, 0.6
 _IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 _SUFFIX = '/compressed'

@@ -1,4 +1,4 @@
-"""Topics of the nodes: what they subscribe to, and the quality of service of what they publish."""
+"""Topics of the nodes: subscriptions, and the quality of service of publications."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from msg_tools.messages.message_types import register_definitions
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-# For `~/handled`: who waits for an answer to each message must not miss those to a burst.
+# For `~/handled`: a client that waits for each answer must not miss the answers to a burst.
 ANSWERS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     depth=1,
@@ -86,7 +86,7 @@ def image_topic(image_transport: str) -> SubscribedTopic:
 
 
 def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
-    """Topics of what comes with the images, by the table of inputs."""
+    """Topics of the inputs that come with the images, by the table of inputs."""
     for row in rows:
         for source, msgtype in row.types.items():
             yield SubscribedTopic(
@@ -100,7 +100,7 @@ def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
 
 
 def types_of_others(rows: Iterable[ImageInput], source: str) -> dict[str, str]:
-    """Types of messages of other packages that a `source` needs, and what needs each."""
+    """Types of messages of other packages that a `source` needs, each with its consumer."""
     return {row.types[DETECTIONS]: f'source {source}' for row in rows if DETECTIONS in row.types}
 
 
@@ -110,7 +110,7 @@ def published_with(published: PublishedTopic) -> tuple[str, QoSProfile]:
 
 
 def mixture_topic(source: str, topic: str) -> SubscribedTopic:
-    """Pose mixtures of a person; who is slow for a while misses none."""
+    """Pose mixtures of a person; a subscriber that is slow for a while misses none."""
     return SubscribedTopic(source, topic, POSE_MIXTURE, _MIXTURES)
 
 
@@ -124,7 +124,7 @@ def read_installed_messages(msgtype: str, needed_by: str) -> None:
     """Reads the definitions of a package of messages, as it is installed.
 
     Args:
-        needed_by: what needs it, for the error.
+        needed_by: consumer of the messages, for the error.
 
     Raises:
         ValueError: the package is not installed.

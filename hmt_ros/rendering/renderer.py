@@ -371,7 +371,7 @@ def _ranges(start: Index, stop: Index) -> tuple[Index, Index]:
 Depth = NDArray[np.floating]
 
 # Standard deviation and step of the disparity, divided by focal length and distance of the eyes:
-# what the square of a depth is multiplied with, 1/m.
+# factors on the square of a depth, 1/m.
 NOISE, STEP = 0.0020, 0.0008
 # Standard deviation of the blur that makes neighbouring errors alike, px.
 BLUR = 1.5
@@ -422,7 +422,7 @@ def _smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], blur: float)
 def _shadowed(inverse: Depth, shift: float) -> NDArray[np.bool_]:
     """Pixels hidden from the second eye, to the right, by disparities in units of 1/m."""
     column = np.arange(inverse.shape[1])
-    # A pixel is seen there at this column; what is nearer, further right, covers it.
+    # A pixel is seen there at this column; a nearer surface, further right, covers it.
     there = column - shift * inverse
     nearest_right = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
     result: NDArray[np.bool_] = there > nearest_right + 0.5

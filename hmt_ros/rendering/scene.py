@@ -31,7 +31,7 @@ SUPERSAMPLING = 2
 NOISE_LEVELS = 256
 # Streams of random numbers of a seed.
 OF_THINGS, OF_SURFACES, OF_NOISE, OF_CLOTHES = 1, 2, 3, 4
-WAVE_LENGTHS = (0.30, 0.16, 0.10, 0.07)  # m, of what a pattern is the sum of
+WAVE_LENGTHS = (0.30, 0.16, 0.10, 0.07)  # m, of the waves that make up a pattern
 # Where cloth ends, as shares of the segment from its start.
 SLEEVE, SHORTS, SOCK = 0.80, 0.15, 0.85
 # Cover of the segments whose name contains the word; everything else is skin.
@@ -218,7 +218,7 @@ def _empty_place(scene: Scene, camera: Camera) -> tuple[Picture, Picture]:
     on_box = t_box < np.minimum(t_wall, t_floor)
     on_floor = (t_floor < t_wall) & ~on_box
 
-    # The wall has stains and a skirting. What no ray meets has its plain colour.
+    # The wall has stains and a skirting. Rays that meet nothing get its plain colour.
     colour = np.tile(base[0] * scene.lambert(light[1:2]), (len(rays), 1))
     on_wall = np.flatnonzero(np.isfinite(t_wall) & ~on_floor & ~on_box)
     at = eye + rays[on_wall] * t_wall[on_wall, None]

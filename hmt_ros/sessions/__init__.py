@@ -1,1 +1,1 @@
-"""Messages in, messages out, without ROS: what a node and an offline replay both hold."""
+"""Messages in, messages out, without ROS: the part that a node and an offline replay share."""

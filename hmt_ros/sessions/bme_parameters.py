@@ -17,7 +17,7 @@ from hmt_ros.sessions.declared_parameters import (
 )
 from hmt_ros.sessions.filter_parameters import BACKGROUND
 
-# What a prediction is from.
+# Cues that a prediction is made from.
 FROM_SILHOUETTES, FROM_KEYPOINTS, FROM_BOTH = 'silhouettes', 'keypoints', 'both'
 CUES = (FROM_SILHOUETTES, FROM_KEYPOINTS, FROM_BOTH)
 

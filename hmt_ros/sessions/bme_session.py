@@ -8,8 +8,8 @@ The rules, besides those of `CameraSession`:
   no background.
 - With `tracked_interval` the track of the filter (`pose_mixture`) is heard. While it says that the
   person is tracked, images within `tracked_interval` after the last prediction are not looked at.
-  What is then published has no components and the state of the track, so that who waits for a
-  prediction goes on: not looked at, which is not the same as nobody seen.
+  Their messages have no components but the state of the track, so that a subscriber that waits for
+  a prediction goes on: the image was not looked at, which does not say that nobody was seen.
 - The silhouette of every image is published if somebody subscribes to it: that of the background
   subtraction, empty while the background is being learned. An image that is left to the track has
   one, too. With `use_mask` there is none besides the mask.
@@ -19,7 +19,7 @@ The rules, besides those of `CameraSession`:
   those of the last second (`experts.lifter`), in place of the images; without components where
   fewer than five landmarks are seen. With 'both' an image waits for the keypoints of exactly its
   stamp, for those of a later stamp, or for an image that is `input_timeout` younger; its silhouette
-  counts where keypoints show nobody. (The product of both predictions errs as that from keypoints.)
+  counts where keypoints show nobody. (The product of both is no better than that from keypoints.)
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ TOPICS = {PREDICTION: PublishedTopic('hmt_msgs/msg/PoseMixture')}
 _TOPICS_OF_NODE = {**TOPICS, SILHOUETTE: PublishedTopic('sensor_msgs/msg/Image')}
 
 
-# Time after which a track that is not heard of is not relied on any more.
+# Time without a message after which a track no longer counts.
 _SURE_NS = SECOND_NS
 # Relative standard deviation of the size of a person whose stature is known.
 _MEASURED_SPREAD = 0.02
@@ -106,7 +106,7 @@ class BmeState(SessionState):
     Attributes:
         modes: components of the last prediction.
         height: of the last silhouette, px.
-        support: 0 to 1, how far the silhouette is like those of the training set.
+        support: likeness of the silhouette to those of the training set, 0 to 1.
         moved: whether the camera has moved since the background was taken.
     """
 
@@ -190,7 +190,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             previous = self._seen(mask, shown.camera, previous).mixture
 
     def _forget(self) -> None:
-        # What is known of the background stays.
+        # The known background is kept.
         self._previous = None
         self._looked = self._tracked = None
         self._by_keypoints = None
@@ -375,7 +375,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._look_at_scene(waiting, self._background, 'configure the node anew')
 
     def _known_before(self, stamp_ns: int) -> tuple[GaussianMixture | None, float]:
-        """The poses of the prediction before an image, as far as they count; s since then."""
+        """The poses predicted before an image, if they still count, and the time since then, s."""
         p, previous = self.parameters, self._previous
         if p.propagation == ALONE or previous is None:
             return None, STEP
@@ -483,7 +483,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
 
 def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
-    """The model for the person, and how much persons of known stature differ from its size."""
+    """The model for the person, and the relative deviation of the size of people from it."""
     try:
         predictor = load_predictor(parameters.model_file or SHIPPED)
     except OSError as error:

@@ -21,7 +21,7 @@ from msg_tools.files.plain_yaml import load_plain_yaml
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
 
 LARGEST_FILE = 1_000_000  # bytes
-# What programs call the entries of an OpenCV file.
+# Names of the entries of an OpenCV file in several programs.
 _MATRIX = ('camera_matrix', 'Camera_Matrix', 'cameraMatrix', 'K', 'M1')
 _DISTORTION = (
     'distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'dist_coeffs', 'D', 'D1',

@@ -2,8 +2,8 @@
 
 Images are taken in the order of their stamps. They wait until a calibrated camera_info has come,
 and for other inputs (`image_inputs`); at most `MOST_INCOMPLETE` wait, the oldest are dropped. A
-session is late where messages have come during an estimate while images waited for it: of the
-images that need not wait for anything else the newest `queue_size` are estimated from.
+session is late where messages have come during an estimate while images waited for it: only the
+newest `queue_size` of the images that wait for no other input are then estimated from.
 """
 
 from __future__ import annotations

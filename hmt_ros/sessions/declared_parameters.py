@@ -51,7 +51,7 @@ OWN_KEYPOINTS = 'keypoints'
 # Scheme of keypoints that come without names, unless another is named.
 USUAL_ORDER = 'coco17'
 
-# Parameters that nodes had before, and what is there instead.
+# Parameters that were removed, and their replacements.
 _TRACKER = 'programs set it in TrackerSettings'
 _LIKELIHOOD = 'programs set it in LikelihoodSettings'
 _BACKGROUND = 'programs set it in BackgroundSettings'
@@ -113,7 +113,7 @@ def nested_parameters(
         effect: when new values take effect; one of `EFFECTS`.
         parameters: the limits of those that are parameters, by name; dots lead into settings within
             the settings.
-        prefix: what the names of the parameters begin with.
+        prefix: start of the names of the parameters.
     """
     return {_EFFECT: effect, _LIMITS: parameters, _PREFIX: prefix}
 
@@ -344,7 +344,7 @@ def _declared(
         groups.append(getattr(groups[-1], step))
     owner, outer = groups[-1], groups[-2:-1]
     text = described_fields(type(owner)).get(path[-1], '')
-    # Fields of one class are told apart by what the group says of each.
+    # Fields of one class are told apart by their descriptions in the group.
     if outer and sum(type(value) is type(owner) for value in vars(outer[0]).values()) > 1:
         group = described_fields(type(outer[0]))[path[-2]].rstrip('.')
         text = f'{group}: {text[0].lower()}{text[1:]}'

@@ -284,7 +284,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             if not starts:
                 self._log.skip(Fault.ESTIMATE, f'image of {stamp} ns can not be tracked: {text}')
                 return
-            # The next image would fail as this one did, after as long a time.
+            # The next image would fail in the same way, and take the same time.
             self._log.skip(Fault.START, f'no track starts at the image of {stamp} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None, box=None))
 
@@ -342,7 +342,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                 fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
         state = KeepOutState.UNKNOWN if tracker is None else _STATES[tracker.status]
         if state is KeepOutState.NOBODY and tracker is not None and not tracker.nobody_shown:
-            # An earlier image has said so, and this one says nothing.
+            # An earlier image showed that nobody is there; this one shows nothing.
             state = KeepOutState.UNKNOWN
         if state is KeepOutState.TRACKING and tracker is not None:
             if placed and posterior is not None and not tracker.foreseen:

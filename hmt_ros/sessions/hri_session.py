@@ -69,11 +69,11 @@ BODY_TOPICS = {
     'cropped': PublishedTopic('sensor_msgs/msg/Image'),
 }
 MIXTURE = 'pose_mixture'
-# Share of the weight of the heaviest mode with which a mode goes on to be shown.
+# Least weight, relative to the heaviest mode, with which a mode stays on show.
 _KEPT = 0.5
 # Change of a length above which a body is described anew, m.
 _RESHAPED = 0.005
-# People of whom no body is tracked who are remembered, for the numbers of their tracks.
+# Number of people without a body who are remembered, for the numbers of their tracks.
 _REMEMBERED = 1000
 # A filter that is further behind drops images itself.
 _IMAGES = 20
@@ -279,7 +279,7 @@ class HriSession(Session[HriParameters, HriState]):
         """Publishes a body in its pose.
 
         Raises:
-            ValueError: joint positions that are those of no person.
+            ValueError: joint positions that no person has.
         """
         p, stamp = self.parameters, content.stamp_ns
         shown = _shown_mode(content, person.mode if person.goes_on(content.track_id) else 0)

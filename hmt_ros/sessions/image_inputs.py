@@ -48,8 +48,8 @@ class ImageInput:
     Attributes:
         name: of the input.
         types: type of its messages, by source; a source is the name of its topic, too.
-        parameter: that is true where images wait for it; '': they always do.
-        faulty, none: kinds of faults of a message that can not be used, and of an image without.
+        parameter: name of the one that is true where images wait for it; '': they always do.
+        faulty, none: kinds of faults: of an unusable message, and of an image without one.
         read: content of a message of a stamp, None where it says that there is nothing; raises
             ValueError, in one line, where it can not be used.
         lone: kind of fault of one that belongs to no image; None: it is not reported.
@@ -205,7 +205,7 @@ class ImageInputs:
         return self._waiting[name]
 
     def row(self, source: str) -> ImageInput | None:
-        """The input that a source is of; None: it is of none."""
+        """The input that a source belongs to; None: to none."""
         return self._rows.get(source)
 
     def put(self, source: str, message: Any, stamp_ns: int, read: Callable[..., Any]) -> None:

@@ -41,9 +41,9 @@ from msg_tools.messages.keypoints import Positions, keypoints_of
 
 # Time without the person after which the largest one is chosen anew, s.
 LONGEST_ABSENCE = 1.0
-# A person moves less between two images, in sizes of the person.
+# Largest motion of a person between two images, in sizes of the person.
 _FARTHEST = 1.0
-# Factor per image on the size of a person of whom less is seen now.
+# Factor per image on the size of a person who is partly hidden now.
 _SIZE_KEPT = 0.95
 # Sets of unknown names that are warned of, each once; a detector has one.
 _MOST_WARNINGS = 20
@@ -142,7 +142,7 @@ class KeypointReader:
 
         Args:
             camera: that took the image; None: it is not known yet.
-            sigma_px: standard deviation of keypoints without one, px; 0: as is learned.
+            sigma_px: standard deviation of keypoints without one, px; 0: the learned one.
 
         Raises:
             ValueError: it can not be used; one line.

@@ -107,7 +107,7 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     for key in document:
         if str(key) not in sections:
             raise ParameterError(f'{path}: section {key!r} has no {_KEY}')
-    # As in ROS, what stands for one node goes before what stands for all.
+    # As in ROS, a section for one node overrides a section for all.
     for key in sorted(sections, key=lambda key: '*' not in key):
         if key.rpartition('/')[2] in ((node,) if by_name else (node, '*', '**')):
             result.update(_flattened(sections[key][_KEY] or {}, '', path))

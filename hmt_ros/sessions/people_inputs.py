@@ -61,7 +61,7 @@ class PeopleReader:
         """The people in a message.
 
         Args:
-            sigma_px: standard deviation of keypoints without covariances, px; 0: as is learned.
+            sigma_px: standard deviation of keypoints without covariances, px; 0: learned ones.
 
         Raises:
             MessageError: it can not be used.
@@ -92,7 +92,7 @@ class PeopleReader:
     def found(
         self, people: Sequence[DetectedPerson], body: Body, scheme: str, *, use_keypoints: bool
     ) -> list[Found]:
-        """The people of whom something was seen.
+        """The people who are at least partly visible.
 
         Args:
             use_keypoints: whether they are used for more than boxes.

@@ -8,7 +8,7 @@ from typing import ClassVar
 from hmt_ros.sessions.declared_parameters import AT_ONCE, NEXT_CONFIGURE, parameter_field
 from hmt_ros.sessions.filter_parameters import FilterParameters
 
-# Inputs of one person, of whom a topic can not say who it is.
+# Inputs of a single person, whose topics can not tell which person it is.
 _OF_ONE = {
     'subject_file': '', 'use_predictions': False, 'use_keypoints_3d': False, 'person_id': '',
 }  # fmt: skip

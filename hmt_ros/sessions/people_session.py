@@ -3,8 +3,8 @@
 The rules, besides those of `TrackingSession`:
 
 - An image waits for its detections (`image_inputs`).
-- Identities of the detector are kept. People without one are told apart by where they were
-  last and how they moved (`hmt_ros.tracking.association`).
+- Identities of the detector are kept. People without one are told apart by their last place
+  and motion (`hmt_ros.tracking.association`).
 - A detection that matches nobody who is followed starts a filter, the largest first, up to
   `max_people`. A person without a track, or no longer in view (`Tracker.status`), is dropped.
 - The nearest person is tracked first. For each person the pixels of nearer people are unknown, and
@@ -71,9 +71,9 @@ def published_topic(topic: str) -> PublishedTopic:
     return TOPICS_OF_NODE[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
 
 
-# Less of somebody in the image, px, is not worth a track.
+# Least size in the image, px, of a person who is tracked.
 SMALLEST = 4
-# Somebody who is detected no more, and of whom no track has started, is forgotten after so long, s.
+# Time, s, after which a person who is no longer detected and has no track yet is forgotten.
 UNSTARTED = 0.5
 
 

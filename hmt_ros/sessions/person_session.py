@@ -1,6 +1,6 @@
-"""The filter of one of several people: as `FilterSession`, but handed what the people share.
+"""The filter of one of several people: a `FilterSession` that is handed all shared inputs.
 
-Image, calibration, background and transforms are those of all. Topics lie in `humans/bodies/<id>/`
+People share image, calibration, background and transforms. Topics lie in `humans/bodies/<id>/`
 (REP 155), frames of the links begin with `body_<id>/`.
 """
 
@@ -32,18 +32,18 @@ BODIES = 'humans/bodies'
 
 
 def topic_of(person: str, topic: str) -> str:
-    """Name of a topic of a person; absolute ones are those of all."""
+    """Name of a topic of a person; all people share absolute ones."""
     return topic if topic.startswith('/') else f'{BODIES}/{person}/{topic}'
 
 
 def person_of(topic: str) -> str:
-    """The person whose topic this is; '' where it is that of all."""
+    """The person whose topic this is; '' for a shared topic."""
     name = topic.removeprefix(f'{BODIES}/')
     return '' if name == topic else name.partition('/')[0]
 
 
 def _of_person(person: str, parameters: FilterParameters) -> FilterParameters:
-    """The parameters of the filter of a person; the background is that of all."""
+    """The parameters of the filter of a person; the background is shared."""
     prefix = f'{parameters.frame_prefix}body_{person}/'
     return replace(parameters, frame_prefix=prefix, background_file='')
 
@@ -54,7 +54,7 @@ class PersonSession(FilterSession):
     Args:
         person: identity, which is part of topics and frames.
         publish, wanted: as for `Session`, of topics with the identity.
-        start: what all people start from.
+        start: that all people share.
         frames: that transforms lead to from the camera, looked up by the caller.
     """
 
@@ -78,18 +78,18 @@ class PersonSession(FilterSession):
         )
         self.restart(start)
         for topic in self.TOPICS:
-            # Who publishes opens them now, and not with the first message, which would be lost.
+            # The publisher opens them now, not at the first message, which would be lost.
             self._wanted(topic)
         self.frames = frames
         self._log = log
         self._background = background
 
     def use(self, parameters: FilterParameters) -> None:
-        """Takes the parameters of all, of which those that take effect at once do."""
+        """Takes the shared parameters; those that take effect at once do so."""
         self.parameters = _of_person(self._person, parameters)
 
     def restart(self, start: TrackStart | None = None) -> None:
-        """See `FilterSession.restart`; without a start that of all people."""
+        """See `FilterSession.restart`; without a start, the shared one is used."""
         super().restart(self._shared_start if start is None else start)
 
     @property
@@ -108,7 +108,7 @@ class PersonSession(FilterSession):
         return self._tracker is not None and self._tracker.status is Status.NOBODY
 
     def start_in(self, box: Box) -> None:
-        """The next image starts the track in a box, px, where nothing tells more."""
+        """The next image starts the track in a box, px, unless other inputs tell more."""
         self.start = replace(self.start, box=box)
 
     def follow(

@@ -109,7 +109,7 @@ class RobotOutputs:
         if state is KeepOutState.NOBODY:
             before = None
         elif state is KeepOutState.UNKNOWN and before is not None:
-            # A track was dropped; whom it followed has gone on.
+            # A track was dropped; the person whom it followed may have moved on.
             state = KeepOutState.LOST
         self._told = _Told(state, stamp_ns, frame_id, track_id, existence, seen or before)
 
@@ -117,7 +117,7 @@ class RobotOutputs:
         """The space to keep out of.
 
         Args:
-            probability: that is asked for, where there are no capsules.
+            probability: that is requested; reported where there are no capsules.
             silence: time since the newest image was answered, s; None: it is being answered.
         """
         told = self._told

@@ -30,7 +30,7 @@ from msg_tools.messages.images import decode_image
 
 # Key of the diagnostics, before the name of a topic, for the number of its subscribers.
 SUBSCRIBERS = 'subscribers of '
-FINISH = 'finish'  # what `finish` calls the end of the stream
+FINISH = 'finish'  # source of the report of `finish`, at the end of the stream
 
 
 class PublishedTopic(NamedTuple):
@@ -284,7 +284,7 @@ class Session(ABC, Generic[Parameters, State]):
         return time_ns(message.header.stamp)
 
     def _start_again(self) -> None:
-        """Starts the estimate anew as the last time."""
+        """Starts the estimate anew in the same way as last time."""
         self.restart()
 
     def _handled(self, source: str, stamp: int) -> Handled:

@@ -20,7 +20,7 @@ from hmt_ros.smoothing import LinearGaussianDynamics
 MODELS = ('random_walk', 'constant_velocity', 'learned')
 METHODS = ('paths', 'variational')
 # Factor on the variance that the learned motion gains in a second. Sudden motion is more frequent
-# than a Gaussian of the mean variance has it; chosen on clips (docs/smoothing.md).
+# than under a Gaussian of the mean variance; chosen on clips (docs/smoothing.md).
 LIVELINESS = 2.0
 
 

@@ -3,7 +3,7 @@
 The rules, besides those of `Session`:
 
 - Mixtures are smoothed in the order of their stamps, in a sliding window, ten times a second at
-  most: neighbours tell nearly the same. A pose is published as smoothed before it is older than the
+  most: neighbours hardly differ. A pose is published as smoothed before it is older than the
   newest by more than `fixed_lag` and a fifth of it; those that are still open when the window ends
   are published then: at the end of the stream (`finish`), where time jumps
   back, at a new body.
@@ -67,13 +67,13 @@ from msg_tools.messages.pose_mixtures import (
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
 MIXTURE = 'likelihood_mixture'
-# Distance of two modes of an image below which they are merged, in standard deviations of what the
-# image counts for.
+# Distance of two modes of an image below which they are merged, in standard deviations of the
+# evidence that counts.
 MERGED = 1.75
 NOBODY = 'nobody'  # status while nobody is in view
 # Change of a length from one mixture to the next above which it is another person's, m.
 SAME_PERSON = 0.02
-# Time between two smoothings, as a share of the lag, and at most, s: neighbours tell the same.
+# Time between two smoothings, as a share of the lag, and at most, s: neighbours hardly differ.
 SHARE_OF_LAG, RARELY = 0.2, 0.1
 
 
@@ -270,7 +270,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             return self._resolved[1]
         chosen = self.parameters.body_model
         try:
-            # A message must not have files read: what it names ships with the package.
+            # A message must not cause files to be read: its body has to ship with the package.
             model = known_body(chosen) if chosen else known_body(content.body_model, named_body)
         except ValueError as error:
             raise MessageError(str(error), MessageFault.BODY) from error

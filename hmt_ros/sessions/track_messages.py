@@ -112,7 +112,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     skeleton, posterior = body.skeleton, track.posterior
     joints = forward(skeleton, posterior.means).joints().transpose(2, 0, 1)
     ground = _ground_state(track)
-    # Both are made before anything is published: either may be one that a message must not have.
+    # Both are made before anything is published: either may be invalid for a message.
     made = {
         'pose_mixture': lambda: _posterior(track, joints),
         'likelihood_mixture': lambda: _likelihood(track),
@@ -235,7 +235,7 @@ def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
 
 
 def _likelihood(track: TrackedImage) -> PoseMixture:
-    """The likelihood, which is undiscounted, with how its errors last."""
+    """The likelihood, which is undiscounted, with the duration of its errors."""
     tracker, likelihood, frame = track.tracker, track.likelihood, track.waiting.frame_id
     shape, errors = tracker.shape_covariance, tracker.likelihood_errors
     if (fixed := track.fixed) is not None:

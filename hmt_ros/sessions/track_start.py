@@ -69,7 +69,7 @@ class TrackStart:
 
         Args:
             ground: gravity and floor, as far as they are known; None: by the parameters.
-            shared: background of several people, which somebody else learns; None: an own one.
+            shared: background of several people, which is learned elsewhere; None: an own one.
 
         Raises:
             ValueError: the background was taken by another camera, or the box is not in its image.

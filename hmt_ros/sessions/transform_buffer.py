@@ -28,7 +28,7 @@ REMEMBERED = 10.0
 MOST_FRAMES, MOST_STAMPS = 1000, 10_000
 # Most that the length of a quaternion differs from 1; tf2 takes half of it.
 _NOT_UNIT = 1e-2
-# Cosine of half the angle between two rotations that a line joins as well as an arc.
+# Cosine of half the angle between two rotations so close that a line replaces the arc.
 _CLOSE = 0.9995
 # Names of frames in a message for people.
 _LISTED = 12

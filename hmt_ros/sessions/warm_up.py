@@ -1,7 +1,7 @@
 """The warm-up of sessions before the first message, so that no message waits for compiled code.
 
-numba compiles a kernel, or loads what was compiled, at its first call. A short film, and mixtures
-as if of one, run all of them; nothing stays of it but the code (`Session.prepare`).
+numba compiles a kernel, or loads its compiled code, at its first call. A short film, and mixtures
+as if of one, run all of them; only the compiled code is kept (`Session.prepare`).
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ probability
     E_i[a_j q_j / (a_i q_i + a_j q_j)] <= (a_j / a_i)^(1/2) / 2 int (q_i q_j)^(1/2)
 
 and the overlap of two trajectories is at most that of their poses at any one time, for Gaussians at
-most exp(-1/4 D'(C_i + C_j)^-1 D). Pairs below exp(-30) are left out. Of the others the distance is
-summed up from the time on at which they are farthest apart, until it tells enough.
+most exp(-1/4 D'(C_i + C_j)^-1 D). Pairs below exp(-30) are left out. For the others the distance is
+summed from the time at which they are farthest apart, until it exceeds a threshold.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def add_overlaps(
     weight_gradient: Array,
     band_gradient: Array,
 ) -> None:
-    """Adds what the samples of one component tell of log q.
+    """Evaluates log q at the samples of one component, and adds its derivatives.
 
     Args:
         own: which component the samples are from.

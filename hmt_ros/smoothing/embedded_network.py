@@ -3,8 +3,8 @@
     node  p(r_t | m_i)  = int p(r_t | x) m_i(x) dx           = sum_j w_j N(mu_i; mu_j, S_i + S_j)
     link  p(m_j | m_i)  = int int m_j(y) p(y | x) m_i(x)     = N(mu_j; A mu_i, S_j + A S_i A' + Q)
 
-in closed form. Where the state has velocities, the link integrates over what is known of them at
-first.
+in closed form. Where the state has velocities, the link integrates over the distribution of an
+unknown velocity.
 
 Paths are those of exact max-product over the layers, for all sources at once. The values of nodes
 and links are densities and may exceed 1; dynamic programming over layers needs no bound on them.
@@ -71,7 +71,7 @@ def embedded_network(
     covariances = np.concatenate([mixture.covariances for mixture in mixtures])
     different, which = np.unique(intervals, return_inverse=True)
 
-    # Where every mode is expected at the next time, and how widely.
+    # Expected place and spread of every mode at the next time.
     predicted, spread = np.empty_like(means), np.empty_like(covariances)
     for i, interval in enumerate(different):
         a, q = dynamics.transition(float(interval))
@@ -120,7 +120,7 @@ def _node_values(weights: Array, densities: Array, pairs: Index) -> Array:
     row, column = pairs
     log = np.empty((len(weights), len(weights)))
     log[row, column] = log[column, row] = densities[: len(row)]
-    # scipy's logsumexp, without what it spends on axes and signs.
+    # scipy's logsumexp, without its overhead for axes and signs.
     top = log.max(1, keepdims=True)
     result: Array = np.log(np.exp(log - top) @ weights) + top[:, 0]
     return result
@@ -230,8 +230,8 @@ def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
 def paths_through_nodes(network: EmbeddedNetwork) -> Paths:
     """For every node at every time the best path through it; without repetitions, best first.
 
-    The paths between ends agree in the middle of a long sequence: they tell which trajectories
-    there are, but not what else a single pose may have been.
+    The paths between ends agree in the middle of a long sequence: they show the probable
+    trajectories, but not the alternatives of a single pose.
     """
     forward, ahead = [network.nodes[0]], []
     for links, nodes in zip(network.links, network.nodes[1:]):

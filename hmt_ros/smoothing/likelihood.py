@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 # Modes whose density is below exp(-60) of the greatest are left out: less than rounding.
 NEGLIGIBLE = 60.0
-# Probability that the pose is none of the modes of an image. Where it is, the image says next to
-# nothing: in 37 dimensions that costs 50 nats and more, beside which this one hardly counts.
+# Probability that the pose is none of the modes of an image. Such an image says next to nothing,
+# which costs 50 nats and more in 37 dimensions: beside that, this probability hardly matters.
 MISSED = 0.01
 
 
@@ -49,7 +49,7 @@ class MixtureLikelihood:
 
     With y_k = W_k (x - m_k), S_k^-1 = W_k' W_k, responsibilities r_k and u_k = W_k' y_k, the
     gradient of -log p is u = sum_k r_k u_k and its Hessian sum_k r_k S_k^-1 - (sum_k r_k u_k u_k' -
-    u u'). Without what is in brackets it belongs to the quadratic that expectation-maximisation
+    u u'). Without the part in brackets it belongs to the quadratic that expectation-maximisation
     minimises, which lies above -log p: a full step never ascends.
 
     Attributes:

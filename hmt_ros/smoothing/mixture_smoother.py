@@ -73,14 +73,14 @@ class MixtureSmoother:
         dynamics: of the state.
         lower, upper: (d,) limits of the pose at every time; None: none.
         max_trajectories: components of the result at most.
-        adapt: what the descent of the free energy changes: some of 'weights', 'means', 'inflation',
-            'covariances'; empty: nothing.
+        adapt: variables of the descent of the free energy: some of 'weights', 'means', 'inflation',
+            'covariances'; empty: no descent.
         start: 'laplace' weighs optima by their mass, 'peak' by their height, as VMS does.
         max_iterations: of the descent of the free energy.
         through_modes: whether, besides the best paths between the ends, those through every single
-            single mode are starts: more alternatives for each pose, fewer for the whole motion.
+            mode are starts: more alternatives for each pose, fewer for the whole motion.
         points: maps poses (N, d) to points (N, P, 3), m, by which motions are told apart
-            (`path_hypotheses`); None: nothing tells how far they are apart.
+            (`path_hypotheses`); None: their distance is unknown.
 
     Raises:
         ValueError: settings out of range.
@@ -119,8 +119,8 @@ class MixtureSmoother:
         Args:
             mixtures: T likelihoods over the pose; weights need not sum to 1.
             stamps_ns: (T,) times, increasing; None: one `dynamics.step` apart.
-            observation: what stands for the likelihood in refinement and free energy, the images
-                themselves for example; the mixtures then give the starts. None: the mixtures.
+            observation: likelihood in refinement and free energy, for example that of the images
+                themselves; the mixtures then give the starts. None: that of the mixtures.
 
         Raises:
             ValueError: mixtures or stamps that can not be smoothed; the message says which.
@@ -145,7 +145,7 @@ class MixtureSmoother:
         stamps_ns: Sequence[int] | None = None,
         observation: SequenceLikelihood | None = None,
     ) -> TrajectoryMixture:
-        """As `smooth`, of what was checked."""
+        """As `smooth`, of inputs that were checked."""
         likelihood = sequence.likelihood if observation is None else observation
         best, least = self.optima(sequence, likelihood), np.nan
         for other in self.merged_paths(sequence) if observation is None else ():
@@ -168,7 +168,7 @@ class MixtureSmoother:
         prior, paths = sequence.prior, self.paths(sequence)
         d = prior.dimension
         starts = sequence.states(paths)
-        # What the others share with the best path is refined once.
+        # Parts that the others share with the best path are refined once.
         best = refine(starts[:1], prior, likelihood, low[:d], high[:d])
         shared = paths.nodes == paths.nodes[0]
         starts = np.where(shared[:, :, None], best.states, starts)
@@ -235,7 +235,7 @@ class MixtureSmoother:
         seed: int,
         max_iterations: int,
     ) -> VariationalMixture:
-        """Descent over the components that count; the others stay what they are."""
+        """Descent over the components that count; the others stay as they are."""
         low, high = self._limits()
         heavy = candidates.weights > LEAST_SHARE * candidates.weights.max()
         states = candidates.states[heavy]
@@ -338,7 +338,7 @@ class PathSmoother(MixtureSmoother):
     free energy. Means beyond the limits are moved onto them.
 
     Attributes:
-        resting: points that may rest on the ground; None: nothing is made of them.
+        resting: points that may rest on the ground; None: not used.
     """
 
     resting: RestingPoints | None = None
@@ -381,8 +381,8 @@ class PathSmoother(MixtureSmoother):
                 known = np.array([covariance[:d, :d] for covariance in factors[i].filtered])
                 held = self.resting.held(sequence.prior, poses, known, sequence.intervals)
                 found = path_gaussians(nodes[[i]], held, sequence.likelihood)
-                # Paths of the same motion go along. Covariances are those without what rests: that
-                # it does is decided, and is the same from image to image.
+                # Paths of the same motion are shifted along. Covariances ignore the resting points:
+                # rest is a decision, the same from image to image.
                 states[motions == i] += found.states[0] - states[i]
         return self._mixture(
             weights,

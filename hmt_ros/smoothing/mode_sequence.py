@@ -1,8 +1,8 @@
 """The modes of a sequence of mixtures under a dynamical model, and the Gaussians of their paths.
 
 Modes that overlap are one explanation of the observation rather than two. Where they are merged
-into one Gaussian with their mean and covariance, a path stands for all paths through the modes that
-it merged, and few trajectories cover what many would have to (VMS 4).
+into one Gaussian with their mean and covariance, a path stands for all paths through the merged
+modes, and few trajectories cover the same posterior as many (VMS 4).
 
 Where the likelihood is a mixture at every time, the posterior is a mixture too, with a component
 for every path k = (k_1 .. k_T):

@@ -5,9 +5,9 @@ A path that goes on to mode k of the next image has the state and the weight
     N(x; A m, A S A' + Q) N(C x; mu_k, S_k) w_k        m, S: its state before
 
 where C takes the pose out of the state. So weights are those of the components of the posterior.
-The network of VMS 4 weighs a path by pairs of neighbours (`embedded_network`), and a pair knows
-nothing of what was before it: where most modes are wide, a path may turn round and back. In every
-image few paths are kept of all: some that are apart, and the heaviest.
+The network of VMS 4 weighs a path by pairs of neighbours (`embedded_network`), and a pair does not
+depend on the images before it: where most modes are wide, a path may turn round and back. In every
+image only few paths are kept: some that are apart, and the heaviest.
 
 The states of a path, given all of it, follow backwards from the last one (`smoothed_paths`):
 
@@ -38,7 +38,7 @@ from hmt_ros.smoothing.embedded_network import Paths
 # Motions are one as long as no point of theirs is farther apart than this, m: half the length of a
 # forearm, which a flip turns over.
 SAME_MOTION = 0.12
-# Weight of the state of a path that is lighter, exp of it: a positive number still.
+# Least log weight of the state of a path: its exponential is still positive.
 LEAST_LOG_WEIGHT = -690.0
 
 
@@ -324,7 +324,7 @@ def first_state(mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> G
 
 @dataclass(frozen=True, eq=False)
 class SmoothedPath:
-    """A Gaussian Markov process by what each state is, given the next one.
+    """A Gaussian Markov process, as the density of each state given the next one.
 
         x_T ~ N(m_T, S_T),    x_t | x_{t+1} ~ N(m_t + G_t (x_{t+1} - A m_t), D_t)
         D_t = (1 - G_t A) S_t (1 - G_t A)' + G_t Q G_t' = R_t R_t'
@@ -333,7 +333,7 @@ class SmoothedPath:
 
     Attributes:
         filtered: T covariances S_t (n, n).
-        passages: T-1; of the path before each the row in it.
+        passages: T-1 passages, each with the row of the path in it.
     """
 
     filtered: tuple[Array, ...]

@@ -63,7 +63,7 @@ class RestingPoints:
 
         Args:
             poses: (T, d).
-            covariances: (T, d, d) of which the directions count in which points are known least.
+            covariances: (T, d, d); only the directions in which points are known least count.
             intervals: (T-1,) s.
         """
         return self._probabilities(
@@ -90,7 +90,7 @@ class RestingPoints:
 
         Args:
             prior: of the states, whose first d variables are the pose.
-            poses: (T, d) along which is decided what rests, and points are linear.
+            poses: (T, d) at which rest is decided and points are linearised.
         """
         count, d = poses.shape
         points, jacobians = self.points(poses), self.jacobians(poses)

@@ -24,7 +24,7 @@ from hmt_ros.smoothing.path_hypotheses import SAME_MOTION, FilteredPaths
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
 SECOND_NS = 10**9
-# Intervals between poses tremble by this share of their length.
+# Intervals between poses vary by this share of their length.
 TREMBLE = 0.1
 
 
@@ -80,13 +80,13 @@ class SlidingWindow:
 
     Args:
         fixed_lag: time by which a pose is older than the newest one at most when it is final, s:
-            the next one, expected as long after the last as that after the one before, would make
-            it older. 0 is filtering; infinite: nothing is final before the end.
+            the next one, expected after the same interval as the last, would make it older.
+            0 is filtering; infinite: nothing is final before the end.
         every: least time between two smoothings, s; poses that become final meanwhile wait for
             the next.
 
     Attributes:
-        next_identity: that no trajectory has had.
+        next_identity: number that no trajectory has had.
 
     Raises:
         ValueError: a lag that is negative or not a number.

@@ -37,7 +37,7 @@ from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 FIRST_DAMPING = 1e-4
 DAMPING_LIMIT = 1e10
-# Of the positive Hessian in a step, where the exact one is indefinite.
+# Shares of the positive Hessian in a step, where the exact one is indefinite.
 SHARES = (0.125, 0.25, 0.5, 0.75)
 # Doubles in the Hessians of the observations that are held at once.
 HESSIAN_BUDGET = 800_000
@@ -54,9 +54,9 @@ class RefinedTrajectories:
         free: (M, T, n) variables that do not rest on a limit.
         status: (M,) of `Status`.
         iterations: (M,) evaluations after the first.
-        factors: M Cholesky factors of the precision there. Of a variable that rests on a limit it
-            is that of the slope: the density falls off as exp(-g distance), which has variance 1 /
-            g^2.
+        factors: M Cholesky factors of the precision there. For a variable that rests on a limit
+            it is that of the slope: the density falls off as exp(-g distance), which has variance
+            1 / g^2.
         starts: (M,) which start each of them came from.
     """
 
@@ -268,7 +268,7 @@ class _Problem:
             positive = self._evaluate(self.states[active[failed]], Derivatives.POSITIVE)[3]
             for row, hessian in zip(failed, positive):
                 i = active[row]
-                # Indefinite: as little of the positive Hessian as makes it positive definite.
+                # Indefinite: the least share of the positive Hessian that mends this.
                 if self.exact[i] and any(
                     self._step(
                         i,
@@ -328,7 +328,7 @@ class _Problem:
             return None
 
     def _positive_factor(self, hessian: Array, extra: Array) -> BlockCholesky:
-        """As `_factor`, with what it takes to make the matrix positive definite."""
+        """As `_factor`, with an addition that makes the matrix positive definite."""
         shift = 0.0
         while True:
             factor = self._factor(hessian, extra + shift * self._metric(hessian))

@@ -12,8 +12,8 @@ through their block Cholesky factors, S_i^-1 = L_i L_i'. The expectation is over
     X = M_i + s_i L_i'^-1 z
 
 with the same antithetic noise z throughout, so that the sampled F is a smooth function with exact
-gradients and its descent is repeatable; what is reported besides comes from fresh samples, with a
-standard error. Variables are scaled by the curvature that F would have if the posterior were q:
+gradients and its descent is repeatable; F is also reported on fresh samples, with a standard
+error. Variables are scaled by the curvature that F would have if the posterior were q:
 means by L_i sqrt(a_i), log s_i by sqrt(2 D a_i).
 """
 
@@ -165,8 +165,8 @@ def antithetic(rng: np.random.Generator, components: int, samples: int, size: in
 def matched(noise: Array) -> Array:
     """Noise (M, S, D) scaled to the variance that it should have, for each component.
 
-    What is known of the noise need not be estimated from it: with few samples an inflation would
-    follow their chance variance.
+    The variance of the noise is known and need not be estimated: with few samples an inflation
+    would follow their chance variance.
     """
     result: Array = noise / np.sqrt((noise * noise).mean((1, 2), keepdims=True))
     return result
@@ -348,7 +348,7 @@ class FreeEnergy:
     def _band_gradient(
         self, mixture: Mixture, roots: Array, slope: Array, mass: Array, direct: Array
     ) -> Array:
-        """Gradient (M, D, width + 1) with regard to what moves the factors.
+        """Gradient (M, D, width + 1) with regard to the variables that move the factors.
 
         A sample X = M + s u, u = L'^-1 z, moves by -s L'^-1 dL' u.
         """

@@ -15,17 +15,17 @@ The colours of a person, and whether an image shows them anywhere.
 
 M are the pixels that the model covers. `here` and `elsewhere` are the usual value of B where the
 person is, and its usual maximum over boxes beside the person: the score is about 1 where the image
-shows somebody in these colours, wherever that is, and about 0 in a room without the person. Where
-the two are alike the colours say nothing, and where the colours of the image are not those of the
-images before: a covered lens, another light.
+shows somebody in these colours, wherever that is, and about 0 in a room without the person. Colours
+are no evidence where the two are alike, or where the image has other colours than the images before
+it: a covered lens, another light.
 
 Their absence is evidence against the person only in the scene that they were learned in:
 
     stillness = 1 - changed pixels beyond the model / (UNDECIDED pixels of the model), at least 0
 
-Else `elsewhere` is that of another scene: the camera has moved, and the colours that are gone may
-be those of a thing that the model was on. A person who moves beyond the model changes as much. A
-colour that no image had may belong to the person, who turns about.
+Otherwise `elsewhere` belongs to another scene: the camera has moved, and the lost colours may be
+those of a thing that the model covered. A person who moves beyond the model changes as many pixels.
+A colour that no image had may belong to the person, who turns about.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ from hmt_ros.tracking.person_shape import (
 from hmt_ros.tracking.silhouettes import SPEED
 from hmt_ros.tracking.view import View
 
-# Fraction of the usual value at which a silhouette says nothing; at none of it somebody is absent,
-# at twice as much present.
-# Beyond the model as many pixels may change as this share of those of the person, or of those
-# beyond if they are fewer: a shadow goes with the person. Of more the scene is another one.
+# Fraction of the usual value at which a silhouette is no evidence; at 0 it says that somebody is
+# absent, at twice this fraction present.
+# It also limits the changed pixels beyond the model, relative to those of the person, or to those
+# beyond if they are fewer: a shadow goes with the person. More changes show another scene.
 UNDECIDED = 0.25
 # Colours are learned once in so many seconds: they hardly change.
 LEARNED = 0.1
 # More than this fraction of an image, or of a person, is most of it.
 MOST = 0.5
-# Time constant of what is usual for a track, s.
+# Time constant of the usual values of a track, s.
 MEMORY = 2.0
-# Least difference between `here` and `elsewhere` that says something, a probability.
+# Least difference between `here` and `elsewhere` that is evidence, a probability.
 LEAST_CONTRAST = 0.15
 # Bins of a colour channel.
 BINS = 8
@@ -86,7 +86,7 @@ class Colours:
         self.here = self.elsewhere = math.nan
         self._inside: Array | None = None
         self._around = self._scene = np.zeros(BINS**3)
-        # The last image that was learned, and what the model did not cover in it.
+        # The last image that was learned, and the pixels well beyond the model in it.
         self._image: Image | None = None
         self._beyond: Mask | None = None
 
@@ -106,7 +106,7 @@ class Colours:
         return float((self._means(bins, unseen).max() - self.elsewhere) / contrast)
 
     def stillness(self, image: Image) -> float:
-        """How far an image (h, w, 3) is of the scene that was learned last, from 0 to 1."""
+        """Likeness, from 0 to 1, of an image (h, w, 3) to the scene that was learned last."""
         if self._image is None or self._beyond is None:
             return 0.0
         changed = cv2.absdiff(cv2.blur(image, (3, 3)), self._image).max(axis=2) > OTHER
@@ -126,7 +126,7 @@ class Colours:
         if not model.any() or not around.any():
             return
         bins = binned(image)
-        # One pass: beside both, on the model, around it.
+        # One pass counts the pixels on the model, around it, and all others.
         counts = np.bincount(
             (bins + BINS**3 * (model + 2 * around.view(np.uint8)).astype(np.uint16)).ravel(),
             minlength=3 * BINS**3,
@@ -263,7 +263,7 @@ class Appearance:
             return None
         foreground, others = view.anywhere, view.others
         if others is not None and view.silhouette is not None:
-            # It is open who else is in view: only what is near the person counts.
+            # Others may be in view: only foreground near the person counts.
             foreground = on_raster(view.silhouette, foreground)
             model = model & ~on_raster(others, model)
         self._foreground = foreground
@@ -344,5 +344,5 @@ def _coarse(view: View) -> Image:
 
 
 def _evidence(value: float) -> float:
-    """From -1 to 1, of a value against the usual one."""
+    """Evidence, from -1 to 1, of a value relative to the usual one."""
     return min(max(value / UNDECIDED - 1.0, -1.0), 1.0)

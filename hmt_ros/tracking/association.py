@@ -5,8 +5,8 @@
 u_i are the joints of person i where they were last seen, v_i is the velocity of the person in the
 image, s_i the size of the person, and p_j are the joints of detection j; where they have no joints
 in common the middles of their boxes count. A pair is possible below a cost that grows with the time
-for which the person was not seen. The assignment has the least sum of costs, of which somebody
-without a detection costs as much as the worst possible pair.
+for which the person was not seen. The assignment minimises the sum of costs; a person without a
+detection has the cost of the worst possible pair.
 
 The nearer of two people hides the farther one. For the farther one all pixels of the nearer one are
 unknown; for the nearer one only those that the farther one covers beside it.
@@ -26,14 +26,14 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.error_model import seconds
 
-# Cost below which a pair is possible from one image to the next, in sizes of the person; it grows
-# by as much in `GOES_ON`.
+# Cost below which a pair is possible from one image to the next, in sizes of the person; it doubles
+# within `GOES_ON`.
 GATE = 0.4
 # Time for which a person is taken to go on as before, and to keep the size though less is seen now,
 # s, and the time constant of the velocity.
 GOES_ON = 1.0
 MEMORY = 0.25
-# Margin around what a person covers, or around the hull of keypoints, that is unknown to others, as
+# Margin around the area of a person, or around the hull of keypoints, that is masked for others, as
 # a fraction of the height: the radius of a limb.
 MARGIN = 0.05
 
@@ -43,7 +43,7 @@ class Sighting:
     """Where somebody is in an image.
 
     Attributes:
-        joints: pixels (2,) by the name of the joint, of those that were seen.
+        joints: pixels (2,) of the visible joints, by name.
         corners: (2, 2) left top and right bottom of the box around the person, px.
     """
 
@@ -67,7 +67,7 @@ class Sighting:
         return max(float(np.hypot(*(self.corners[1] - self.corners[0]))), 1.0)
 
     def shifts_to(self, other: Sighting) -> Array:
-        """Ways (n, 2) of the joints in common to where another has them; of the middle, else."""
+        """Shifts (n, 2) of the common joints to another sighting; without any, of the middle."""
         common = [name for name in self.joints if name in other.joints]
         if not common:
             return np.asarray((other.middle - self.middle)[None])
@@ -99,7 +99,7 @@ class ImageTrack:
         dt = seconds(stamp - self.stamp)
         moved = np.median(self.sighting.shifts_to(sighting), axis=0)
         self._known_for += dt
-        # At first the mean of what was seen, later that of the last moments.
+        # At first the mean over all sightings, later that over the last moments.
         gain = min(dt / min(self._known_for, MEMORY), 1.0)
         self.velocity += gain * (moved / dt - self.velocity)
         self.size = max(sighting.size, self.size * math.exp(-dt / GOES_ON))
@@ -128,7 +128,7 @@ def assigned(
         return {}
     costs = np.array([[track.cost(each, stamp) for each in sightings] for track in tracks])
     gates = np.array([track.gate(stamp) for track in tracks])[:, None]
-    # An impossible pair costs as much as to have none.
+    # An impossible pair costs the same as no pair.
     rows, columns = linear_sum_assignment(np.where(costs < gates, costs, gates))
     return {
         int(row): int(column)

@@ -141,7 +141,7 @@ class Starts:
         Args:
             view: of the image.
             stamp: of the image, ns.
-            body: that the poses of a mixture are of.
+            body: of the poses of a mixture.
             upright: gravity; None: unknown.
             prediction: by the image, if any.
             observed: makes the observation of the image.
@@ -171,8 +171,8 @@ def beginning_given(
 
     Args:
         start: subject or mixture that it starts from.
-        model: body that a subject's lengths replace those of.
-        body: that the poses of a mixture are of.
+        model: body, whose lengths those of a subject replace.
+        body: of the poses of a mixture.
         camera: that sees the person.
         upright: gravity; None: unknown.
         depths: of the image that a subject's joints were seen in; None: unknown.
@@ -265,7 +265,7 @@ def poses_to_search(
     """Poses (N, d) of a person from an image alone; None: it shows none.
 
     The body keeps its lengths and flesh. From keypoints come all poses that explain them, from
-    a silhouette mean poses of several headings at its place, and what was predicted.
+    a silhouette mean poses of several headings at its place, and predicted poses.
     """
     found = []
     keypoints, depths = observation.keypoints, observation.evidence.get(DEPTH.name)

@@ -33,7 +33,7 @@ from hmt_ros.tracking.hypotheses import Modes
 LONGEST_GUESS = 0.5
 # Most that the entries of R R' differ from those of the identity.
 NOT_ORTHOGONAL = 1e-3
-# Shift of the still scene above which a background is that of another view, px.
+# Shift of the still scene, px, above which a background belongs to another view.
 SHIFTED = 2.0
 # Distance of people and of the scene, where it is unknown, m.
 USUAL_DISTANCE = 3.0
@@ -168,7 +168,7 @@ class CameraMotion:
 
 
 def propagated(jacobians: Array, covariances: Array) -> Array:
-    """Covariances J S J' (N, n, n) of what has Jacobians (N, n, m), from those (N, m, m)."""
+    """Covariances J S J' (N, n, n), from Jacobians J (N, n, m) and covariances S (N, m, m)."""
     result: Array = jacobians @ covariances @ jacobians.swapaxes(1, 2)
     return 0.5 * (result + result.swapaxes(1, 2))
 
@@ -178,7 +178,7 @@ class CameraPath:
 
     Where an image has none, the camera is taken to go on as between the last two poses that were
     given, for `LONGEST_GUESS` at most; after that its motion is unknown until the next one is
-    given. What was guessed is not held against a later pose: the pose at the image before is then
+    given. A guess does not count against a later pose: the pose at the image before is then
     interpolated.
 
     Attributes:

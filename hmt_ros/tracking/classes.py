@@ -14,7 +14,7 @@ whether a mode was kept of it or not. Seen from the side the two histories meet 
 transition of the joints (`weighting`), h that of the heading, which wanders at the rate of the
 body. The best motion of either way stands for it (2), as the number of its modes is no evidence,
 nor is a motion that was not followed. An image shows the facing direction with the probability v,
-or something else, as a flash does or a covered lens (3): none turns a track about alone.
+else something unrelated, like a flash or a covered lens (3): no single image turns a track about.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Facing:
     """Facing direction of the person of one track.
 
     Attributes:
-        log_odds: S, that the person faces the other way than the mode that leads, the heaviest.
+        log_odds: S, that the person faces the other way than the leading mode, the heaviest.
         back: (K,) modes that face the other way than that one.
     """
 
@@ -57,7 +57,7 @@ class Facing:
     def lacks_a_way(self, log_weights: Array) -> bool:
         """Whether the modes, log weights (K,), have lost one of the two ways.
 
-        It has no mode, or one that the odds could not make up for.
+        A way is lost if it has no mode, or none that the odds could make up for.
         """
         back = self.back
         if not back.any() or back.all():

@@ -6,9 +6,9 @@
 Where limbs are searched for as well, at most 2 B / 5 are rated.
 
 The rest goes to covariances and shape of the modes and to the likelihood alone. Settings bound each
-part; a budget below them takes from all parts. An image that moves the heaviest mode far from where
-the motion prior has it, as where people move fast, gets more. The usual distance grows with the
-information in the image, so with the time between two images:
+part; a budget below them takes from all parts. An image that moves the heaviest mode far from its
+prediction, as when people move fast, gets more. The usual distance grows with the information in
+the image, so with the time between two images:
 
     m' P m  >  `SURPRISING` E m' P m  =  `SURPRISING` tr(I - P H^-1)
 
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 # Budgets of the nodes, which have to keep up with a camera, and of everything else.
 LIVE, ACCURATE = 300, 400
-# Share of what is expected from which on the motion of the heaviest mode is surprising: the motion
-# prior is wider than most motions. And how many times the budget such an image has.
+# Ratio of the motion of the heaviest mode to the expected one above which an image is surprising:
+# the motion prior is wider than most motions. Factor on the budget of such an image.
 SURPRISING, MORE = 0.3, 4
 # Below this budget no limb is searched.
 LEAST_SEARCHED = 100
@@ -60,12 +60,12 @@ class EvaluationPlan:
         groups: maximum number of groups of modes with a trunk of their own that are searched.
         rated: maximum number of poses that are rated, all groups together, where limbs are
             searched for.
-        rated_alone: the same where none is.
+        rated_alone: the same without limb search.
         alternatives: maximum number of configurations of a limb.
         combinations: maximum number of combinations on each trunk.
         searched_chains: number of limbs searched in each group.
         samples, refined: number of samples that a limb draws, and of the best that are refined.
-        surprising: whether the image is.
+        surprising: whether the image is surprising.
     """
 
     hypotheses: int

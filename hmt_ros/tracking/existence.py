@@ -23,7 +23,7 @@ person does so in every image that shows the same. People move, if only a little
 
 An image that has changed for the most part is no evidence: a covered lens, a flash, noise. The
 colours of a track are no evidence against somebody when the camera has moved: they may have been
-those of a thing. For a person whom others hide only the keypoints that are seen count. So only an
+those of a thing. For a person hidden by others, only evidence for the person counts. So only an
 image that shows the place empty ends a track: without it r tends to b / (b + l), which is far above
 `ABSENT`.
 """
@@ -48,8 +48,8 @@ from hmt_ros.tracking.view import View
 
 # Rates at which somebody comes into an empty view, and leaves it, per second.
 BIRTH, LEAVING = 0.1, 0.2
-# Above this probability somebody is there, and a new track may start; below it nobody is, if the
-# image says so. Between them nobody can say.
+# Above the first probability somebody is there, and a new track may start; below the second nobody
+# is, if the image says so. Between them it is undecided.
 PRESENT, ABSENT = 0.85, 0.03
 # Fraction of a cue that is left to a silhouette which a side of the image may cut, and to keypoints
 # of a part of a person.
@@ -83,8 +83,8 @@ class Cue(NamedTuple):
     tau: float
 
 
-# A clear image is right unless something lasts that nobody has thought of: 1 in 3,000. A detector
-# misses a person whom it sees badly in about 1 of 100 images, for longer.
+# A clear image is wrong in 1 of 3,000 cases, by some lasting cause that is not modelled. A detector
+# misses a badly visible person in about 1 of 100 images, for longer.
 CLEAR = Cue(8.0, 0.2)
 DOUBTFUL = Cue(5.0, 0.25)
 
@@ -107,8 +107,8 @@ def probability_of(log_odds: float) -> float:
     return 0.5 * (1.0 + math.tanh(0.5 * log_odds))
 
 
-# Before the first image nobody is there, so far as one clear image leaves it open; a start that is
-# given is like one clear image of somebody.
+# Probability before the first image, as after one clear image of nobody; a given start counts like
+# one clear image of somebody.
 NOBODY_YET, GIVEN = probability_of(-CLEAR.nats), probability_of(CLEAR.nats)
 
 
@@ -124,8 +124,8 @@ class Existence:
         seen: whether the last image shows a filter something to follow: a cue shows somebody, or
             none shows nobody and the image can be used.
         hidden: whether others hid most of the person in the last image.
-        elsewhere: whether it shows somebody where no mode is, or after so long that the modes tell
-            nothing: the track has to search.
+        elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
+            of no use: the track has to search.
     """
 
     def __init__(self, probability: float = NOBODY_YET) -> None:
@@ -166,7 +166,7 @@ class Existence:
         """
         if self._stamps is not None:
             self.probability = moved_on(self.probability, seconds(stamp - self._stamps[1]))
-        # After so long whoever was seen last may as well have gone.
+        # After so long a time the person who was seen last may have gone.
         forgotten = moved_on(1.0, self._appearance.unseen(stamp)) < MOST
         self.hidden = self._appearance.open_to_view(view.others) < 1.0 - MOST
         cues, usable, apart = self._cues(view, stamp, body)

@@ -71,7 +71,7 @@ SHAPED = 4
 
 
 class MixtureFilter:
-    """The posterior over the poses of one person, as a mixture that images move on.
+    """The posterior over the poses of one person, a mixture that is updated image by image.
 
     Args:
         body: of the person.
@@ -79,14 +79,14 @@ class MixtureFilter:
         settings: how.
         seed: of all randomness.
         extra: further energy terms.
-        ground: gravity and floor; None: nothing is made of them.
+        ground: gravity and floor; None: not used.
 
     Attributes:
         contacts: of the feet of the modes.
         body: with the lengths and the flesh that have been estimated.
         shape: the estimate of them.
         misfit: share of the last image that no mode explains.
-        validity: how far its cues are believed, and the track.
+        validity: probabilities that its cues, and the track, are valid.
     """
 
     def __init__(
@@ -281,7 +281,7 @@ class MixtureFilter:
         self.assess(seen, search)
 
     def assess(self, observation: Observation, search: Search | None = None) -> None:
-        """Takes in how much of each cue of an image no mode explains.
+        """Takes in the share of each cue of an image that no mode explains.
 
         Args:
             observation: of the image.
@@ -306,7 +306,7 @@ class MixtureFilter:
         self.check_depths(body, modes.poses[0], observation.depths, self._dt)
 
     def check_depths(self, body: Body, pose: Array, depths: ImageMap | None, dt: float) -> None:
-        """Takes in how far depths, if there are some, show a body at a pose (d,).
+        """Takes in the misfit of depths, if there are some, to a body at a pose (d,).
 
         Args:
             body, pose: of the best mode.
@@ -335,7 +335,7 @@ class MixtureFilter:
         """N hypotheses that are distinct, their log weights, and log w_k p(x_n | x_k), (K, N)."""
         optimised = _finite(optimised)
         evidence = search.evidence(optimised)
-        # Of those that meet, one that has moved there is kept before one that has jumped.
+        # Where hypotheses meet, one that has moved there is kept before one that has jumped.
         followed = np.asarray(~optimised.hypotheses.jumped.any(1))
         order = np.lexsort((evidence, ~followed))
         optimised, evidence = optimised[order], evidence[order]
@@ -423,7 +423,7 @@ class MixtureFilter:
         return self._identities.inherited(before, selected.ancestors, selected.jumped)
 
     def _stand(self, dt: float | None) -> None:
-        """Takes in how the modes stand, dt after their ancestors, s; None: they have none."""
+        """Updates the contacts of the feet, dt s after the ancestors; None: there are none."""
         ground = self._posterior.ground
         if ground is None:
             return
@@ -433,17 +433,17 @@ class MixtureFilter:
         else:
             self.contacts.update(body, plane, modes, dt, still=ground.still)
 
-    # What is learned.
+    # Learning.
 
     def _believed(self, observation: Observation) -> Observation:
-        """An observation with what this track has learned of its cues."""
+        """An observation with the beliefs in its cues that this track has learned."""
         if self._observed is None or self._observed[0] is not observation:
             believed = replace(observation, beliefs=self.validity.beliefs)
             self._observed = observation, believed
         return self._observed[1]
 
     def _fit_shape(self, observation: Observation, trust: float) -> bool:
-        """Moves the shape by what an image says of it; False where that is nothing."""
+        """Moves the shape by the evidence of an image; False if there is none."""
         if not self.settings.estimate_shape:
             return False
         if observation.outline is None and observation.keypoints is None:

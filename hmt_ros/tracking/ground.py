@@ -127,8 +127,8 @@ class GroundEstimator:
     axis last, so its images count as one per `AXIS_TIME`, and the deviation never goes below
     `AXIS_SIGMA`.
 
-    A given vertical that the lines contradict at two looks is not followed, but theirs is. A
-    vertical of the lines that jumps is believed when the next look shows it too.
+    If the lines contradict a given vertical at two looks, theirs is followed instead. A jump of
+    the vertical of the lines is believed when the next look shows it too.
 
     Args:
         known: gravity and floor without the images; None: unknown.

@@ -21,8 +21,8 @@ from hmt_ros.inference.mixture import GaussianMixture
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# Where modes may be that have at most so much less log weight than the heaviest, nats: the person
-# may be there.
+# Modes whose log weight is less than that of the heaviest by at most this, nats, show places where
+# the person may be.
 LIKELY = 4.0
 
 
@@ -90,9 +90,9 @@ class Modes(Hypotheses):
         covariances: (N, d, d) of the posterior, as certain as all images so far make them.
         filtered: (N, d, d) covariances as if errors were independent from image to image.
         log_likelihoods: (N,) of the image.
-        state_covariances: (N, n, n) that are propagated, of poses and velocities. Of a random walk
-            they are `filtered`; with velocities only a share of the images is believed, because
-            their errors last.
+        state_covariances: (N, n, n) of poses and velocities, which are propagated. For a random
+            walk they are `filtered`; with velocities each image counts with a share, because errors
+            last.
         identities: (N,) see `Identities`.
         origins: (N, M) probability that each continues mode m of the image before; M is 0 where
             the modes begin.

@@ -51,7 +51,7 @@ NO_POSE = 'no pose of the body explains the keypoints: are they in the image?'
 LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
 # Axis of the camera, along which depths are measured.
 AXIS = np.array([0.0, 0.0, 1.0])
-# Standard deviation of the place of a person of whom a box is known, as a share of the distance.
+# Standard deviation of the place of a person in a given box, as a share of the distance.
 BOX_SIGMA = 0.15
 
 
@@ -362,7 +362,7 @@ def _first_guesses(
     body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None,
     measured: JointDepths,
 ) -> Array:  # fmt: skip
-    """Mean poses at several headings, where the joints are and as far as their spread says."""
+    """Mean poses at several headings, at the joints, at the distance that their spread gives."""
     seen = keypoints.seen
     pixels = keypoints.pixels[seen]
     names = [x for x, ok in zip(keypoints.names, seen, strict=True) if ok]

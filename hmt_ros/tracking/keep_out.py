@@ -38,7 +38,7 @@ BARE = 0.07
 SPACING = 1.2
 # Share of a radius that is added to it rather than covered by capsules side by side.
 LITTLE = 0.15
-# How fast a hand can be that strikes, and how far it goes, m/s and m; and how fast a person runs.
+# Speed, m/s, and reach, m, of a striking hand; speed of a runner, m/s.
 FASTEST, ARM, RUNNER = 7.0, 0.7, 3.0
 
 

@@ -11,21 +11,21 @@ from hmt_ros.body.body import Body
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 
-# Fewest keypoints that are a person, as a number of joints.
+# Fewest keypoints that make a person.
 FEWEST_KEYPOINTS = 6
-# A keypoint of this confidence is where it says.
+# Confidence of a keypoint whose position is trusted.
 CONFIDENT = 0.5
 # Detectors find small people in the legs of a table and in leaves, with full confidence. Keypoints
-# of a person with this magnification say nothing, with twice as much all that they can, px/m.
+# of a person at this magnification, px/m, are no evidence; at twice this, they count in full.
 LEAST_MAGNIFICATION = 22.0
 
 
 def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
     """Evidence of a detector for a person in view, from -1, nobody, to 1.
 
-    It is 1 where the confidences sum to as much as those of the fewest keypoints that are a person,
-    and -1 below a third of that. Fewer joints, and a person of a few pixels, are no evidence of a
-    person, nor of an empty image.
+    It is 1 where the confidences have at least the sum of the fewest trusted keypoints that make a
+    person, and -1 below a third of that. Fewer joints, and a person of a few pixels, are evidence
+    neither of a person nor of an empty image.
     """
     seen = keypoints.confidences[keypoints.seen]
     most = 0.0

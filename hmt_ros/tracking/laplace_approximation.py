@@ -5,13 +5,13 @@
     state        N(pose, velocity) conditioned on where the pose was found; see `motion_states`
 
 H is the Gauss-Newton Hessian of the energy at an optimum, H_prior that of body and ground, without
-the motion prior. Errors last, so only the share a_g of a cue is believed, and all images so far
-leave T of what one leaves by itself (`inference.error_model`). What is not known of the shape is
-not known of the pose: J P J' (`shape_estimation`). A variable on its limit hardly varies.
+the motion prior. Errors last, so a cue counts with its share a_g, and all images so far leave T
+times the covariance that one leaves by itself (`inference.error_model`). Uncertainty of the shape
+makes the pose uncertain: J P J' (`shape_estimation`). A variable on its limit hardly varies.
 
-The likelihood alone is passed on whole, with how its errors last beside it: who puts images
-together discounts them, once. What is not known of the shape is the same in all images: it is
-passed on beside the likelihood, too.
+The likelihood alone is passed on undiscounted, together with the duration of its errors: the
+consumer that combines images discounts them once. The error due to the shape is the same in all
+images; its covariance is passed on beside the likelihood.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def posterior_modes(
     else:
         found = filtered
         if states.wandered.any() and measured:
-            # Errors of images last: what is propagated believes a share of them, too.
+            # Errors of images last: the propagated covariance uses a share of them, too.
             found = fused(states.covariances_of(h.ancestors, h.jumped), alone)
         velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, found)
     return Modes(
@@ -123,12 +123,12 @@ def posterior_modes(
 def likelihood_modes(
     modes: Modes, posterior: Posterior, observation: Observation, shape: ShapeEstimate
 ) -> Likelihood:
-    """The modes of the likelihood alone, without what was known from the images before.
+    """The modes of the likelihood alone, without information from the images before.
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
     parabola; its minimum and curvature make a component, its depth and its volume the weight, of at
-    least `LEAST_LOG_WEIGHT`. Nothing of it is discounted, but that one pair (s, tau) stands for
-    keypoints and experts: what these tell in a second counts as much as it does in the filter.
+    least `LEAST_LOG_WEIGHT`. Nothing is discounted, except that one pair (s, tau) stands for
+    keypoints and experts: their information per second is the same as in the filter.
 
     Args:
         modes: of the posterior, K, heaviest first.
@@ -154,7 +154,7 @@ def likelihood_modes(
 
 
 def _errors(fit: ImageFit, covariances: Array, weights: Array) -> CueErrors:
-    """How errors last of an energy whose Hessian H = sum_g H_g has the inverse S in each mode.
+    """How long errors of an energy last; its Hessian H = sum_g H_g has the inverse S in a mode.
 
     A cue counts with the number of variables that it determines, tr(S H_g), in the mean over modes.
     """

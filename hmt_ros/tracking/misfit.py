@@ -1,4 +1,4 @@
-"""How much of each cue of an image no mode explains, from 0 to 1.
+"""Share of each cue of an image that no mode explains, from 0 to 1.
 
     silhouette   visible points of the model outside it
     outline      samples of the silhouette's outline that are further than 4 sigmas from the model's
@@ -37,7 +37,7 @@ UNEXPLAINED = 4.0
 
 
 class Misfit(NamedTuple):
-    """How much of a cue is not explained, by group.
+    """Share of a cue that is not explained, by group.
 
     Attributes:
         shares: (G,) from 0, all is explained, to 1.
@@ -166,7 +166,7 @@ def of_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap) -> Arra
 def of_depth_at_best(body: Body, camera: Camera, pose: Array, depths: ImageMap) -> float:
     """The same for one pose (d,), or for the pose moved to the measured depth.
 
-    A track without depth is not at its distance.
+    A track that used no depth may be at a wrong distance.
     """
     poses = np.concatenate([pose[None], moved_to_depth(body, camera, pose[None], depths)])
     return float(of_depth(body, camera, poses, depths).min())

@@ -1,13 +1,13 @@
 """States of modes, poses with their velocities: predicted, and corrected by where poses were found.
 
-A mode's pose x and velocity v have one Gaussian. An image tells only of x: when it has been found
+A mode's pose x and velocity v have one Gaussian. An image shows only x: when it has been found
 at x* with the covariance P*, the prediction N((x, v), P) is conditioned on it,
 
     G = P_vx P_xx^-1,    v* = v + G (x* - x),    P*_vv = P_vv - G P_xv + G P* G',    P*_vx = G P*
 
 which is the Kalman filter where the energy of the image is quadratic. Where a limb has jumped its
-displacement is no motion: nothing is known of its velocity then. Where it jumped to is known as
-well as a random walk would say, at the rates of the body; so far jumps are searched, too.
+displacement is no motion: its velocity is then unknown. Its new place is as uncertain as after a
+random walk at the rates of the body; jumps are searched within that range, too.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class PredictedStates:
         together = gain @ found
         own = predicted[:, d:, d:] - gain @ cross + together @ gain.swapaxes(1, 2)
         own = 0.5 * (own + own.swapaxes(1, 2))
-        # A velocity of which nothing is known goes with no other.
+        # An unknown velocity is correlated with no other.
         both = ~(jumped[:, :, None] | jumped[:, None, :])
         fresh = jumped[:, :, None] & jumped[:, None, :]
         own = np.where(both, own, np.where(fresh, self.dynamics.unknown_velocity, 0.0))

@@ -50,8 +50,8 @@ def on_raster(image: NDArray[Any], raster: Mask) -> NDArray[Any]:
 def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
     """The largest piece of a foreground that has the shape of one person; None: there is none.
 
-    A piece is connected, or it is the largest one with what is near it: clothes in the colours of
-    the room leave holes.
+    A piece is connected, or it is the largest one with the pieces near it: clothes in the colours
+    of the room leave holes.
 
     Args:
         foreground: (h, w).

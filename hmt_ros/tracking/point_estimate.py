@@ -38,7 +38,7 @@ class PointEstimate:
         self.pose: Array | None = None
         # (n,) and (n, n): the motion, n = d where poses have no velocities, else 2 d.
         self._mean = self._covariance = np.empty(0)
-        # (d,) the heaviest mode of the motion in its last image, which says what way it faces: the
+        # (d,) the heaviest mode of the motion in its last image, which gives its facing way: the
         # mean of modes that are seen from the side may face between two ways.
         self._leader = np.empty(0)
 

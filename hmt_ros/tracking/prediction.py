@@ -77,7 +77,7 @@ def expected_poses(
     """
     d = body.dimension
     known = modes.state_covariances.copy()
-    # What is published of the poses is less certain than what is propagated.
+    # The published covariances of the poses are larger than the propagated ones.
     known[:, :d, :] = known[:, :, :d] = 0.0
     known[:, :d, :d] = modes.covariances
     states = predicted_states(modes, known, body, dynamics_of(body, motion), dt)
@@ -104,7 +104,7 @@ class Forecaster:
     stamp_ns: int
 
     def at(self, stamp_ns: int) -> GaussianMixture:
-        """The mixture over poses at a time of which no image speaks, as `expected_poses`.
+        """The mixture over poses at a time without an image, as `expected_poses`.
 
         Raises:
             ValueError: the time is before the image.
@@ -129,7 +129,7 @@ def follow_flow(
     Args:
         predicted: K of them.
         precisions: (K, d, d) of the predictions.
-        points: that were seen of each mode in the last image; None: nothing was looked for.
+        points: visible points of each mode in the last image; None: none were looked for.
         observation: of the image.
         posterior: of the body.
     """

@@ -4,8 +4,8 @@
 
 Keeping the K heaviest modes keeps near copies of the heaviest one. Here the K are chosen that leave
 the least expected distance from a hypothesis to the nearest kept one, greedily, heaviest first; d
-is the mean distance of the joints, each capped, below which two hypotheses count as the same. What
-is not kept gives its weight to the nearest that is.
+is the mean distance of the joints, each capped; two hypotheses count as the same below a minimum.
+Those dropped give their weight to the nearest kept one.
 """
 
 from __future__ import annotations

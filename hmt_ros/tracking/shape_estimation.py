@@ -31,7 +31,7 @@ from hmt_ros.inference.error_model import ERRORS
 
 # Standard deviations over people and clothes, by kind of growth: logarithms, m.
 SPREAD = dict(zip(GROWTH, (0.2, 0.2, 0.02, 0.02, 0.02), strict=True))
-# A length is hardly ever known better, m.
+# Least standard deviation of a length, m: none is known better.
 LEAST_LENGTH_SIGMA = 0.008
 # Largest change by one image, and in all, in standard deviations over people.
 LARGEST_STEP, LARGEST = 0.5, 3.0

@@ -27,8 +27,8 @@ from hmt_ros.tracking.camera_motion import SHIFTED, CameraPose
 
 # Least share of the person that is foreground before a background without the person.
 LEAST_FOREGROUND = 0.35
-# Margins of the area of a body, as a fraction of its height: of what is surely the person, and of
-# what may be.
+# Margins of the area of a body, as a fraction of its height: for the sure area of the person, and
+# for the possible one.
 INSIDE, AROUND = 0.01, 0.06
 # Largest share of the person's area that may be unknown where silhouettes are used.
 MOST_UNKNOWN = 0.02
@@ -43,7 +43,7 @@ class Silhouettes:
 
     Args:
         background: the empty scene, or a model that is to learn it.
-        shared: whether the background is that of other people, too: somebody else learns it.
+        shared: whether other people share the background; it is then learned elsewhere.
 
     Attributes:
         background: as far as it is known.

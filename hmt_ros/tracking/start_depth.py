@@ -31,7 +31,7 @@ SIGMA = 0.03
 SCALE = 4.0
 # Fewest joints of the trunk whose depth tells where a person is.
 FEWEST = 3
-# Quantile of what they say, below the median as the background is behind; how often they are asked.
+# Quantile of their depths, below the median as the background is behind; number of iterations.
 NEAR, ROUNDS = 0.35, 2
 
 
@@ -89,7 +89,7 @@ def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | 
     result = poses.copy()
     for _ in range(ROUNDS):
         joints = body.joint_positions(result)[:, index]
-        # Joints of a pose that is too near lie beside the person; what is half way in may not.
+        # Joints of a pose that is too near lie beside the person; points half way in may not.
         inside = 0.5 * (joints + joints.mean(1, keepdims=True))
         for pose, points in zip(result, np.concatenate([joints, inside], axis=1), strict=True):
             skin = _depths_at(depths, camera.project(points))
@@ -101,7 +101,7 @@ def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | 
 
 
 def _depths_at(depths: ImageMap, pixels: Array) -> Array:
-    """Depths (P,) of what lies in front around pixels (P, 2), m; 0 where nothing was measured."""
+    """Depths (P,) of the front surface around pixels (P, 2), m; 0 where nothing was measured."""
     values = depths.values[0]
     height, width = values.shape
     steps = np.arange(-AROUND, AROUND + 1)

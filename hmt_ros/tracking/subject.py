@@ -108,7 +108,7 @@ def _positive(value: Any, name: str, largest: float = LARGEST_PIXEL) -> float:
 
 
 def _length(value: Any, name: str, signed: bool) -> float:
-    """A length, m; one that people differ in by more than itself, as of an offset, has a sign."""
+    """A length, m; a signed one, such as an offset, may be negative."""
     if not signed:
         return _positive(value, f'length {name}', LONGEST)
     if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LONGEST:

@@ -458,7 +458,7 @@ class Tracker:
             resting = min(self.contacts.values(), default=RESTING)
             self._ground.update(self.body, self.modes, resting, dt)
         follows = self.modes.origins.shape[1] > 0
-        # The motion takes in one image after another, and so what each leaves by itself.
+        # The motion takes in one image after another, so each with its own covariance alone.
         found = replace(self.posterior, covariances=self.modes.covariances / TOGETHER)
         self._point.update(self.body, self._track.dynamics, found, dt if follows else None)
         self._observer.last_image, self._followed = view.image, stamp

@@ -70,7 +70,7 @@ PLACED = 0.8
 TRACK, DETECTOR = 0, 1
 AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
 CHAINS = AXES[KEYPOINTS].stop
-# Chains (2^n, n) in each state, and what is valid then, v: no group of a detector that fails is.
+# States (2^n, n) of the chains, and validity v in each: groups of a failed detector are invalid.
 STATES = np.array(np.unravel_index(np.arange(2**CHAINS), (2,) * CHAINS)).T
 VALID = STATES.copy()
 VALID[:, AXES[KEYPOINTS]] *= STATES[:, [DETECTOR]]
@@ -95,7 +95,7 @@ class Validity:
 
     Attributes:
         joint: (2, .., 2) probability of the track, of the detector and of the cues of `AXES`.
-        depth: (1,) that of depths.
+        depth: (1,) probability that depths are valid.
     """
 
     def __init__(self) -> None:

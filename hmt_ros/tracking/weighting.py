@@ -12,8 +12,8 @@ the image (2), or ends, if all of them are less likely than e^-c. E_g is the ene
 which an image adds the share a_g (`inference.error_model`).
 
 The normaliser |S_k|^(1/2) of a mode is left out, as in the paper: the Hessian shows how well the
-image fixes a pose, and what it fixes badly (depth, a limb behind the trunk) would gain weight by
-being unseen.
+image fixes a pose, so a badly fixed one (in depth, or with a limb behind the trunk) would gain
+weight by being unseen.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hmt_ros.inference.arrays import Array, Index
 # Mean squared distance q by which joints leave their prediction, m^2/s, and the degrees of freedom
 # nu of its tails: modes tremble, and limbs are found where they were not looked for.
 SPREAD, TAILS = 0.01, 2.0
-# A mode of which no hypothesis is likelier than this goes on ends: c, nats.
+# c, nats: a mode ends where all its continuations are less likely than exp(-c).
 ENDS = 5.0
 
 
@@ -94,7 +94,7 @@ def pooled_origins(histories: Array, log_weights: Array, owner: Index) -> Array:
         P(k | m) = sum_n w_n P(k | x_n) / sum_n w_n,    over the hypotheses n that m stands for
         P(k | x_n) = w_k p(x_n | x_k) / sum_j w_j p(x_n | x_j)
 
-    What the image says is a factor of w_n alone, and cancels in P(k | x_n).
+    The evidence of the image is a factor of w_n alone, and cancels in P(k | x_n).
 
     Args:
         histories: (K, N) log w_k p(x_n | x_k).

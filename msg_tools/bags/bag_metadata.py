@@ -13,14 +13,14 @@ from msg_tools.bags.contents import BagError, reason
 from msg_tools.files.bounded_file import read_bytes
 
 FILE_NAME = 'metadata.yaml'
-# What the names of the other files of a bag end with.
+# Suffixes of the other files of a bag.
 MCAP_SUFFIXES = ('.mcap', '.mcap.zstd')
 DATABASE_SUFFIXES = ('.db3', '.db3.zstd')
 SUFFIXES = (*MCAP_SUFFIXES, *DATABASE_SUFFIXES)
 VERSION = 9
 MAX_BYTES = 2**24
 
-# No deadline, no lifespan: what rmw writes for an infinite duration.
+# No deadline, no lifespan: rmw writes this for an infinite duration.
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 
 _POLICIES: dict[str, type[Enum]] = {

@@ -159,7 +159,7 @@ class BagMessage:
         are zero or empty.
 
         Raises:
-            BagError: its bytes are not what its type wants, or the type is not known.
+            BagError: its bytes do not fit its type, or the type is not known.
         """
         return self._deserialise(self)
 
@@ -177,7 +177,7 @@ class BagReader(AbstractContextManager['BagReader']):
         path: as given.
         topics: by name, in the order of the bag.
         start_ns, end_ns: log times of the first and the last message; None when there is none.
-        damage: what is already known to be wrong, None when nothing is; it is raised by `messages`
+        damage: damage that is already known, None when there is none; it is raised by `messages`
             once everything before it is out.
     """
 
@@ -205,7 +205,7 @@ class BagReader(AbstractContextManager['BagReader']):
         self.damage = next((f.damage for f in self._files if f.damage is not None), None)
 
     def close(self) -> None:
-        """Removes what was decompressed into the folder for temporary files."""
+        """Removes the files that were decompressed into the folder for temporary files."""
         if self._scratch is not None:
             self._scratch.cleanup()
             self._scratch = None
@@ -214,7 +214,7 @@ class BagReader(AbstractContextManager['BagReader']):
         self.close()
 
     def raise_damage(self) -> None:
-        """Raises BagError where something is already known to be wrong."""
+        """Raises BagError if damage is already known."""
         if self.damage is not None:
             raise BagError(f'{self.path} {self.damage}')
 

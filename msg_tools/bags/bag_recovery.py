@@ -43,7 +43,7 @@ class Recovery:
     Attributes:
         path: the new bag.
         messages: how many were saved.
-        topics: how many topics they are of.
+        topics: number of their topics.
         lost_messages: how many were not; None if the bag has no count of its messages.
         losses: one line for each loss.
     """
@@ -163,7 +163,7 @@ def _line(file: McapSalvage, loss: Loss) -> str:
 
 
 def _files(source: Path) -> tuple[list[Path], list[str]]:
-    """Files to look into, in their order; and what is missing."""
+    """Files to look into, in their order; and a line for each missing one."""
     try:
         if not os.path.lexists(source):
             source = _unfinished(source)
@@ -184,7 +184,7 @@ def _files(source: Path) -> tuple[list[Path], list[str]]:
     try:
         named = read_file_names(source)
     except BagError:
-        # Recorders write it at the end, so that it is missing in what was cut off.
+        # Recorders write it at the end, so that a recording that was cut off lacks it.
         named = []
     there = {path.name for path in paths}
     missing = [
@@ -221,7 +221,7 @@ def _check_database(paths: list[Path]) -> None:
 
 @contextmanager
 def _opened(source: Path, paths: list[Path], losses: list[str]) -> Iterator[list[McapSalvage]]:
-    """The files that are some; those that are compressed as a whole through copies."""
+    """The files that are MCAP files; those compressed as a whole are read through copies."""
     with tempfile.TemporaryDirectory(prefix='bag_recovery.') as scratch:
         files = []
         for number, path in enumerate(paths):

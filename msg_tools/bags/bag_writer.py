@@ -97,7 +97,7 @@ class BagFolder:
             type_hash: RIHS01 hash of the type, or ''.
 
         Returns:
-            What `add_message` wants.
+            Number of the channel, for `add_message`.
         """
         with self.dropping_on_error():
             schema = 0
@@ -171,7 +171,7 @@ class BagFolder:
         if folder is None:
             return
         if self._file is not None:
-            # Closing writes what is buffered, and fails again on a full disk: nothing is to be
+            # Closing writes the buffer, and fails again on a full disk: nothing is to be
             # saved.
             with suppress(OSError):
                 self._file.close()
@@ -229,7 +229,7 @@ class BagFolder:
             shutil.rmtree(aside, ignore_errors=True)
 
     def _hand_over(self) -> None:
-        """Hands what the library has written to the system, where it outlives the process."""
+        """Hands the bytes of the library to the system, where they outlive the process."""
         assert self._file is not None
         written = self._file.tell()
         if written != self._handed_over:

@@ -74,7 +74,7 @@ class McapFile:
     Attributes:
         counts: number of messages of each channel.
         start, end: log times in ns of the first and the last message; None when there is none.
-        damage: what is already known to be wrong, for example that the end is missing.
+        damage: damage that is already known, for example a missing end.
     """
 
     def __init__(self, path: Path, name: str) -> None:

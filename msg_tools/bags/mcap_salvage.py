@@ -245,7 +245,7 @@ class McapSalvage:
         elif opcode == Opcode.ATTACHMENT:
             yield _attachment(read_exactly(file, length), offset)
         else:
-            # An index is not needed; but what looks like one may be something else, damaged.
+            # An index is not needed; but a record that looks like one may be another, damaged.
             fields = Fields(read_exactly(file, length), offset)
             fields.skip(2)
             if fields.u32() != length - 6:

@@ -24,7 +24,7 @@ from msg_tools.files.error_line import error_line
 # Bytes of all arrays of an archive together.
 LARGEST_ARCHIVE = 2**31
 _MOST_ARRAYS = 10_000
-# What damaged archives lead to, besides OSError and ValueError.
+# Exceptions that damaged archives lead to, besides OSError and ValueError.
 _FAULTS = (
     zipfile.BadZipFile,
     zipfile.LargeZipFile,

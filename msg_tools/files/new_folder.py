@@ -16,7 +16,7 @@ class FolderKind:
     """Folders of files with known names; others are never replaced.
 
     Attributes:
-        what: such a folder is, for messages: 'a bag'.
+        what: name of such a folder in messages: 'a bag'.
         marker: name of the file without which it is no such folder.
         own: names of the other files that it may have.
     """
@@ -45,7 +45,7 @@ class FolderKind:
     def new(self, target: Path, *, overwrite: bool) -> Iterator[Path]:
         """Where to make a folder, which comes to its place when all is written, or not at all.
 
-        What is yielded does not exist yet; after an error nothing is left behind.
+        The yielded folder does not exist yet; after an error nothing is left behind.
 
         Raises:
             ValueError: see `check_place`.

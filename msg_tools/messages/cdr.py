@@ -51,7 +51,7 @@ def deserialise(data: bytes | memoryview, msgtype: str, types: Typestore | None 
     body = view[_HEADER_BYTES:]
     message, end = read(body, 0, definition.cls, store)
     if end > len(body):
-        # rosbags before 0.11 takes what is there for the whole of a string.
+        # rosbags before 0.11 takes the bytes that are there for the whole of a string.
         raise ValueError(f'it breaks off after {len(view)} bytes')
     return message
 

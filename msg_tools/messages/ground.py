@@ -18,7 +18,7 @@ GROUND = 'hmt_msgs/msg/Ground'
 
 Array = NDArray[np.float64]
 
-# Most that the length of up, and the plane, differ from what they are to be.
+# Largest error of the length of up, and of the plane.
 _TOLERANCE = 1e-6
 
 

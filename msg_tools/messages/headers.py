@@ -8,7 +8,7 @@ from typing import Any
 from msg_tools.messages.message_types import MessageFactory
 
 SECOND_NS = 1_000_000_000
-EARLIEST_NS = -(2**31) * SECOND_NS  # that a message can tell
+EARLIEST_NS = -(2**31) * SECOND_NS  # that a message can hold
 _STAMP_AT, _STAMP_SIZE = 4, 8  # bytes of CDR
 
 

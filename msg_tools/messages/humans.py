@@ -29,10 +29,10 @@ IDS = 'hri_msgs/msg/IdsList'
 REGION = 'hri_msgs/msg/NormalizedRegionOfInterest2D'
 _LANDMARK = 'hri_msgs/msg/NormalizedPointOfInterest2D'
 
-# What surrounds a joint of a person, m: flesh, skull, fingers.
+# Reach of the body around a joint, m: flesh, skull, fingers.
 REACH = 0.12
-# From axes x to the person's right, y backwards, z down, in which the head's landmarks are told, to
-# those of the reference model.
+# From the axes of the head's landmarks, x to the person's right, y backwards, z down, to those of
+# the reference model.
 _OF_HEAD = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # Modes agree on a landmark, or on a corner of the region, within this share of the region's height.
 _AGREE = 0.1
@@ -109,7 +109,7 @@ def skeleton_message(
 
     Args:
         landmarks: (K, 18, 3) in all modes, see `landmarks_in_space`.
-        shown: index of the mode whose landmarks are told.
+        shown: index of the mode whose landmarks are sent.
         weights: (K,) of the modes.
     """
     # (0, 0) is the centre of the first pixel.
@@ -133,8 +133,8 @@ def landmarks_in_space(
 ) -> Array:
     """Landmarks (K, 18, 3) of Skeleton2D in the frame of the joint positions (K, J, 3), m.
 
-    Limbs are told by their joints, nose and ears by where detectors see them on a head that is
-    turned as that of the reference model; eyes, of which nothing is known, are NaN.
+    Landmarks of limbs are their joints, nose and ears have the places that detectors give them
+    on a head turned like that of the reference model; eyes are unknown, NaN.
     """
     marks = schemes()['skeleton2d'].landmarks
     names, rotations, _ = human.links()
@@ -187,7 +187,7 @@ def human_transforms(
     """tf2_msgs/TFMessage: the body, seen from the camera, and all links, seen from the body.
 
     Args:
-        links: whether the links are told, or the body alone.
+        links: whether the links are sent, or the body alone.
     """
     root = f'body_{body_id}'
     names, rotations, places = (

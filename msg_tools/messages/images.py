@@ -3,9 +3,9 @@
 A decoded picture is always BGR, uint8, (H, W, 3), contiguous and writable. Messages of `rosbags`
 and of ROS will both do: the data may be any buffer of bytes.
 
-A depth image is registered to a colour image of the same size: each value is the depth of what that
-pixel shows, along the axis of the camera (REP 118). `16UC1` counts millimetres, 0 where nothing was
-measured; `32FC1` counts metres, NaN where nothing was measured.
+A depth image is registered to a colour image of the same size: each value is the depth of the
+surface at that pixel, along the axis of the camera (REP 118). `16UC1` counts millimetres, 0 where
+nothing was measured; `32FC1` counts metres, NaN where nothing was measured.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Depth = NDArray[np.float32]
 
-# Larger pictures are taken for damage, before memory is spent on them.
+# Larger pictures count as damaged, before memory is spent on them.
 MAX_PIXELS = 2**26
 
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
@@ -35,8 +35,8 @@ _PNG_DEPTH = 24
 # A progressive JPEG has a dozen; each costs the decoder a pass over the whole picture.
 MAX_JPEG_SCANS = 100
 
-# What compression can do at its best: JPEG spends one bit on each block of 8x8 pixels, deflate one
-# byte on 1032, which in PNG may be 8 pixels each.
+# Limits of compression: JPEG spends at least one bit on each block of 8x8 pixels, deflate one byte
+# on 1032, which in PNG may be 8 pixels each.
 _JPEG_PIXELS_PER_BYTE = 512
 _PNG_PIXELS_PER_BYTE = 8 * 1032
 
@@ -127,7 +127,7 @@ def _decode_raw(message: Any) -> Picture:
 
 
 def _rows_of(message: Any, rows: int, row_bytes: int, what: str = 'image') -> Picture:
-    """The bytes (rows, row_bytes) of an Image, without what fills up its rows."""
+    """The bytes (rows, row_bytes) of an Image, without the padding of its rows."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     _check_size(width, height, what)
     if step < row_bytes:
@@ -145,8 +145,8 @@ def _rows_of(message: Any, rows: int, row_bytes: int, what: str = 'image') -> Pi
 def decode_mask(message: Any) -> Mask:
     """The mask (H, W) of an Image, `mono8` or `8UC1`, or of a CompressedImage, a grey PNG.
 
-    True where the value is not zero. A JPEG is refused: it blurs the outline of the mask, and what
-    is zero is not zero any more.
+    True where the value is not zero. A JPEG is refused: it blurs the outline of the mask, and
+    zeros do not stay zero.
 
     Raises:
         ImageError: another encoding, sizes that contradict each other, bytes that are no picture.
@@ -187,7 +187,7 @@ def decode_picture(
     The size in the header of the file is checked before anything is decoded.
 
     Args:
-        form: what it is said to be, for messages.
+        form: format that it claims to have, for messages.
         colours: flag of OpenCV for the channels of the picture.
 
     Raises:
@@ -263,7 +263,7 @@ _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height of a file that has its end; a decoder would make up what is missing."""
+    """Width and height of a file that has its end; a decoder would invent a missing part."""
     size: tuple[int, int] | None = None
     at = 2
     while at + 4 <= len(content) and content[at] == 0xFF:

@@ -1,7 +1,7 @@
-"""hmt_msgs/Keypoints2D and hmt_msgs/Keypoints3D: what a detector finds of a person, as arrays.
+"""hmt_msgs/Keypoints2D and hmt_msgs/Keypoints3D: keypoints of a person, as arrays.
 
 A keypoint is not seen if its confidence is 0, if its position is not a number, or if it lies at
-(0, 0) in the image, where detectors put what they have not found. Nothing else of it matters then.
+(0, 0) in the image, where detectors put missing keypoints. Its other fields then do not matter.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
 def checked_keypoints(
     names: tuple[str, ...], pixels: Array, confidences: Array, covariances: Array | None = None
 ) -> Keypoints:
-    """Keypoints as a detector tells them; those that were not seen lose the rest.
+    """Keypoints as a detector reports them; those that were not seen lose their other values.
 
     Args:
         names: (n,), each once.
@@ -110,8 +110,8 @@ def checked_keypoints(
 def positions_of(message: Any) -> Positions:
     """The content of an hmt_msgs/Keypoints3D, of `rosbags` or of ROS.
 
-    A landmark has a position unless its confidence is 0; by how much confidence exceeds 0 does not
-    matter here.
+    A landmark has a position unless its confidence is 0; higher confidences all count the same
+    here.
 
     Raises:
         MessageError: as `keypoints_of`.

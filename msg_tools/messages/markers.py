@@ -5,7 +5,7 @@ the joints. So a viewer replaces the markers of the last time, and ranks that ar
 are deleted: every array speaks about all ranks.
 
 The floor is a translucent square in the namespace `floor`, the feet that stand on it are spheres in
-the namespace `contacts`, the less probable the fainter. What is not known any more is deleted.
+the namespace `contacts`, the less probable the fainter. Markers of unknown things are deleted.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def trajectory_markers(
 
 
 def _markers(messages: MessageFactory, header: Any, namespace: str) -> Callable[..., Any]:
-    """Maker of the markers of one array, which share what is the same in all of them."""
+    """Maker of the markers of one array, which share their common fields."""
     blank = messages.create(
         'visualization_msgs/msg/Marker',
         header=header,

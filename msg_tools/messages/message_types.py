@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 # Stands before each of the IDL files that a bag strings together.
 _IDL_HEADER = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
 
-# What ROS 2 makes of a message without fields.
+# The field that ROS 2 gives a message without fields.
 _NO_FIELDS = 'uint8 structure_needs_at_least_one_member'
 
 
@@ -139,7 +139,7 @@ class MessageFactory(Protocol):
     def create(self, msgtype: str, **fields: Any) -> Any:
         """A message with some fields given, the others zero or empty (quaternions: no rotation).
 
-        Numpy arrays are converted to what the field wants.
+        Numpy arrays are converted to the type of the field.
         """
 
     def points(self, positions: NDArray[np.float64]) -> list[Any]:
@@ -266,7 +266,7 @@ _ZEROS: dict[str, Callable[[], Any]] = {
 
 @cache
 def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
-    """For each field what makes its default, and the dtype where it is an array of numbers."""
+    """For each field the maker of its default, and the dtype where it is an array of numbers."""
     result: dict[str, tuple[Callable[[], Any], str | None]] = {}
     for name, description in typestore().fielddefs[msgtype][1]:
         kind, detail = description

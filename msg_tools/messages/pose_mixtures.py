@@ -421,7 +421,7 @@ def _existence(message: Any, state: TrackState) -> float:
 
 
 def _errors(message: Any) -> dict[str, float]:
-    """How errors last; NaN where a publisher or an older definition does not tell."""
+    """The error model; NaN where a publisher or an older definition lacks it."""
     share = float(getattr(message, 'error_share', math.nan))
     if share == 0.0:
         # ROS sets fields to 0 that a publisher leaves alone.

@@ -144,7 +144,7 @@ def trajectory_mixture_of(
     """The content of an hmt_msgs/TrajectoryMixture, of `rosbags` or of ROS.
 
     Args:
-        dof_names: what it has to be about, in this order; None: anything.
+        dof_names: that it has to have, in this order; None: any.
 
     Raises:
         MessageError: names that differ, arrays whose lengths contradict each other, weights that

@@ -37,7 +37,7 @@ def body_urdf(
 
     Args:
         skeleton: whose segments are shown as rods to their ends.
-        root_link: what the segments without parent hang on: the frame of the camera.
+        root_link: parent of the segments without one: the frame of the camera.
         rod_radius: m.
         link_prefix: stands before the names of all links but the root.
 
@@ -119,7 +119,7 @@ def link_frames(
     q = np.asarray(pose, dtype=np.float64)
     turned = frames.rotations()[index]
     origins = np.ascontiguousarray(frames.origins[:, :, index])
-    # What takes a rotation back: a turn by -q about its axis, which it does not move itself.
+    # The inverse of a rotation: a turn by -q about its axis, which it does not move itself.
     back = _rotations(frames.axes[:, :, index], -q)
     names: list[str] = []
     rotations: list[Array] = []

@@ -1,1 +1,1 @@
-"""The command import-video, which writes a video and what was found in it into a bag."""
+"""The command import-video, which writes a video and the detections in it into a bag."""

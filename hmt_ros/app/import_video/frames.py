@@ -21,7 +21,7 @@ from msg_tools.messages.images import MAX_PIXELS, ImageError, decode_picture
 IMAGE_SUFFIXES = ('.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.webp', '.ppm', '.pgm')
 LARGEST_IMAGE_FILE = 2**28  # bytes
 MOST = 1e9  # frames; a head that announces more is damaged
-FASTEST = 1000.0  # frames per second; what a container claims beyond is damage
+FASTEST = 1000.0  # frames per second; a container that claims more is damaged
 _EXIF_WITHIN = 2**16  # bytes at the beginning of a JPEG
 _QUIET = '-8'  # AV_LOG_QUIET of FFmpeg
 _HALF = 127  # grey levels, of masks

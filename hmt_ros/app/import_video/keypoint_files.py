@@ -1,4 +1,4 @@
-"""Files of 2D detectors, with the layouts that import-video --help tells, and whom to track."""
+"""Files of 2D detectors, in the layouts of import-video --help, and the choice of a person."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Person:
 
     Attributes:
         keypoints: under the detector's names; their covariances are not known (NaN).
-        track: what the detector calls the person in all frames; '' if it does not track.
+        track: name that the detector gives the person in all frames; '' if it does not track.
     """
 
     keypoints: Keypoints
@@ -66,8 +66,8 @@ def person(
 ) -> Person | None:
     """A person as a detector reports one; None if it sees nothing of the person.
 
-    What lies at (0, 0) or at NaN, or has no confidence, was not seen. Confidences above 1, which
-    some detectors give, count as 1.
+    A keypoint at (0, 0) or at NaN, or without confidence, was not seen. Confidences above 1,
+    which some detectors give, count as 1.
 
     Args:
         pixels: (n, 2) px.
@@ -93,8 +93,8 @@ class Choice:
 
     Attributes:
         kind: `LARGEST`: box in each frame. `NEAREST`: to the person chosen before; the first is
-            the largest. `INDEX`: place in the list of the frame. `TRACK`: what the detector calls
-            the person.
+            the largest. `INDEX`: place in the list of the frame. `TRACK`: name that the detector
+            gives the person.
         value: the place, or the name.
     """
 
@@ -151,7 +151,7 @@ _BY_COUNT = {
     for name in ('coco17', 'skeleton2d', 'body25', 'halpe26', 'mediapipe33', 'mhr70')
 }
 _MATCHING_NS = 10_000_000  # between the time of a row and that of its frame
-_FRACTION = 2.0  # px; what lies all within is given as fractions of the image
+_FRACTION = 2.0  # px; keypoints that all lie within are given as fractions of the image
 _FARTHEST = 1e5  # px; no image is so large
 
 
@@ -214,7 +214,7 @@ class FoundPersons:
 
 
 def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPersons:
-    """Reads what a detector found in the frames of a source.
+    """Reads the output of a detector for the frames of a source.
 
     Args:
         first_stamp_ns: stamp of the first frame, which stamps in the file refer to.

@@ -1,4 +1,4 @@
-"""The input of the filter in a bag: images, calibration, what comes with them, transforms."""
+"""The input of the filter in a bag: images, calibration, inputs beside them, transforms."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 # Names of topics that are preferred to all others.
 _USUAL = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
-# What a bag may have of the table of inputs: predictions are made anew.
+# Rows of the table of inputs that a bag may have: predictions are made anew.
 RECORDED = (*(row for row in INPUTS if row is not PREDICTION_INPUT), DETECTIONS_INPUT)
 # Frames with z up that stand still [REP 105]; messages that are searched for a way to one.
 UPRIGHT_FRAMES = ('odom', 'map', 'world')
@@ -41,7 +41,7 @@ class RecordedInput:
     """The topics of a bag that a replay reads.
 
     Attributes:
-        given: topics of what comes with the images, by the source that it is for.
+        given: topics of the inputs that come with the images, by source.
         transforms: topics of transforms by source, those that the bag has of `TRANSFORMS`; None if
             transforms are not used.
         upright_frame: one of `UPRIGHT_FRAMES` that transforms lead to from the camera; empty: they
@@ -92,7 +92,7 @@ def recorded_input(
 
     Images come from `image/compressed`, else from `image`, else from the only topic of images.
     Calibration comes from `camera_info` beside the images, else from the only topic of its type.
-    What comes with the images has the names of the table of inputs, transforms come from `/tf` and
+    Inputs beside the images have the names of the table of inputs, transforms come from `/tf` and
     `/tf_static`.
 
     Args:
@@ -150,7 +150,7 @@ def upright_frame(bag: BagReader, recorded: RecordedInput) -> str:
             if found:
                 return found
     except BagError:
-        # The replay itself tells of the damage, and what to do.
+        # The replay itself reports the damage and the remedy.
         return ''
     return ''
 

@@ -328,7 +328,7 @@ class LiveNode:
         return self.full_name.replace('/', '.')
 
     def _topic(self, name: str) -> str:
-        """The topic of a name; those of all nodes that a node publishes on are its own here."""
+        """The topic of a name; shared topics that a node publishes on are its own here."""
         if not name.startswith('/'):
             return f'{self._namespace}/{name}'
         return f'/{self.full_name}{name}' if name in self._topics else name
@@ -345,7 +345,7 @@ class LiveNode:
             )
             for source, (topic, msgtype) in inputs.items()
         }
-        # Sources whose topic the node publishes on, too, and what was published there by this side.
+        # Sources whose topic the node publishes on, too, and messages published there by this side.
         self._shared = {source for source, (topic, _) in inputs.items() if topic in self._topics}
         self._own = OwnMessages()
         shared = {inputs[source][0] for source in self._shared}
@@ -391,7 +391,7 @@ class LiveNode:
 
 
 def _into(queue: deque[bytes], own: OwnMessages | None = None) -> Callable[[bytes], None]:
-    """A callback that appends to a queue what others have sent; rclpy inspects its signature."""
+    """A callback that appends messages of others to a queue; rclpy inspects its signature."""
 
     def receive(data: bytes) -> None:
         if own is None or not own.is_own(data):

@@ -1,8 +1,8 @@
 """Replay of many bags, one after the other or through Dask; bags that are done are skipped.
 
-Each new bag `<name>` has `<name>.replay.json` beside it, which records what it was made from (sizes
-and times of the input files, all parameters, checksums of the files that they name, the version of
-this package) and whether it is complete. The record is written before and after the replay.
+Each new bag `<name>` has `<name>.replay.json` beside it, which records its inputs (sizes and times
+of the input files, all parameters, checksums of the files that they name, the version of this
+package) and whether it is complete. The record is written before and after the replay.
 """
 
 from __future__ import annotations
@@ -240,7 +240,7 @@ def _replayed_once(job: Job, tell: Tell) -> tuple[str, str]:
     return DONE, str(replayed)
 
 
-# What a bag was made from
+# Inputs of a bag
 
 
 def _made_from(job: Job) -> dict[str, Any]:
@@ -296,7 +296,7 @@ def _write_record(path: Path, content: dict[str, Any]) -> None:
     partial.replace(path)
 
 
-# Which bags
+# Choice of bags
 
 
 def _jobs(

@@ -192,7 +192,7 @@ def _play(
 
 
 def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str, BagMessage, Any]:
-    """Source and message of the next message, and what the nodes get: images may be decoded.
+    """Source and message of the next message, and its form for the nodes: images may be decoded.
 
     Raises:
         BagError: its bytes are not a message; the next one can still be read.

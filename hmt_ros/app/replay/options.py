@@ -174,7 +174,7 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
 def _tracking_values(options: ReplayOptions, recorded: RecordedInput, node: str) -> dict[str, Any]:
     """Values for a node that tracks; inputs and transforms of a bag are used where there are some.
 
-    What the user says of them counts.
+    Values that the user gives take precedence.
     """
     values = _given_values(options, node)
     given = {

@@ -3,7 +3,7 @@
 The BME takes each image before the filter, which takes the `pose_prediction` of the BME; the
 smoother takes the `likelihood_mixture` of the filter, and the BME its `pose_mixture` if it is to
 predict less often while the person is tracked; then the next message follows. At the end of
-the bag they finish, in the same order: no message tells a node, so it is deactivated.
+the bag they finish, in the same order: no message announces the end, so nodes are deactivated.
 """
 
 from __future__ import annotations

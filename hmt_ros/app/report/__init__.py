@@ -1,1 +1,1 @@
-"""The command `report`: figures and one HTML page of what a bag carries."""
+"""The command `report`: figures and one HTML page of the content of a bag."""

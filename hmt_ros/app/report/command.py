@@ -137,7 +137,7 @@ def write_report(options: ReportOptions) -> tuple[Content, str]:
 
 
 def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) -> Content:
-    """Reads and scores what the page shows."""
+    """Reads and scores the content of the page."""
     truth = read_truth(options.truth) if options.truth else recorded_truth(options.bag)
     with BagReader(options.bag) as bag:
         topics = chosen_topics(bag, options.topics)

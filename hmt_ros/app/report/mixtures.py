@@ -83,7 +83,7 @@ def marginals_of(content: PoseMixture, body: Body | None, ground: GroundState | 
 
 
 def regions_of(content: PoseMixture) -> Array:
-    """Ellipsoids that hold 90 % of where a joint is, relative to the pelvis, by component.
+    """Ellipsoids that hold a joint with 90 %, relative to the pelvis, by component.
 
     Returns:
         (K, J, 6) xx, yy, zz, xy, xz, yz of the matrix R, m, which takes the unit ball to the

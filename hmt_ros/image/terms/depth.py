@@ -3,15 +3,15 @@
     E(x) = w / V sum_i rho((D(u_i(x)) - z_i(x)) / sigma_i)
     sigma_i^2 = sigma^2 + (growth D^2)^2 + (noise_i / cos a_i)^2
 
-over the V visible points i of the flesh: on every ring the two on either side of what faces the
-camera. D is the depth image, registered to the colour image, z the depth of the point, both along
-the axis of the camera, m. The error of a sensor that triangulates grows with the square of the
-distance [Khoshelham and Elberink, Sensors 2012]; that of the flesh, `noise`, is one along the
-normal of the surface, which the ray meets at the angle a. The gradient is that of points that stay
-on the skin, with their deviations.
+over the V visible points i of the flesh: on every ring the two on either side of the part that
+faces the camera. D is the depth image, registered to the colour image, z the depth of the point,
+both along the axis of the camera, m. The error of a sensor that triangulates grows with the square
+of the distance [Khoshelham and Elberink, Sensors 2012]; that of the flesh, `noise`, is along the
+normal of the surface, which the ray meets at the angle a. In the gradient the points stay on the
+skin, and their deviations are constant.
 
-Where nothing was measured a point costs as much as one that errs by its deviation, whatever the
-pose. What lies before a point, or far behind it, costs at most what the kernel allows.
+Where nothing was measured a point has the cost of an error of one deviation, whatever the pose. A
+surface before a point, or far behind it, costs at most the maximum of the kernel.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from hmt_ros.image.terms.image_term import (
 )
 from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
 
-# Depths that sensors measure, m; what is nearer or further says nothing.
+# Depths that sensors measure, m; nearer and further ones are no evidence.
 NEAREST, FURTHEST = 0.2, 20.0
-# Angle around a ring between what faces the camera and a point, rad.
+# Angle around a ring between the part that faces the camera and a point, rad.
 ASIDE = np.pi / 4
 COS, SIN = float(np.cos(ASIDE)), float(np.sin(ASIDE))
 # Points whose normal is further from the ray than this are not compared, as a cosine.
@@ -57,7 +57,7 @@ NO_DEPTHS = ImageMap(np.zeros((1, 2, 2), np.float32))
 
 
 def usable_depths(depth: NDArray[np.floating]) -> NDArray[np.float32]:
-    """A depth image (H, W), m, with 0 for what says nothing: holes, and what is out of range."""
+    """A depth image (H, W), m, with 0 for holes and for depths out of range."""
     with np.errstate(invalid='ignore'):
         good = (depth >= NEAREST) & (depth <= FURTHEST)
     result: NDArray[np.float32] = np.where(good, depth, 0.0).astype(np.float32)

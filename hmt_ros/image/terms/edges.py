@@ -35,7 +35,7 @@ _DISC = np.array(
     [[x * x + y * y <= (MARGIN + 0.5) ** 2 for x in range(-MARGIN, MARGIN + 1)]
      for y in range(-MARGIN, MARGIN + 1)], dtype=np.uint8,
 )  # fmt: skip
-# Distance to an edge that is taken where somebody else hides what is there, px.
+# Distance to an edge that is assumed where somebody else hides the edges, px.
 HIDDEN = 2.0
 # Fewer visible points than this do not make each of them count more.
 FEWEST = 20

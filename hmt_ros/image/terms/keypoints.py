@@ -47,9 +47,9 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
 KEYPOINTS = TermSettings(0.5, 1.0, 3.0)
-# Height of what keypoints show of a person whose distance is unknown, m.
+# Assumed height of the visible part of a person whose distance is unknown, m.
 USUAL_EXTENT = 1.4
-# A person whose landmarks have the offsets of the table, m.
+# Stature of a person whose landmarks have the offsets of the table, m.
 USUAL_STATURE = 1.7
 # Least standard deviation of a keypoint whose noise is learned, px.
 SMALLEST_SIGMA = 1.5
@@ -338,7 +338,7 @@ class MeasuredKeypoints:
 
 
 # A track makes a term for every set of hypotheses of an image, and a start one for every trial of
-# lengths. What does not depend on the hypotheses, or on the lengths, is worked out once.
+# lengths. Inputs that do not depend on the hypotheses, or on the lengths, are computed once.
 @lru_cache(maxsize=16)
 def _measured(
     skeleton: Skeleton, camera: Camera, keypoints: Keypoints, sigma: float, magnification: float

@@ -4,9 +4,9 @@
 
 A residual at the point p of a segment has a derivative a with respect to the point. A small motion
 of the segment is a twist (v, w) that moves p by v + w x p, so the residual adds `g b` and
-`k b b^T` to its segment, b = (a, p x a), g the derivative and k the curvature of rho. Sums over
-what a degree of freedom moves give its row of the gradient and of the Hessian. It is the compiled
-counterpart of `body.kinematics.segment_sums` and `assemble`, one pose at a time.
+`k b b^T` to its segment, b = (a, p x a), g the derivative and k the curvature of rho. Sums over the
+segments that a degree of freedom moves give its row of the gradient and of the Hessian. It is the
+compiled counterpart of `body.kinematics.segment_sums` and `assemble`, one pose at a time.
 """
 
 from __future__ import annotations

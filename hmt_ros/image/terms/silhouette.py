@@ -27,12 +27,12 @@ from hmt_ros.inference.arrays import Array
 
 # Samples on the outline.
 OUTLINE_POINTS = 120
-# Pixels that opposite directions count like when outline and contour are matched, per unit.
+# Pixels that a unit of difference in direction counts as when outline and contour are matched.
 TURN = 12.0
 # Along the outline distances up to this, px, cost nothing: the contour's points stand that far
 # apart.
 SPACING = 8.0
-# How far a sample of the outline is believed whose outside, so many px away, may be the person.
+# Belief in a sample of the outline beyond which, this many px away, the person may go on.
 UNSURE = 0.3
 BESIDE = 4.0
 
@@ -43,7 +43,7 @@ class Outline(NamedTuple):
     Attributes:
         pixels: (M, 2).
         normals: (M, 2) unit vectors out of the silhouette.
-        beliefs: (M,) how far each is believed, 0 to 1.
+        beliefs: (M,) belief in each, 0 to 1.
     """
 
     pixels: Array

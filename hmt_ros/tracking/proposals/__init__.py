@@ -30,7 +30,7 @@ class Proposal(Protocol):
     def propose(
         self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
     ) -> Hypotheses:
-        """Hypotheses that are to be optimised; what they weigh is not for a proposal to say.
+        """Hypotheses that are to be optimised; a proposal does not set their weights.
 
         Args:
             search: of the image.
@@ -41,7 +41,7 @@ class Proposal(Protocol):
         ...
 
 
-# What the setting `proposals` selects. A new proposal is a file beside this one and a line here.
+# By the setting `proposals`. A new proposal is a file beside this one and a line here.
 PROPOSALS: dict[str, Callable[[Posterior], Proposal]] = {
     'kjs': KinematicJumps,
     'css': CovarianceScaledSamples,

@@ -1,8 +1,8 @@
-"""Poses that keypoints alone would have: a silhouette of something else draws modes away from them.
+"""Poses fitted to keypoints alone, from which a silhouette of something else draws modes away.
 
     x' = argmin sum_p d_p(x)^2 / 2 + E_prior(x) + (x - f)' P (x - f) / 2
 
-d_p is the distance to keypoint p in deviations, f where the heaviest mode is predicted, or x' of
+d_p is the distance to keypoint p in deviations, f the predicted pose of the heaviest mode, or x' of
 the image before while silhouette and keypoints go different ways, P the precision of the
 prediction.
 """
@@ -24,7 +24,7 @@ from hmt_ros.tracking.validity import UNDECIDED, ByKeypoints
 
 
 class KeypointHistory:
-    """Where keypoints alone have led since the modes left some of them.
+    """The pose that keypoints alone have led to since the modes left some of them.
 
     Attributes:
         pose: (1, d) of the last image; None: the modes explain every group of keypoints.
@@ -45,10 +45,10 @@ class KeypointHistory:
             search: of the image.
             mode: (d,) the heaviest.
             term: of the keypoints.
-            missed: what the modes leave of them.
+            missed: misfit of the modes to them.
 
         Returns:
-            What the pose by keypoints says of the cues; None: the modes explain enough keypoints.
+            Misfit and gain of the pose by keypoints; None: the modes explain enough keypoints.
         """
         self.contradicted = missed.share > UNDECIDED[KEYPOINTS]
         if not (missed.shares[missed.counts > 0] > UNDECIDED[KEYPOINTS]).any():
@@ -66,7 +66,7 @@ class KeypointHistory:
 
 @dataclass(frozen=True)
 class KeypointPoses:
-    """Proposes where keypoints alone would move the heaviest mode."""
+    """Proposes the pose to which keypoints alone would move the heaviest mode."""
 
     def propose(
         self, search: Search, _base: Minimum, sources: Hypotheses, _rng: np.random.Generator

@@ -1,7 +1,7 @@
 """Kinematic jump sampling: other configurations of the limbs and of the trunk (KJS 3, 4).
 
 For each trunk that the modes have, every limb has alternatives: those of the modes, all their
-flips, and, where no keypoints show it or the image is surprising, what a search of the image found.
+flips, and, where no keypoints show it or the image is surprising, the results of an image search.
 Combinations of alternatives are rated on the trunk as it is, with limbs exchanged that were taken
 for each other, and with the torso flipped; the best that stand for all become candidates.
 
@@ -10,8 +10,8 @@ Covariance-scaled sampling of one limb at a time (KJS 3).
     E(a) = E_image(a) + E_keypoints(a) + E_prior(a) + E_motion(a)      over the angles a of a limb
 
 Given the trunk, limbs are nearly independent: instead of 37 degrees of freedom at once, samples of
-the four to six of one limb are compared with the image there, and the best are refined. What the
-rest of the body explains of the silhouette's outline costs a limb nothing.
+the four to six of one limb are compared with the image there, and the best are refined. The part of
+the silhouette's outline that the rest of the body explains costs a limb nothing.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SAME_TRUNK = 0.06
 DISTINCT = 0.08
 # Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
 TAILS = 4.0
-# Factor on the standard deviations of the body's prior, of the samples that are drawn from it.
+# Factor on the standard deviations of the body's prior where samples are drawn from it.
 WIDE = 1.3
 
 
@@ -88,7 +88,7 @@ class LimbSearch:
             pose: (d,) whose other limbs are kept.
             covariance: (d, d) how far the limb may have moved.
             observation: of the image.
-            plan: what its evaluations are spent on.
+            plan: allocation of its evaluations.
             rng: source of randomness.
         """
         body, own = self.posterior.body, self.dofs
@@ -206,8 +206,8 @@ class KinematicJumps:
     def _not_shown(self, observation: Observation, surprising: bool) -> list[str]:
         """The limbs that an image is searched for: those that no keypoints show.
 
-        Two keypoints fix a limb but for its flips; samples beside them mostly find what the image
-        has of other limbs and of the background. Where an image is surprising they may be wrong.
+        Two keypoints fix a limb but for its flips; samples beside them mostly find other limbs and
+        the background. Where an image is surprising the keypoints may be wrong.
         """
         if not {'coverage', 'edges'} & observation.evidence.keys():
             return []

@@ -19,11 +19,11 @@ from hmt_ros.tracking.optimisation import Search
 
 @dataclass(frozen=True, eq=False)
 class PosePrediction:
-    """A mixture over poses, and whose they are.
+    """A mixture over the poses of a body.
 
     Attributes:
         mixture: over poses (d,), with some weight above 0.
-        body: that the poses are of, at the lengths that were assumed.
+        body: of the poses, at the lengths that were assumed.
 
     Raises:
         ValueError: a mixture that is not over poses of the body.
@@ -42,7 +42,7 @@ class PosePrediction:
             raise ValueError('a prediction has no weight')
 
     def seen_as(self, body: Body) -> GaussianMixture:
-        """The same for a person of other lengths: as much further away as the person is larger.
+        """The same for a person of other lengths, at a distance in proportion to the size.
 
         Raises:
             ValueError: a body with other degrees of freedom.
@@ -60,7 +60,7 @@ class PosePrediction:
         )
 
     def both_ways(self, body: Body) -> GaussianMixture:
-        """As `seen_as`, with the reversal in depth, which a silhouette does not tell from it."""
+        """As `seen_as`, with the reversals in depth, which have nearly the same silhouettes."""
         seen = self.seen_as(body)
         return GaussianMixture(
             np.tile(0.5 * seen.weights, 2),
