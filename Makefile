@@ -28,18 +28,18 @@ help:
 	@sed -n 's/^# \{0,1\}//p; /^$$/q' Makefile
 
 setup:
-	@$(WORKSPACE) ros test lint build kernels
+	@$(WORKSPACE) ros test lint kernels
 
 detector:
 	@$(WORKSPACE) ros detector
 
 demo:
-	@$(WORKSPACE) ros build kernels
+	@$(WORKSPACE) ros kernels
 	@rm -rf build/demo && mkdir -p build/demo
 	@$(SOURCED) python -m hmt_ros.app.demo $(DEMO_BAG) -o build/demo --live
 
 test:
-	@$(WORKSPACE) ros test build
+	@$(WORKSPACE) ros test kernels
 	@$(WORKSPACE) detector || echo 'hmt_ros: the tests of MediaPipe Pose are skipped' >&2
 	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder $(ARGS)
 

@@ -12,6 +12,8 @@ export AMENT_PREFIX_PATH=$VIRTUAL_ENV CMAKE_PREFIX_PATH=$VIRTUAL_ENV
 export PATH=$VIRTUAL_ENV/bin:$PATH
 export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3
 source "$_root/install/local_setup.bash"
+# Nodes and commands run the sources, not the copy in install/.
+export PYTHONPATH=$_root:$PYTHONPATH
 # DDS communicates on this machine only, unless the variable is set already.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
 unset _root

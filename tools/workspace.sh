@@ -9,7 +9,7 @@
 #     lint     ruff, mypy, pre-commit
 #     detector MediaPipe Pose
 #     build    both packages, in build/ and install/
-#     kernels  what numba compiles, for the sources and for what is installed
+#     kernels  build and, beside it, what numba compiles
 #
 # A checksum of its inputs identifies a completed stage, which is skipped. A stage that was
 # interrupted or whose inputs have changed runs again.
@@ -220,31 +220,25 @@ stage_build() {
   echo "$key" >"$stamps/build"
 }
 
-# The kernels of the sources, which commands run in this folder use, and of the installed package.
+# One core or more builds, one compiles the kernels of the sources, which tools/environment.bash uses.
 stage_kernels() {
-  local key log installed
-  key=$("$venv/bin/python" -c 'from pathlib import Path; import hmt_ros.compiled_code as code
-for place in Path("."), *Path("install").glob("hmt_ros/lib/*/site-packages"):
-    print(code.folder_of((place / "hmt_ros").resolve()))')
-  done_already kernels "$key" && return
+  local key log compiling
+  key=$("$venv/bin/python" -c 'from pathlib import Path
+import hmt_ros.compiled_code as code; print(code.folder_of(Path("hmt_ros").resolve()))')
+  if done_already kernels "$key"; then
+    stage_build
+    return
+  fi
   say 'compiling kernels, once after an update (a minute or two)'
   log=$(mktemp)
-  compile_in / --quiet >"$log" 2>&1 &
-  installed=$!
-  compile_in . || fail 'the kernels could not be compiled'
-  saying_how_long 'waiting for the kernels of the installed package' wait "$installed" ||
-    fail "the kernels of the installed package could not be compiled:"$'\n'"$(cat "$log")"
+  "$venv/bin/python" -m hmt_ros compile --quiet >"$log" 2>&1 9<&- &
+  compiling=$!
+  stage_build
+  saying_how_long 'compiling kernels' wait "$compiling" ||
+    fail "the kernels could not be compiled:"$'\n'"$(cat "$log")"
   rm "$log"
   echo "$key" >"$stamps/kernels"
 }
-
-# The package that Python finds in a folder: the sources in this one, the installed one elsewhere.
-compile_in() (
-  set +u
-  source tools/environment.bash
-  cd "$1"
-  exec python -m hmt_ros compile "${@:2}"
-)
 
 # Runs "colcon build" quietly with .venv as the ROS installation; shows its output if it fails.
 colcon_build() {
@@ -257,7 +251,7 @@ colcon_build() {
     export CPATH=$headers/usr/include
   fi
   output=$(
-    export HMT_ROS_KERNELS=later # The stage does it, and shows how far it is.
+    export HMT_ROS_KERNELS=later # Commands here run the sources.
     export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv
     colcon --log-base "$(dirname "$build_base")/log" build --build-base "$build_base" "$@" \
       --event-handlers console_cohesion+ console_start_end- console_stderr- status- \
