@@ -13,7 +13,7 @@ import pytest
 from hmt_ros.sessions.camera_session import MOST_INCOMPLETE
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from msg_tools.messages.cdr import serialise
-from test.nodes.conftest import PATIENCE
+from test.nodes.conftest import PATIENCE, only_line
 
 pytestmark = pytest.mark.ros
 
@@ -495,11 +495,11 @@ def test_a_track_leaves_lines_in_the_log(running, small_camera, stub_tracker):
 # The executable.
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_ends_cleanly(number, subject_file, executable):
+def test_ends_cleanly(subject_file, executable):
+    """By the signal of `kill`; the other nodes by that of the interrupt key."""
     file = f'subject_file:={subject_file}'
     node = executable('filter_node', '-p', file, '--params-file', str(CONFIG))
-    lines = node.stop_at('images from /image', number)
+    lines = node.stop_at('images from /image', signal.SIGTERM)
     assert 'images from /image' in lines[-1]
     # Before it listened, it has loaded or compiled what it runs.
     assert 'kernels loaded in' in lines[0] or 'compiling kernels' in lines[0]
@@ -529,8 +529,9 @@ def test_kernels_are_ready_before_the_node_listens(world, monkeypatch):
         (('-p', 'background.method:=guess'), "saw 'guess'"),
     ],
 )
-def test_wrong_arguments_are_one_line(arguments, message, executable):
-    line = executable('filter_node', *arguments).refusal()
+def test_wrong_arguments_are_one_line(arguments, message, ended):
+    code, output, errors = ended('filter_node', '--ros-args', *arguments)
+    line = only_line(code, output + errors)
     assert line.startswith('filter_node: ')
     assert message in line
 
