@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import runpy
 import subprocess
 import sys
@@ -177,7 +176,7 @@ def test_a_raised_hand_is_as_probable_as_its_modes():
     assert math.isnan(told(nobody))
 
 
-def test_the_height_of_a_joint_is_drawn(tmp_path):
+def test_the_height_of_a_joint_is_drawn(tmp_path, monkeypatch):
     body = load_body('human37')
     poses = np.tile(body.prior_mean, (2, 1))
     poses[:, 2] = 3.0
@@ -190,11 +189,11 @@ def test_the_height_of_a_joint_is_drawn(tmp_path):
                 state=TrackState.TRACKING,
             )  # fmt: skip
             bag.write('pose_mixture', content.stamp_ns, pose_mixture_message(MESSAGES, content))
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / 'plot_joint.py', tmp_path / 'bag', '-o', tmp_path / 'a.png'],
-        env={**os.environ, 'PYTHONPATH': str(ROOT)}, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0
+    words = ['plot_joint.py', str(tmp_path / 'bag'), '-o', str(tmp_path / 'a.png')]
+    monkeypatch.setattr(sys, 'argv', words)
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(EXAMPLES / 'plot_joint.py'), run_name='__main__')
+    assert ended.value.code == 0
     picture = cv2.imread(str(tmp_path / 'a.png'))
     assert picture.shape == (480, 900, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
