@@ -28,6 +28,7 @@ from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
+from test.app.replay.test_transforms import FRAME, with_transforms
 
 pytestmark = pytest.mark.ros
 
@@ -115,8 +116,8 @@ def test_same_of_every_image_without_a_subject(tmp_path, capsys):
 
 @pytest.mark.usefixtures('in_one_process')
 def test_same_predictions_from_keypoints_and_silhouettes(tmp_path, capsys):
-    """The subject is given, and the nodes share a process."""
-    entries = recorded(3)
+    """The subject is given, gravity is from transforms, and the nodes share a process."""
+    entries = with_transforms(recorded(3))
     stamp = next(time for topic, time, _ in entries if topic == 'image/compressed')
     seen = MESSAGES.create(
         'hmt_msgs/msg/Keypoints2D',
@@ -129,13 +130,14 @@ def test_same_predictions_from_keypoints_and_silhouettes(tmp_path, capsys):
         tmp_path / 'bag', sorted([*entries, ('keypoints', stamp, seen)], key=lambda x: x[1])
     )
     options = ['--bme', '--set', 'bme.predict_from=both', '--set', 'use_keypoints=false']
-    options += ['--set', 'forecast_rate=50.0']
+    options += ['--set', 'forecast_rate=50.0', *FRAME, '--with-images']
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
     assert one[0] == 0
     for topic in ('pose_prediction', 'pose_mixture', 'smoothed_pose_mixture'):
         assert len(messages(live, topic)) == 3
     assert len(messages(live, 'pose_forecast')) > 3
+    assert messages(live, '/tf_static') == messages(bag, '/tf_static') != []
     assert content(offline) == content(live)
 
 
