@@ -361,6 +361,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
 ):
     begun, go = held_estimate
     one = world(queue_size=2).start()
+    end_period = one.own_periods()
     one.send('camera_info', small_camera.info())
     queue = one.thread.queue
 
@@ -385,6 +386,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     assert [h.stamp_ns for h in dropped] == [small_camera.stamp(i) for i in range(1, 10)]
     assert 'is dropped: newer ones came before its turn' in dropped[0].faults[0]
     assert not any(h.warnings for h in dropped)
+    end_period()
     late = re.compile(r'computing takes \d+ ms for one of the images; late: 9 images dropped in a')
     one.spin_until(lambda: any(late.match(d.status[0].message) for d in one.diagnostics))
     level, _, values = one.diagnosis()
