@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import select
 import subprocess
 import sys
 from pathlib import Path
@@ -61,7 +62,7 @@ def test_consumer_in_python(tmp_path):
     node = rclpy.create_node('publisher', context=context)
     namespace = f'/consumed_{os.getpid()}'
     publisher = node.create_publisher(PoseMixtureMessage, f'{namespace}/pose_mixture', 10)
-    command = [sys.executable, 'consumer.py', '--ros-args', '-r', f'__ns:={namespace}']
+    command = [sys.executable, '-u', 'consumer.py', '--ros-args', '-r', f'__ns:={namespace}']
     process = subprocess.Popen(command, cwd=tmp_path, text=True, stdout=subprocess.PIPE)
     timer = node.create_timer(0.1, lambda: publisher.publish(data))
     try:
@@ -69,10 +70,8 @@ def test_consumer_in_python(tmp_path):
         executor.add_node(node)
         for _ in range(600):
             executor.spin_once(timeout_sec=0.1)
-            if publisher.get_subscription_count() and process.poll() is None:
+            if select.select([process.stdout], [], [], 0.0)[0]:
                 break
-        for _ in range(20):
-            executor.spin_once(timeout_sec=0.1)
         process.terminate()
         assert process.communicate(timeout=20)[0].splitlines()[0] == ANSWER.format(
             37

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from benchmarks import BENCHMARKS
-from hmt_ros.app import COMMANDS, main
+from hmt_ros.app import COMMANDS
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import Scores
 from hmt_ros.sessions import (
@@ -176,19 +176,6 @@ def test_marked_commands_run(workplace, capsys):
     assert ran == ['make-bag', 'replay', 'evaluate', 'evaluate', 'report']
     assert '"fraction_tracked"' in capsys.readouterr().out
     assert (workplace / 'reach_report' / 'report.html').is_file()
-
-
-def test_video_of_the_readme(workplace, walk_video, capsys):
-    """One command line leads from a video to a report."""
-    for name in ('walk.mp4', 'walk.json'):
-        (workplace / name).symlink_to(walk_video / name)
-    found = [words for words, _ in commands(ROOT / 'README.md') if 'track-video' in words]
-    (words,) = found
-    assert main(words[3:]) == 0, capsys.readouterr().err
-    out = capsys.readouterr().out.splitlines()
-    assert out[0] == 'walk/video: 8 images, 8 with keypoints'
-    assert 'walk/tracked: 7 of 8 images tracked' in out
-    assert (workplace / 'walk' / 'report' / 'report.html').stat().st_size > 100_000
 
 
 def test_subject_file_of_the_page_on_bags():

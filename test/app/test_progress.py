@@ -142,7 +142,8 @@ def bag(tmp_path_factory):
 def test_commands_without_a_terminal(bag, tmp_path, capsys, monkeypatch):
     """Lines on stderr, results on stdout."""
     monkeypatch.setattr(progress, 'INTERVAL', 1e-3)
-    assert make_bag.main(['reach', '-o', str(tmp_path / 'reach'), '--duration', '0.5']) == 0
+    small = ['--duration', '0.5', '--size', '160x120']
+    assert make_bag.main(['reach', '-o', str(tmp_path / 'reach'), *small]) == 0
     streams = capsys.readouterr()
     assert 'reach: ' in streams.err
     assert ' of 15 images' in streams.err

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from hmt_ros.app import track_video
+from hmt_ros.app import main, track_video
 from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import load_body
 from hmt_ros.tracking import read_subject
+from test.test_docs import ROOT, commands
 
 
 def run(folder, *options):
@@ -19,9 +20,17 @@ def keypoints(folder):
     return ['--keypoints', str(folder / 'walk.json')]
 
 
-def test_from_video_to_report(walk_video, tmp_path, capsys):
+def test_from_video_to_report(walk_video, tmp_path, monkeypatch, capsys):
+    """By the command line of the README."""
     out = tmp_path / 'walk'
-    assert run(walk_video, '-o', str(out), *keypoints(walk_video)) == 0
+    for name in ('walk.mp4', 'walk.json'):
+        (tmp_path / name).symlink_to(walk_video / name)
+    monkeypatch.chdir(tmp_path)
+    (words,) = (words for words, _ in commands(ROOT / 'README.md') if 'track-video' in words)
+    assert main(words[3:]) == 0, capsys.readouterr().err
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == 'walk/video: 8 images, 8 with keypoints'
+    assert 'walk/tracked: 7 of 8 images tracked' in told
     assert sorted(x.name for x in out.iterdir()) == ['report', 'tracked', 'video']
     assert (out / 'report' / 'report.html').stat().st_size > 100_000
     truth = read_truth(walk_video / 'rendered' / 'truth.npz')
@@ -29,7 +38,6 @@ def test_from_video_to_report(walk_video, tmp_path, capsys):
     assert len(scored.scores) == 7
     # Of the depth of limbs the first images know little; the right way round is below 0.2 m.
     assert np.median(scored.scores.best) < 0.1
-    capsys.readouterr()
     assert run(walk_video, '-o', str(out), *keypoints(walk_video)) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f'track-video: {out}/video exists; give another name, or --overwrite'

@@ -7,11 +7,13 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import pytest
 
 from hmt_ros.sessions.declared_parameters import EFFECTS, declared_parameters
@@ -236,7 +238,15 @@ class World:
             assert reason in why, why
 
     def warnings(self):
-        """Texts that the node has logged as warnings or worse.
+        """Texts that the node has logged as warnings or worse."""
+        return self._texts('WARN', 'ERROR', 'FATAL')
+
+    def errors(self):
+        """Texts that the node has logged as errors."""
+        return self._texts('ERROR')
+
+    def _texts(self, *levels):
+        """Texts that the node has logged with some levels.
 
         From stderr: what contexts that have ended in this process leave behind may keep /rosout
         of a node with the same name silent.
@@ -245,12 +255,18 @@ class World:
         head = re.compile(rf'^\[(\w+)\] \[[0-9.]+\] \[{self.name}\]: ', re.MULTILINE)
         lines = head.split(self.logged)
         entries = zip(lines[1::2], lines[2::2], strict=True)
-        return [text.strip() for level, text in entries if level in ('WARN', 'ERROR', 'FATAL')]
+        return [text.strip() for level, text in entries if level in levels]
 
     def diagnosis(self):
-        """The newest diagnostics: level, message, values."""
-        count = len(self.diagnostics)
-        self.spin_until(lambda: len(self.diagnostics) > count, 'diagnostics')
+        """The diagnostics of a period that ends now: level, message, values."""
+        from rclpy.time import Time
+
+        now = self.node.get_clock().now()
+        self.node._timer.callback()
+        self.spin_until(
+            lambda: self.diagnostics and Time.from_msg(self.diagnostics[-1].header.stamp) >= now,
+            'diagnostics',
+        )
         (status,) = self.diagnostics[-1].status
         return status.level[0], status.message, {v.key: v.value for v in status.values}
 
@@ -280,6 +296,42 @@ def world_of(capfd, monkeypatch):
     yield make
     for one in worlds:
         one.close()
+
+
+def only_line(code, output):
+    """What a node said that has not started."""
+    assert code == 1
+    (line,) = output.splitlines()
+    return line
+
+
+@pytest.fixture
+def ended(capfd, monkeypatch):
+    """Runs nodes that end by themselves, in this process: exit code, output, and errors."""
+    numbers = signal.SIGINT, signal.SIGTERM
+    handlers, threads = [signal.getsignal(number) for number in numbers], cv2.getNumThreads()
+    # It would be for good.
+    monkeypatch.setattr('hmt_ros.nodes.run_node._use_one_heap', lambda: None)
+
+    def run(name, *arguments):
+        main = import_module(f'hmt_ros.nodes.{name}').main
+        capfd.readouterr()
+        # One that does not end is stopped as the interrupt key does it, and its code is 0.
+        guard = threading.Timer(PATIENCE, os.kill, [os.getpid(), signal.SIGINT])
+        guard.start()
+        try:
+            code = main(list(arguments))
+        except SystemExit as of_command_line:
+            code = of_command_line.code
+        finally:
+            guard.cancel()
+            for number, handler in zip(numbers, handlers, strict=True):
+                signal.signal(number, handler)
+            cv2.setNumThreads(threads)
+        said = capfd.readouterr()
+        return code, said.out, said.err
+
+    return run
 
 
 class Executable:
@@ -313,9 +365,7 @@ class Executable:
     def refusal(self):
         """The only line of a node that does not start."""
         output, _ = self.process.communicate(timeout=PATIENCE)
-        assert self.process.returncode == 1
-        (line,) = output.splitlines()
-        return line
+        return only_line(self.process.returncode, output)
 
 
 @pytest.fixture

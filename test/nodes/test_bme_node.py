@@ -130,11 +130,15 @@ def test_lifecycle(world, somebody):
     assert one.state == 'unconfigured'
 
 
-def test_a_model_that_is_none_is_told(tmp_path, executable):
+def test_a_model_that_is_none_is_told(tmp_path, world_of):
+    from hmt_ros.nodes.bme_node import BmeNode
+
     path = tmp_path / 'model.npz'
     path.write_bytes(b'garbage')
-    lines = executable('bme_node', '-p', f'model_file:={path}').stop_at('model.npz')
-    assert '[ERROR]' in next(line for line in lines if 'model.npz' in line)
+    one = world_of(BmeNode, 'bme_node', {}, model_file=str(path))
+    one.node.start()
+    (text,) = one.errors()
+    assert text.startswith(f'{path}: ')
 
 
 def test_ends_cleanly(executable):

@@ -13,7 +13,7 @@ import pytest
 from hmt_ros.sessions.camera_session import MOST_INCOMPLETE
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from msg_tools.messages.cdr import serialise
-from test.nodes.conftest import PATIENCE
+from test.nodes.conftest import PATIENCE, only_line
 
 pytestmark = pytest.mark.ros
 
@@ -361,6 +361,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
 ):
     begun, go = held_estimate
     one = world(queue_size=2).start()
+    end_period = one.own_periods()
     one.send('camera_info', small_camera.info())
     queue = one.thread.queue
 
@@ -385,6 +386,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     assert [h.stamp_ns for h in dropped] == [small_camera.stamp(i) for i in range(1, 10)]
     assert 'is dropped: newer ones came before its turn' in dropped[0].faults[0]
     assert not any(h.warnings for h in dropped)
+    end_period()
     late = re.compile(r'computing takes \d+ ms for one of the images; late: 9 images dropped in a')
     one.spin_until(lambda: any(late.match(d.status[0].message) for d in one.diagnostics))
     level, _, values = one.diagnosis()
@@ -495,11 +497,11 @@ def test_a_track_leaves_lines_in_the_log(running, small_camera, stub_tracker):
 # The executable.
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_ends_cleanly(number, subject_file, executable):
+def test_ends_cleanly(subject_file, executable):
+    """By the signal of `kill`; the other nodes by that of the interrupt key."""
     file = f'subject_file:={subject_file}'
     node = executable('filter_node', '-p', file, '--params-file', str(CONFIG))
-    lines = node.stop_at('images from /image', number)
+    lines = node.stop_at('images from /image', signal.SIGTERM)
     assert 'images from /image' in lines[-1]
     # Before it listened, it has loaded or compiled what it runs.
     assert 'kernels loaded in' in lines[0] or 'compiling kernels' in lines[0]
@@ -529,8 +531,9 @@ def test_kernels_are_ready_before_the_node_listens(world, monkeypatch):
         (('-p', 'background.method:=guess'), "saw 'guess'"),
     ],
 )
-def test_wrong_arguments_are_one_line(arguments, message, executable):
-    line = executable('filter_node', *arguments).refusal()
+def test_wrong_arguments_are_one_line(arguments, message, ended):
+    code, output, errors = ended('filter_node', '--ros-args', *arguments)
+    line = only_line(code, output + errors)
     assert line.startswith('filter_node: ')
     assert message in line
 

@@ -160,10 +160,12 @@ def test_namespaces_that_are_named(installed, world_of, likelihoods):
     one.assert_refused(({'namespaces': 'p1'}, "saw 'p1'"))
 
 
-def test_a_package_that_is_not_installed_is_told(executable):
+def test_a_package_that_is_not_installed_is_told(world_of):
     if find_spec('hri_msgs') is not None:
         pytest.skip('package hri_msgs is installed')
-    lines = executable('hri_node').stop_at('hri_msgs')
-    (line,) = (line for line in lines if 'hri_msgs' in line)
-    assert '[ERROR]' in line
-    assert 'hri_node needs hri_msgs/IdsList, but the package hri_msgs is not installed' in line
+    from hmt_ros.nodes.hri_node import HriNode
+
+    one = world_of(HriNode, 'hri_node', {})
+    one.node.start()
+    (text,) = one.errors()
+    assert 'hri_node needs hri_msgs/IdsList, but the package hri_msgs is not installed' in text

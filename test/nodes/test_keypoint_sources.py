@@ -86,12 +86,14 @@ def test_people_of_yolo_msgs(world, small_camera, stub_tracker):
 
 @pytest.mark.parametrize('node', ['filter_node', 'bme_node'])
 @pytest.mark.parametrize('source', ['skeleton2d', 'yolo'])
-def test_a_package_that_is_not_installed_is_told(executable, node, source):
+def test_a_package_that_is_not_installed_is_told(world_of, node, source):
     package = SOURCES[source].partition('/')[0]
     if find_spec(package) is not None:
         pytest.skip(f'package {package} is installed')
-    more = ('-p', 'predict_from:=keypoints') if node == 'bme_node' else ()
-    lines = executable(node, '-p', f'source:={source}', *more).stop_at(package)
-    (line,) = (line for line in lines if package in line)
-    assert '[ERROR]' in line
-    assert f'the package {package} is not installed: install it' in line
+    more = {'predict_from': 'keypoints'} if node == 'bme_node' else {}
+    module = import_module(f'hmt_ros.nodes.{node}')
+    kind = {'filter_node': 'FilterNode', 'bme_node': 'BmeNode'}[node]
+    one = world_of(getattr(module, kind), node, {}, source=source, **more)
+    one.node.start()
+    (text,) = one.errors()
+    assert f'the package {package} is not installed: install it' in text

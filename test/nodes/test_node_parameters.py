@@ -1,14 +1,10 @@
 """Parameters that are given in vain are named, and so are files for another node."""
 
+from functools import partial
+
 import pytest
 
 pytestmark = pytest.mark.ros
-
-
-def warnings_of(process, until='[filter_node]: images from'):
-    """Texts of the warnings of a node that is stopped once it says a text."""
-    lines = process.stop_at(until)
-    return [line.partition('[filter_node]: ')[2].strip() for line in lines if '[WARN]' in line]
 
 
 def test_unknown_names_are_told_with_the_nearest():
@@ -25,18 +21,23 @@ def test_unknown_names_are_told_with_the_nearest():
     ]
 
 
-def test_unknown_names_from_command_line_and_file(executable, tmp_path):
+def test_unknown_names_from_command_line_and_file(world_of, stub_tracker, tmp_path):
+    from hmt_ros.nodes.filter_node import FilterNode
+
     file = tmp_path / 'own.yaml'
     file.write_text(
         '/**/filter_node:\n  ros__parameters:\n    subjekt_file: a\n    use_mask: true\n'
     )
     quality = 'qos_overrides./{}.subscription.reliability:=reliable'
-    node = executable(
-        'filter_node', '-p', 'max_hypothesis:=3', '-p', 'use_sim_time:=false',
+    arguments = [
+        '--ros-args', '-p', 'max_hypothesis:=3', '-p', 'use_sim_time:=false',
         '-p', quality.format('imgae'), '-p', quality.format('camera_info'),
         '--params-file', str(file),
-    )  # fmt: skip
-    assert warnings_of(node) == [
+    ]  # fmt: skip
+    one = world_of(partial(FilterNode, cli_args=arguments), 'filter_node', {})
+    one.node.start()
+    assert one.session.parameters.use_mask
+    assert one.warnings() == [
         "unknown parameter 'max_hypothesis'; did you mean 'max_hypotheses'?",
         "unknown parameter 'subjekt_file'; did you mean 'subject_file'?",
         "unknown parameter 'qos_overrides./imgae.subscription.reliability'; did you mean "
@@ -90,8 +91,11 @@ def test_namespaces_of_a_file(tmp_path):
     assert files_for_others(['--params-file', str(file)], '/a/b/filter_node') == []
 
 
-def test_a_file_for_another_namespace_is_told_by_the_node(executable, tmp_path):
+def test_unknown_names_and_a_file_for_another_namespace_are_told_by_the_node(executable, tmp_path):
     file = tmp_path / 'own.yaml'
     file.write_text('/p1/filter_node:\n  ros__parameters:\n    use_mask: true\n')
-    (text,) = warnings_of(executable('filter_node', '--params-file', str(file)), 'its parameters')
-    assert text.endswith("none is used; name the section '/**/filter_node'")
+    arguments = ['-p', 'max_hypothesis:=3', '-p', 'autostart:=false', '--params-file', str(file)]
+    lines = executable('filter_node', *arguments).stop_at('its parameters')
+    first, second = (line.partition('[filter_node]: ')[2] for line in lines if '[WARN]' in line)
+    assert first.startswith("unknown parameter 'max_hypothesis'")
+    assert second.strip().endswith("none is used; name the section '/**/filter_node'")

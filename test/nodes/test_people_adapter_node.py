@@ -33,10 +33,12 @@ def test_people(world_of, likelihoods, package):
     one.assert_described(PeopleAdapterParameters())
 
 
-def test_packages_that_are_not_installed_are_told(executable):
+def test_packages_that_are_not_installed_are_told(world_of):
     if any(find_spec(package) for package in PACKAGES):
         pytest.skip('one of them is installed')
-    lines = executable('people_adapter_node').stop_at('people_msgs')
-    (line,) = (line for line in lines if 'people_msgs' in line)
-    assert '[ERROR]' in line
-    assert 'needs one of the packages people_msgs and vision_msgs, but none is installed' in line
+    from hmt_ros.nodes.people_adapter_node import PeopleAdapterNode
+
+    one = world_of(PeopleAdapterNode, 'people_adapter_node', {})
+    one.node.start()
+    (text,) = one.errors()
+    assert 'needs one of the packages people_msgs and vision_msgs, but none is installed' in text

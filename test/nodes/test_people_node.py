@@ -107,9 +107,12 @@ def test_a_reset_that_can_not_be_done_is_refused(world, small_camera, tmp_path):
     assert len(StubTracker.made) == 1
 
 
-def test_boxes_need_their_package(executable):
+def test_boxes_need_their_package(world_of):
     if find_spec('vision_msgs') is not None:
         pytest.skip('package vision_msgs is installed')
-    lines = executable('people_node', '-p', 'source:=boxes').stop_at('vision_msgs')
-    (line,) = (line for line in lines if 'vision_msgs' in line)
-    assert 'the package vision_msgs is not installed: install it' in line
+    from hmt_ros.nodes.people_node import PeopleNode
+
+    one = world_of(PeopleNode, 'people_node', {}, source='boxes')
+    one.node.start()
+    (text,) = one.errors()
+    assert 'the package vision_msgs is not installed: install it' in text

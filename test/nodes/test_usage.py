@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -17,19 +16,20 @@ OTHERS = ('run_node', 'session_node', 'tracking_node', 'person_node', 'camera_no
 NODES = [name for name in NODES if name not in OTHERS]
 
 
-@cache
-def helped(node, *arguments):
-    """What a node says of itself; the same words are not said twice."""
-    done = subprocess.run(
-        [sys.executable, '-m', f'hmt_ros.nodes.{node}', *arguments],
-        cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, '')
-    return done.stdout
+@pytest.fixture
+def helped(ended):
+    """What a node says of itself."""
+
+    def help_of(node, *arguments):
+        code, output, errors = ended(node, *arguments)
+        assert (code, errors) == (0, '')
+        return output
+
+    return help_of
 
 
 @pytest.mark.parametrize('node', NODES)
-def test_help_lists_usage_and_all_parameters(node):
+def test_help_lists_usage_and_all_parameters(node, helped):
     from importlib import import_module
 
     from hmt_ros.sessions.declared_parameters import declared_parameters
@@ -51,7 +51,16 @@ def test_help_lists_usage_and_all_parameters(node):
     'arguments',
     [('-h',), ('--ros-args', '--help'), ('--ros-args', '-p', 'max_hypotheses:=3', '--', '--help')],
 )
-def test_wherever_it_stands(arguments):
+def test_wherever_it_stands(arguments, helped):
     text = helped('filter_node', *arguments)
     assert '  max_hypotheses (int; ' in text
     assert text == helped('filter_node', '--help')
+
+
+def test_a_process_says_the_same(helped):
+    done = subprocess.run(
+        [sys.executable, '-m', 'hmt_ros.nodes.filter_node', '--ros-args', '--help'],
+        cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout == helped('filter_node', '--help')

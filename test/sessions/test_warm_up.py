@@ -5,8 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import pytest
-
 from hmt_ros.compiled_code import compiled_functions
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
@@ -28,17 +26,16 @@ SESSIONS = [
 ]
 
 
-@pytest.mark.parametrize(('kind', 'parameters'), SESSIONS, ids=lambda x: type(x).__name__)
-def test_preparing_estimates_and_publishes_nothing(kind, parameters, outputs):
-    session = kind(parameters, outputs.append)
-    before = session.state
-    warm_up_tracking.cache_clear()
-    session.prepare()
-    count = compiled_functions().count
-    warm_up_tracking.cache_clear()
-    session.prepare()
-    assert compiled_functions().count == count
-    assert session.state == before
+def test_preparing_estimates_and_publishes_nothing(outputs):
+    sessions = [kind(parameters, outputs.append) for kind, parameters in SESSIONS]
+    before, counts = [session.state for session in sessions], []
+    for _ in range(2):
+        warm_up_tracking.cache_clear()
+        for session in sessions:
+            session.prepare()
+        counts.append(compiled_functions().count)
+    assert counts[0] == counts[1]
+    assert [session.state for session in sessions] == before
     assert outputs == []
 
 

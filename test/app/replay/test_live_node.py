@@ -28,6 +28,7 @@ from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
+from test.app.replay.test_transforms import FRAME, with_transforms
 
 pytestmark = pytest.mark.ros
 
@@ -84,11 +85,17 @@ def both_ways(bag, tmp_path, capsys, *options, person=PERSON):
     return folders, ends
 
 
-def test_same_mixtures_of_every_image(tmp_path, capsys):
+def test_same_of_every_image_without_a_subject(tmp_path, capsys):
+    """Each node in a process of its own.
+
+    What the BME predicts reaches the filter beside the image that it is from. It hears the track,
+    too: the second image comes 0.07 s after the first.
+    """
     bag = write(tmp_path / 'bag', recorded(3))
     # Filter and smoother tell of links on the same topic.
     options = ['--set', 'smoother.publish_tf=true', '--set', 'forecast_rate=50.0']
-    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
+    options += ['--set', 'bme.tracked_interval=0.1']
+    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options, person=PERSON[2:])
     assert one == other
     assert one[0] == 0
     assert len(messages(offline, '/tf')) == 6
@@ -97,6 +104,9 @@ def test_same_mixtures_of_every_image(tmp_path, capsys):
         # Windows are smoothed ten times a second.
         assert len(messages(offline, topic)) == (2 if topic == 'trajectory_mixture' else 3)
         assert messages(offline, topic) == messages(live, topic)
+    with BagReader(offline) as bag_out:
+        found = [len(x.message.components) > 0 for x in bag_out.messages(['pose_prediction'])]
+    assert found == [True, False, True]
     # What a robot acts on, too.
     assert len(messages(offline, 'keep_out')) == 3
     assert len(messages(offline, 'pose_forecast')) > 3
@@ -105,38 +115,9 @@ def test_same_mixtures_of_every_image(tmp_path, capsys):
 
 
 @pytest.mark.usefixtures('in_one_process')
-def test_same_in_one_process(tmp_path, capsys):
-    bag = write(tmp_path / 'bag', recorded(3))
-    options = ['--set', 'forecast_rate=50.0', '--bme', '']
-    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
-    assert one == other
-    assert one[0] == 0
-    assert len(messages(live, 'pose_prediction')) == 3
-    assert len(messages(live, 'smoothed_pose_mixture')) == 3
-    assert content(offline) == content(live)
-
-
-def test_same_without_a_subject(tmp_path, capsys):
-    """What the BME predicts reaches the filter beside the image that it is from.
-
-    It hears the track, too: the second image comes 0.07 s after the first.
-    """
-    bag = write(tmp_path / 'bag', recorded(3))
-    options = ['--set', 'bme.tracked_interval=0.1']
-    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options, person=PERSON[2:])
-    assert one == other
-    assert one[0] == 0
-    for topic in ('pose_prediction', 'pose_mixture'):
-        assert len(messages(offline, topic)) == 3
-    with BagReader(offline) as bag_out:
-        found = [len(x.message.components) > 0 for x in bag_out.messages(['pose_prediction'])]
-    assert found == [True, False, True]
-    assert content(offline) == content(live)
-
-
-@pytest.mark.usefixtures('in_one_process')
 def test_same_predictions_from_keypoints_and_silhouettes(tmp_path, capsys):
-    entries = recorded(2)
+    """The subject is given, gravity is from transforms, and the nodes share a process."""
+    entries = with_transforms(recorded(3))
     stamp = next(time for topic, time, _ in entries if topic == 'image/compressed')
     seen = MESSAGES.create(
         'hmt_msgs/msg/Keypoints2D',
@@ -149,10 +130,14 @@ def test_same_predictions_from_keypoints_and_silhouettes(tmp_path, capsys):
         tmp_path / 'bag', sorted([*entries, ('keypoints', stamp, seen)], key=lambda x: x[1])
     )
     options = ['--bme', '--set', 'bme.predict_from=both', '--set', 'use_keypoints=false']
+    options += ['--set', 'forecast_rate=50.0', *FRAME, '--with-images']
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
     assert one[0] == 0
-    assert len(messages(offline, 'pose_prediction')) == 2
+    for topic in ('pose_prediction', 'pose_mixture', 'smoothed_pose_mixture'):
+        assert len(messages(live, topic)) == 3
+    assert len(messages(live, 'pose_forecast')) > 3
+    assert messages(live, '/tf_static') == messages(bag, '/tf_static') != []
     assert content(offline) == content(live)
 
 
@@ -191,6 +176,7 @@ def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
     assert content(offline) == content(live)
 
 
+@pytest.mark.usefixtures('in_one_process')
 def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
     """Keypoints and masks that come late, an image of another size, a time that jumps."""
     entries = []
@@ -242,13 +228,14 @@ def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
     assert content(offline) == content(live)
 
 
+@pytest.mark.usefixtures('in_one_process')
 def test_bad_input_ends_both_in_the_same_way(tmp_path, capsys):
     entries = recorded(2)
     entries[3] = (*entries[3][:2], entries[3][2])
     broken = next(m for topic, _, m in entries if topic == 'image/compressed')
     broken.data = broken.data[:100]
     bag = write(tmp_path / 'bag', entries)
-    folders, (one, other) = both_ways(bag, tmp_path, capsys)
+    folders, (one, other) = both_ways(bag, tmp_path, capsys, '--no-smoother')
     assert one == other
     assert one[0] == 1
     assert 'breaks off or is damaged' in one[2]

@@ -11,7 +11,7 @@ from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.ground import ground_of
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.states import transforms_message
-from test.app.replay.test_command import PERSON, content, read, recorded, write
+from test.app.replay.test_command import PERSON, read, recorded, write
 
 VIEW = Viewpoint(distance=4.0, height=1.25, pitch=0.15)
 FRAME = ['--set', 'gravity_frame=world', '--set', 'floor_in_gravity_frame=true']
@@ -205,14 +205,6 @@ def test_bad_settings(moving, tmp_path, capsys, settings, line):
     assert main(arguments) == 1
     assert line in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.ros
-def test_live_nodes_give_the_same_bytes(replayed, moving, tmp_path):
-    out = tmp_path / 'out'
-    arguments = [str(moving), '-o', str(out), *PERSON, *SMALL, *FRAME, '--with-images']
-    assert main([*arguments, '--no-smoother', '--quiet', '--live']) == 0
-    assert content(out) == content(replayed)
 
 
 def test_fixed_frame_of_a_camera_that_stands_still(replayed, moving, tmp_path):

@@ -74,11 +74,11 @@ def chunks(path: Path) -> list[tuple[int, int, int]]:
 
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory: pytest.TempPathFactory, messages: RosbagsMessages) -> Path:
-    """A bag of 25 messages, in nine chunks that do not overlap in time."""
+    """A bag of 16 messages, in six chunks that do not overlap in time."""
     path = tmp_path_factory.mktemp('bags') / 'whole'
     rng = np.random.default_rng(4)
     with BagWriter(path) as bag:
-        for i in range(25):
+        for i in range(16):
             text = rng.bytes(220_000).hex()
             bag.write('text', 1000 + i, messages.create(STRING, data=text))
     return path / 'whole.mcap'
