@@ -12,8 +12,8 @@ through their block Cholesky factors, S_i^-1 = L_i L_i'. The expectation is over
     X = M_i + s_i L_i'^-1 z
 
 with the same antithetic noise z throughout, so that the sampled F is a smooth function with exact
-gradients and its descent is repeatable; F is also reported on fresh samples, with a standard
-error. Variables are scaled by the curvature that F would have if the posterior were q:
+gradients and its descent is repeatable; the F that is reported comes from fresh samples, with a
+standard error. Variables are scaled by the curvature that F would have if the posterior were q:
 means by L_i sqrt(a_i), log s_i by sqrt(2 D a_i).
 """
 
