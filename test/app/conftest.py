@@ -15,7 +15,7 @@ from hmt_ros.inference import GaussianMixture
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.camera_info import camera_info_message
-from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.images import compressed_image_message, encode_jpeg, jpeg_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
 
@@ -117,9 +117,9 @@ def write_images(path, stamps=STAMPS, picture=None):
         camera = CAMERA if picture.shape[1] == CAMERA.width else large
         message = camera_info_message(MESSAGES, camera, stamps[0], FRAME_ID)
         bag.write('camera_info', stamps[0], message)
+        jpeg = encode_jpeg(picture)
         for stamp in stamps:
-            message = compressed_image_message(MESSAGES, picture, stamp, FRAME_ID)
-            bag.write('image/compressed', stamp, message)
+            bag.write('image/compressed', stamp, jpeg_message(MESSAGES, jpeg, stamp, FRAME_ID))
     return path
 
 
@@ -143,6 +143,12 @@ def make(out, folder, *options):
     """The report's page, as text."""
     assert report.main([str(out), '-o', str(folder), '--quiet', *map(str, options)]) == 0
     return (folder / 'report.html').read_text('utf-8')
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Reports are pages alone, for tests of what no picture shows otherwise than others do."""
+    monkeypatch.setattr(report, 'draw_pictures', lambda *_: [])
 
 
 def data_of(page):
