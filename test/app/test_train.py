@@ -41,7 +41,7 @@ def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_procedural_motions_give_a_model_and_figures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     output = tmp_path / 'model.npz'
     arguments = ['--motions', 'reach', '--model', 'local', '--samples', '120', '--seed', '3']
@@ -57,6 +57,8 @@ def test_procedural_motions_give_a_model_and_figures(
     for name in figures:
         assert (tmp_path / 'model_report' / name).read_bytes()[:4] == b'\x89PNG'
     assert '2 motions, ' in capsys.readouterr().out
+    # The same again, without the figures.
+    monkeypatch.setattr(train, 'write_report', lambda *_: [])
     again = tmp_path / 'again.npz'
     assert train.main([*arguments, '-o', str(again), '--quiet']) == 0
     assert again.read_bytes() == output.read_bytes()
