@@ -72,7 +72,8 @@ def test_people_give_the_spreads_of_the_yaml_file(tmp_path, capsys):
         (['one.bvh', '--body', 'flat.yaml'], 'no spreads of stature and proportions'),
     ],
 )
-def test_bad_input_is_one_line(arguments, message, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_one_line(arguments, message, tmp_path, read_here, monkeypatch, capsys):
+    read_here()
     monkeypatch.chdir(tmp_path)
     write_figure(Path('one.bvh'), 1.0)
     Path('table.csv').write_text('file\none.bvh\n')

@@ -61,7 +61,7 @@ def write_motion(path: Path, times: int, fps: float, seed: int) -> Path:
     return path
 
 
-def test_motions_give_a_motion_prior(tmp_path, capsys):
+def test_motions_give_a_motion_prior(tmp_path, read_here, capsys):
     folder = tmp_path / 'motions'
     folder.mkdir()
     write_motion(folder / 'sway.bvh', 150, 30.0, 0)
@@ -78,6 +78,8 @@ def test_motions_give_a_motion_prior(tmp_path, capsys):
     assert learned.body == 'human37'
     assert learned.card.startswith('From nobody.\nLearned from 2 motions, 7 s: ')
     assert learned.dynamics.dimension == 37
+    # The same in one process.
+    read_here()
     again = tmp_path / 'again.npz'
     assert learn_motion.main([*arguments, '-o', str(again), '--quiet']) == 0
     assert again.read_bytes() == output.read_bytes()
@@ -95,7 +97,8 @@ def test_motions_give_a_motion_prior(tmp_path, capsys):
         (['short.bvh', '-o', 'nowhere/file.npz'], 'there is no folder nowhere'),
     ],
 )
-def test_bad_input_is_one_line(arguments, message, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_one_line(arguments, message, tmp_path, read_here, monkeypatch, capsys):
+    read_here()
     monkeypatch.chdir(tmp_path)
     Path('empty').mkdir()
     Path('there.npz').touch()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +35,13 @@ def short_motions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train, 'PROCEDURAL_SEEDS', 2)
 
 
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, 'write_report', lambda *_: [])
+
+
 def test_procedural_motions_give_a_model_and_figures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     output = tmp_path / 'model.npz'
     arguments = ['--motions', 'reach', '--model', 'local', '--samples', '120', '--seed', '3']
@@ -51,6 +57,8 @@ def test_procedural_motions_give_a_model_and_figures(
     for name in figures:
         assert (tmp_path / 'model_report' / name).read_bytes()[:4] == b'\x89PNG'
     assert '2 motions, ' in capsys.readouterr().out
+    # The same again, without the figures.
+    monkeypatch.setattr(train, 'write_report', lambda *_: [])
     again = tmp_path / 'again.npz'
     assert train.main([*arguments, '-o', str(again), '--quiet']) == 0
     assert again.read_bytes() == output.read_bytes()
@@ -105,6 +113,7 @@ def test_marks_that_are_damaged_are_told(tmp_path: Path) -> None:
             mark.begin((4, 2), rng)
 
 
+@pytest.mark.usefixtures('no_figures')
 @pytest.mark.parametrize('model', ['nearest', 'joint'])
 def test_models_by_name(model: str, tmp_path: Path) -> None:
     output = tmp_path / 'model.npz'
@@ -115,9 +124,15 @@ def test_models_by_name(model: str, tmp_path: Path) -> None:
     assert predictor.notes['model'] == model
 
 
+@pytest.mark.usefixtures('no_figures')
 def test_broken_motions_are_skipped_and_counted(
-    mocap_walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    mocap_walk: Path,
+    tmp_path: Path,
+    read_here: Callable[[], None],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(train, 'TESTED', 100)
     folder = tmp_path / 'motions'
     (folder / 'deeper').mkdir(parents=True)
     (folder / 'deeper' / 'fine_walk.bvh').write_bytes(mocap_walk.read_bytes())
@@ -132,6 +147,7 @@ def test_broken_motions_are_skipped_and_counted(
     assert sorted(x.split()[2] for x in warnings) == ['alone.amc:', 'broken.bvh:', 'unknown.bvh:']
     assert '1 motions, 3 skipped' in captured.out
     assert 'Learned from 1 motions' in PosePredictor.load(output).notes['card']
+    read_here()
     # People are left out by their names, and others are what it is scored on.
     more = ['--without', 'broke*', '--test', str(folder / 'deeper'), '--overwrite']
     assert train.main([*arguments, *more]) == 0
@@ -160,7 +176,10 @@ def _fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return error[-1]
 
 
-def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(
+    tmp_path: Path, read_here: Callable[[], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    read_here()
     output = str(tmp_path / 'm.npz')
     empty = tmp_path / 'empty'
     empty.mkdir()

@@ -135,10 +135,15 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
         cost = term.energy(frames, np.zeros(len(poses), dtype=np.intp)).value
         return cost, np.arctan2(-axis[2], -axis[1])
 
-    angles = np.radians(np.linspace(-90, 30, 481))
-    grid = np.stack(np.meshgrid(angles, angles if bends else [0.0]), axis=-1).reshape(-1, 2)
-    cost, lean = leaning(*grid.T)
-    best = int(np.argmin(cost))
+    # Two degrees apart over all leans, then ever closer around the best.
+    centre, width = np.radians([-30.0, -30.0 if bends else 0.0]), np.radians(60.0)
+    for _ in range(3):
+        offsets = np.linspace(-width, width, 61)
+        steps = np.stack(np.meshgrid(offsets, offsets if bends else [0.0]), axis=-1)
+        grid = centre + steps.reshape(-1, 2)
+        cost, lean = leaning(*grid.T)
+        best = int(np.argmin(cost))
+        centre, width = grid[best], width / 12.0
     assert cost[best] == pytest.approx(0.0, abs=1e-4)
     assert lean[best] == pytest.approx(TRUNK_LEAN, abs=2e-3)
     small, turned = leaning(grid[best, 0] + np.array([-0.01, -np.pi / 3]), grid[best, 1])[0]

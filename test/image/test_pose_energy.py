@@ -184,7 +184,8 @@ def test_energies_over_some_variables(terms, poses, body, motion):
     expected = motion_of(poses, motion, len(free))
     own = PoseEnergy(likelihood, some, expected, poses[0], free)
     reference = plain(likelihood, some, expected, poses[0], free)
-    x, rows = poses[:, free], np.arange(COUNT)
+    # In the order in which the tracker gives them, which the compiled code is made for.
+    x, rows = np.ascontiguousarray(poses[:, free]), np.arange(COUNT)
     check_same(own.energy(x, rows), reference.energy(x, rows))
     found = own.minimise(x, max_iterations=6, **SOLVER)
     wanted = minimise(
@@ -252,7 +253,7 @@ def test_a_pose_that_has_no_energy_is_left_where_it_is(terms, poses):
     likelihood, some = terms['image']
     centres = poses.copy()
     centres[1] = np.inf
-    motion = Quadratic(centres, np.broadcast_to(np.eye(37), (COUNT, 37, 37)))
+    motion = Quadratic(centres, np.tile(np.eye(37), (COUNT, 1, 1)))
     found = PoseEnergy(likelihood, some, motion).minimise(poses, max_iterations=3, **SOLVER)
     assert np.array_equal(found.x[1], poses[1])
     assert not np.isfinite(found.value[1])

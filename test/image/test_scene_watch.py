@@ -1,5 +1,7 @@
 """A camera that was moved is noticed; people and light are not taken for it."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -35,11 +37,17 @@ def seen(room, index, shift=(0.0, 0.0), angle=0.0, light=1.0):
     return np.clip(light * image + noise, 0, 255).astype(np.uint8)
 
 
-def watched(room, count=60, **change):
+@pytest.fixture(scope='module')
+def still(room):
+    """Function (index) -> the image of a camera that stands where it stood, drawn once."""
+    return cache(lambda index: seen(room, index))
+
+
+def watched(room, still, count=60, **change):
     """The watch after a change in the middle, and the image at which it was noticed."""
     watch, background, first = SceneWatch(), BackgroundModel.from_image(room), None
     for index in range(count):
-        image = seen(room, index, **(change if index >= count // 2 else {}))
+        image = seen(room, index, **change) if index >= count // 2 else still(index)
         watch.look(image, background)
         if watch.moved and first is None:
             first = index
@@ -47,39 +55,41 @@ def watched(room, count=60, **change):
 
 
 @pytest.mark.parametrize('light', [1.0, 0.6, 1.3])
-def test_people_and_light_are_no_motion_of_the_camera(room, light):
-    watch, first = watched(room, light=light)
+def test_people_and_light_are_no_motion_of_the_camera(room, still, light):
+    watch, first = watched(room, still, light=light)
     assert first is None
     assert watch.shift == 0.0
 
 
 @pytest.mark.parametrize('shift', [(4.0, 0.0), (-6.0, 8.0), (0.0, 20.0), (36.0, 0.0)])
-def test_a_bump_is_noticed_and_measured(room, shift):
-    watch, first = watched(room, shift=shift)
+def test_a_bump_is_noticed_and_measured(room, still, shift):
+    watch, first = watched(room, still, shift=shift)
     assert watch.moved
     assert 30 <= first <= 50
     assert np.isclose(watch.shift, np.hypot(*shift), atol=2.0)
 
 
 @pytest.mark.parametrize('change', [{'angle': 20.0}, {'shift': (200.0, 90.0)}])
-def test_another_view_is_noticed(room, change):
-    watch, first = watched(room, **change)
+def test_another_view_is_noticed(room, still, change):
+    watch, first = watched(room, still, **change)
     assert watch.moved
     assert first >= 30
 
 
-def test_one_bad_image_is_no_motion(room):
+def test_one_bad_image_is_no_motion(room, still):
     watch, background = SceneWatch(), BackgroundModel.from_image(room)
     for index in range(60):
-        watch.look(seen(room, index, shift=(12.0 * (index == 30), 0.0)), background)
+        image = seen(room, index, shift=(12.0, 0.0)) if index == 30 else still(index)
+        watch.look(image, background)
         assert not watch.moved
 
 
-def test_a_camera_that_comes_back(room):
+def test_a_camera_that_comes_back(room, still):
     watch, background = SceneWatch(), BackgroundModel.from_image(room)
     moved = []
     for index in range(70):
-        watch.look(seen(room, index, shift=(12.0 * (20 <= index < 45), 0.0)), background)
+        away = 20 <= index < 45
+        watch.look(seen(room, index, shift=(12.0, 0.0)) if away else still(index), background)
         moved.append(watch.moved)
     assert moved[40]
     assert not moved[69]

@@ -178,7 +178,7 @@ def test_bad_input_leaves_the_window_as_it_was(modes, walk):
     ('interval', 'age'), [(0.1, 0.7), (0.2, 0.6), (0.25, 0.5), (0.5, 0.5), (0.9, 0.9)]
 )
 def test_poses_are_final_before_they_are_older_than_the_lag(modes, interval, age):
-    window = SlidingWindow(MixtureSmoother(FAST), fixed_lag=0.7)
+    window = SlidingWindow(MixtureSmoother(FAST, max_trajectories=4), fixed_lag=0.7)
     step = round(interval * 1e9)
     found = set()
     final = []
@@ -195,7 +195,8 @@ def test_poses_are_final_before_they_are_older_than_the_lag(modes, interval, age
 
 
 def test_stamps_that_tremble_do_not_change_the_lag(modes):
-    window, rng = SlidingWindow(MixtureSmoother(FAST), fixed_lag=0.3), np.random.default_rng(0)
+    window = SlidingWindow(MixtureSmoother(FAST, max_trajectories=4), fixed_lag=0.3)
+    rng = np.random.default_rng(0)
     for t, mixture in enumerate(modes(2.0, times=12)):
         update = window.step(t * 10**8 + int(rng.integers(-3 * 10**6, 3 * 10**6)), mixture)
         assert len(update.final) == (t >= 3)
@@ -226,7 +227,8 @@ def test_neighbours_are_smoothed_together(modes):
     stamps = [round(33_333_333.3 * t) for t in range(len(mixtures))]
 
     def final(every):
-        window = SlidingWindow(MixtureSmoother(FAST), fixed_lag=0.3, every=every)
+        smoother = MixtureSmoother(FAST, max_trajectories=8)
+        window = SlidingWindow(smoother, fixed_lag=0.3, every=every)
         updates = [window.step(at, one) for at, one in zip(stamps, mixtures, strict=True)]
         poses = [(t, pose) for t, update in enumerate(updates) for pose in update.final]
         smoothed = sum(update.trajectories is not None for update in updates)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,11 +18,12 @@ from benchmarks.exact_smoothing import (
     modes,
     particle_marginals,
 )
+from benchmarks.machine import best_time
 from benchmarks.smoothing_peers import gtsam_missing, gtsam_trajectory, scipy_trajectory
 from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
-from hmt_ros.smoothing import LinearGaussianDynamics
+from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
 from hmt_ros.smoothing.trajectory_refinement import refine
 
 WALK = LinearGaussianDynamics.random_walk([1.0])
@@ -65,8 +67,13 @@ def test_the_waving_person_has_eight_modes_that_merge_at_times():
     assert ((sequence.truth >= sequence.lower) & (sequence.truth <= sequence.upper)).all()
 
 
-def test_longer_windows_are_better_conditioned():
-    found = smoothing.relations(5)
+@pytest.fixture(scope='module')
+def related():
+    return smoothing.relations(5)
+
+
+def test_longer_windows_are_better_conditioned(related):
+    found = related
     ratios = list(found['eigenvalue_ratio'].values())
     assert ratios == sorted(ratios, reverse=True)
     assert found['free_energy_fall'] > 0.1
@@ -74,7 +81,11 @@ def test_longer_windows_are_better_conditioned():
     assert found['roughness_ratio'] < 1
 
 
-def test_report(monkeypatch, capsys):
+def test_report(related, monkeypatch, capsys):
+    monkeypatch.setattr(smoothing, 'relations', lambda times: related)
+    monkeypatch.setattr(smoothing, 'best_time', partial(best_time, least=1))
+    few = partial(MixtureSmoother, max_trajectories=8)
+    monkeypatch.setattr(smoothing, 'MixtureSmoother', few)
     monkeypatch.setattr(smoothing, 'peak_memory_apart', lambda work, times: 1e8)
     monkeypatch.setattr(smoothing, 'clips', lambda quick: 'skipped: not here')
     assert smoothing.main(['--quick', '--json']) == 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -27,7 +29,7 @@ def followed(film, human32, camera, keypoints_of):
     """Function (with keypoints, sure) -> tracker and posteriors of a track that is told wrongly.
 
     The prediction of the first image faces the other way than the person; if the start is sure,
-    it is all that the track starts from, else its reversal is among its modes.
+    it is all that the track starts from, else its reversal is among its modes. Each is made once.
     """
     poses, images, empty = film
     wrong = PosePrediction(
@@ -50,7 +52,7 @@ def followed(film, human32, camera, keypoints_of):
             )
         return tracker, posteriors
 
-    return run
+    return cache(run)
 
 
 def test_directions_to_the_left(human32, motion):
@@ -122,6 +124,6 @@ def test_a_track_that_was_sure_of_the_wrong_way_turns_about(film, followed, huma
 
 
 def test_the_same_bytes_twice(followed):
-    a, b = (followed(keypoints=True, sure=True)[1] for _ in range(2))
+    a, b = (run(keypoints=True, sure=True)[1] for run in (followed, followed.__wrapped__))
     for name in ('weights', 'means', 'covariances'):
         assert [getattr(x, name).tobytes() for x in a] == [getattr(x, name).tobytes() for x in b]

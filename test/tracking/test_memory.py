@@ -10,13 +10,15 @@ import numpy as np
 from hmt_ros.body import Camera, load_body
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.tracking import Status, Subject, Tracker
+from hmt_ros.tracking import Status, Subject, Tracker, TrackerSettings
 
 START = 10**9
 SMALL = Camera(110.0, 110.0, 59.5, 44.5, 120, 90)
-# Bytes that a track may gain from the first number of images to the last: less than ten of its
+# A small search: what is kept of an image does not depend on it.
+SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, searched_chains=1, combinations=32)
+# Bytes that a track may gain from the first number of images to the last: less than seven of its
 # images take.
-FIRST, LAST, BOUND = 80, 200, 300_000
+FIRST, LAST, BOUND = 80, 160, 200_000
 
 
 def test_a_track_does_not_grow(filmed):
@@ -25,7 +27,7 @@ def test_a_track_does_not_grow(filmed):
     pixels = SMALL.project(body.joint_positions(poses[:1]))[0]
     n = len(pixels)
     seen = Keypoints(body.joint_names, pixels, np.tile(np.eye(2), (n, 1, 1)), np.ones(n))
-    tracker = Tracker(body, SMALL, background=BackgroundModel.from_image(empty))
+    tracker = Tracker(body, SMALL, SETTINGS, BackgroundModel.from_image(empty))
     tracker.reset(Subject(START, seen, dict(body.segment_lengths)))
     taken, turn = {}, len(poses) - 1
     tracemalloc.start()

@@ -16,6 +16,8 @@ from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 from test.app.conftest import FRAMES, STAMPS, data_of, make, write_out
 from test.app.report.test_command import UP, with_ground
 
+pytestmark = pytest.mark.usefixtures('no_pictures')
+
 GROUND = GroundState(STAMPS[0], FRAME_ID, UP, height=1.5)
 
 

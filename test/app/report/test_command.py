@@ -19,7 +19,7 @@ from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.ground import GroundState, ground_message
-from msg_tools.messages.headers import time_ns
+from msg_tools.messages.headers import time_message, time_ns
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
@@ -76,6 +76,7 @@ def with_beliefs(message):
     return message
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_beliefs_are_those_of_the_bag(data, body, poses, tmp_path):
     assert [(layer['existence'], layer['cues']) for layer in data['layers']] == [(None, {})] * 2
     out = write_out(tmp_path / 'out', body, poses, change=with_beliefs)
@@ -181,12 +182,14 @@ def test_the_page_needs_nothing_else(page):
     assert page.isascii()
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_the_same_bag_gives_the_same_page(made, page, tmp_path):
     assert page == make(
         made.out, tmp_path / 'again', '--images', made.images, '--truth', made.truth
     )
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_ground_truth_of_the_bag_is_used(body, poses, data, tmp_path):
     found = data_of(make(write_out(tmp_path / 'out', body, poses), tmp_path / 'report'))
     assert found['truth']['source'].endswith('(/ground_truth)')
@@ -206,6 +209,7 @@ def test_without_images_and_truth(made, tmp_path):
     assert names == {'report.html', 'side_views.png', 'weights.png', 'free_energy.png'}
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_images_that_the_bag_has_itself(body, poses, made, tmp_path):
     out = tmp_path / 'out'
     with BagWriter(out) as bag, BagReader(made.images) as images, BagReader(made.out) as mixtures:
@@ -240,6 +244,7 @@ def test_chosen_topics_and_fewer_times(made, tmp_path):
     assert found['notes'] == [f'4 of {FRAMES} times are shown']
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_bag_in_a_namespace(body, poses, tmp_path):
     """The topics of a person are found in the person's namespace; a relative name is enough."""
     place = '/humans/bodies/anna'
@@ -296,6 +301,7 @@ def test_mixtures_without_covariances_and_missing_frames(body, poses, tmp_path):
     assert np.allclose(found['times'], [0.0, 0.2])
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_text_from_outside_stays_text(body, poses, made, tmp_path):
     def change(message):
         message.joint_names = ['</script><b>' if n == 'head' else n for n in message.joint_names]
@@ -328,15 +334,17 @@ def test_images_get_smaller_until_they_fit(each, tmp_path):
     assert (len(strip.jpegs) == FRAMES) == (each > 1_500)
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_two_hundred_frames_stay_under_20_mb(body, poses, tmp_path):
     # The longer it lasts, the larger images may be: here the whole page is what bounds them.
     stamps = [START_NS + i * 200_000_000 for i in range(200)]
     rng = np.random.default_rng(0)
     with BagWriter(tmp_path / 'out') as bag:
         mixture = mixture_of(body, poses[0], 16, rng)
+        message = pose_message(body, mixture, START_NS, MixtureKind.POSTERIOR)
         for stamp in stamps:
+            message.header.stamp = time_message(MESSAGES, stamp)
             for topic in ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture'):
-                message = pose_message(body, mixture, stamp, MixtureKind.POSTERIOR)
                 bag.write(topic, stamp, message)
     # Nothing compresses worse than noise: 0.2 MB an image.
     images = write_images(tmp_path / 'in', stamps, noise(640, 480))
@@ -351,6 +359,7 @@ def test_two_hundred_frames_stay_under_20_mb(body, poses, tmp_path):
     assert told < data_size(mixtures) < 1.2 * told
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_five_seconds_stay_under_6_mb(body, poses, tmp_path):
     stamps = [START_NS + i * 33_333_333 for i in range(150)]
     rng = np.random.default_rng(0)
@@ -361,14 +370,17 @@ def test_five_seconds_stay_under_6_mb(body, poses, tmp_path):
             ('likelihood_mixture', MixtureKind.LIKELIHOOD, 7),
         ):
             mixture = mixture_of(body, poses[0], modes, rng)
+            message = pose_message(body, mixture, START_NS, kind)
             for stamp in stamps:
-                bag.write(topic, stamp, pose_message(body, mixture, stamp, kind))
+                message.header.stamp = time_message(MESSAGES, stamp)
+                bag.write(topic, stamp, message)
     images = write_images(tmp_path / 'in', stamps, noise(640, 480))
     page = make(tmp_path / 'out', tmp_path / 'report', '--images', images)
     assert None not in data_of(page)['images']['jpegs']
     assert len(page) < 6_000_000
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_times_are_left_out_where_the_data_get_too_large(made, tmp_path, monkeypatch):
     size = data_size(read_mixtures(made.out))
     monkeypatch.setattr(report, 'DATA_BYTES', size // 2)
@@ -446,6 +458,7 @@ def test_images_that_do_not_fit(made, tmp_path, capsys):
     assert str(cut) in fails(tmp_path, capsys, made.out, '--images', cut)
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_only_reports_are_replaced(made, page, tmp_path, capsys):
     folder = tmp_path / 'report'
     folder.mkdir()
@@ -508,6 +521,7 @@ def with_ground(path, body, poses, *, frame=FRAME_ID, height=1.5, topics=('groun
     return path / 'b'
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_floor_is_that_of_the_bag(body, poses, tmp_path):
     bag = with_ground(tmp_path, body, poses)
     ground = data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground']
@@ -515,6 +529,7 @@ def test_floor_is_that_of_the_bag(body, poses, tmp_path):
     assert ground['contacts'] == [{}, *[{'left': 0.9, 'right': 0.1}] * (FRAMES - 1)]
 
 
+@pytest.mark.usefixtures('no_pictures')
 @pytest.mark.parametrize(
     'options',
     [{'frame': 'elsewhere'}, {'topics': ('a/ground', 'b/ground')}, {'topics': ()}],
@@ -525,6 +540,7 @@ def test_floor_that_is_not_known(body, poses, tmp_path, options):
     assert data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground'] is None
 
 
+@pytest.mark.usefixtures('no_pictures')
 def test_contacts_without_a_floor(body, poses, tmp_path):
     bag = with_ground(tmp_path, body, poses, height=None)
     ground = data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground']

@@ -13,6 +13,8 @@ from msg_tools.messages.pose_mixtures import pose_mixture_of
 from test.app.conftest import FRAMES, MESSAGES, STAMPS, data_of, make, write_out
 from test.app.report.test_command import integers, positions
 
+pytestmark = pytest.mark.usefixtures('no_pictures')
+
 NAMES = schemes()['mediapipe33'].names
 HIDDEN = 'left_wrist'
 

@@ -233,6 +233,7 @@ def test_pages_with_less_in_them(made, body, poses, tmp_path):
     assert seen['space drawn'] > 1000
 
 
+@pytest.mark.usefixtures('no_pictures')
 @in_a_browser
 def test_beliefs_are_drawn_where_a_topic_has_them(page, body, poses, tmp_path):
     steps = """
@@ -272,6 +273,7 @@ def test_the_address_tells_what_is_shown(page, tmp_path):
     assert given['space'] != plain['space']
 
 
+@pytest.mark.usefixtures('no_pictures')
 @in_a_browser
 def test_floor_and_contacts_are_drawn(body, poses, tmp_path):
     guessed = make(write_out(tmp_path / 'plain', body, poses), tmp_path / 'one', '--times', '3')
@@ -286,6 +288,7 @@ def test_floor_and_contacts_are_drawn(body, poses, tmp_path):
     assert abs(seen[1]['floor'] + (1.5 - 0.6 * 2) / 0.8) < 1e-6
 
 
+@pytest.mark.usefixtures('no_pictures')
 @in_a_browser
 def test_keys_buttons_detector_regions_and_shadow(made, body, poses, tmp_path):
     steps = """
@@ -402,6 +405,7 @@ def with_identities(message):
     return message
 
 
+@pytest.mark.usefixtures('no_pictures')
 @in_a_browser
 def test_filter_and_smoother_are_drawn_side_by_side(page, made, tmp_path):
     steps = """
@@ -426,6 +430,7 @@ def test_filter_and_smoother_are_drawn_side_by_side(page, made, tmp_path):
     assert visit(alone, steps, tmp_path, '#show=0,beside')['hidden'] is True
 
 
+@pytest.mark.usefixtures('no_pictures')
 @in_a_browser
 def test_motions_are_switched_on_and_off(page, body, poses, tmp_path):
     assert visit(page, "seen.hidden = get('motions-figure').hidden;", tmp_path)['hidden'] is True
@@ -456,6 +461,7 @@ def test_motions_are_switched_on_and_off(page, body, poses, tmp_path):
     assert seen['all again'] == seen['all']
 
 
+@pytest.mark.usefixtures('no_pictures')
 @in_a_browser
 def test_a_height_or_an_angle_is_drawn_over_time(page, body, made, tmp_path):
     steps = """
