@@ -233,7 +233,8 @@ import hmt_ros.compiled_code as code; print(code.folder_of(Path("hmt_ros").resol
   log=$(mktemp)
   "$venv/bin/python" -m hmt_ros compile --quiet >"$log" 2>&1 9<&- &
   compiling=$!
-  stage_build
+  # The kernels take longer.
+  niceness=10 stage_build
   saying_how_long 'compiling kernels' wait "$compiling" ||
     fail "the kernels could not be compiled:"$'\n'"$(cat "$log")"
   rm "$log"
@@ -253,7 +254,8 @@ colcon_build() {
   output=$(
     export HMT_ROS_KERNELS=later # Commands here run the sources.
     export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv
-    colcon --log-base "$(dirname "$build_base")/log" build --build-base "$build_base" "$@" \
+    nice -n "${niceness:-0}" \
+      colcon --log-base "$(dirname "$build_base")/log" build --build-base "$build_base" "$@" \
       --event-handlers console_cohesion+ console_start_end- console_stderr- status- \
       desktop_notification- --cmake-args "${cmake_args[@]}" 2>&1
   ) || fail "colcon build failed:"$'\n'"$output"
