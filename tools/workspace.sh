@@ -36,11 +36,13 @@ fail() {
   exit $explained
 }
 
-# Runs a command and says every few seconds for how long, as nobody waits long before a silent screen.
+# Runs a command and says what it is, and every few seconds for how long: nobody waits long before a
+# silent screen.
 ticker=''
 saying_how_long() {
   local what=$1 start=$SECONDS
   shift
+  say "$what"
   (
     trap 'kill "$pause"; exit' TERM
     while true; do
@@ -165,7 +167,7 @@ stage_ros() {
   touch "$unfinished"
   unpack_python_headers
   saying_how_long 'installing ROS 2' install -r requirements/ros.txt -r requirements/runtime.txt
-  repair_exported_include_paths
+  saying_how_long 'preparing ROS 2' repair_exported_include_paths
   build_tf2_msgs
   mkdir -p "$stamps"
   echo "$key" >"$stamps/ros"
@@ -203,7 +205,6 @@ stage_requirements() {
   local key
   key=$(printf '%s\n' "requirements/$1.txt" | checksum "$(cat "$stamps/ros")")
   done_already "$1" "$key" && return
-  say "installing requirements/$1.txt, once"
   touch "$unfinished"
   saying_how_long "installing requirements/$1.txt" install -r "requirements/$1.txt"
   echo "$key" >"$stamps/$1"
@@ -215,8 +216,7 @@ stage_build() {
   key=$(find package.xml colcon.pkg setup.py setup.cfg resource hmt_ros msg_tools launch rviz foxglove security \
     -type f -not -name '*.pyc' | LC_ALL=C sort | checksum "$(cat "$stamps/ros")")
   done_already build "$key" && [ -f install/setup.bash ] && return
-  say 'building hmt_msgs and hmt_ros with colcon'
-  saying_how_long 'building' colcon_build build --base-paths . msg_tools/hmt_msgs
+  saying_how_long 'building hmt_msgs and hmt_ros' colcon_build build --base-paths . msg_tools/hmt_msgs
   echo "$key" >"$stamps/build"
 }
 
