@@ -36,6 +36,7 @@ detector:
 demo:
 	@$(WORKSPACE) ros kernels
 	@rm -rf build/demo && mkdir -p build/demo
+	@echo 'starting the demonstration'
 	@$(SOURCED) python -m hmt_ros.app.demo $(DEMO_BAG) -o build/demo --live
 
 test:
