@@ -26,7 +26,6 @@ blender() { env -u PYTHONPATH "$made/blender/bin/python" "$@"; }
 set +u
 source tools/environment.bash
 set -u
-export PYTHONPATH=$PWD:${PYTHONPATH:-}
 python tools/demonstration/move.py "$body" "$1" "$2" "$3" "$made/motion.npz"
 rm -f "$made"/images/*.png
 blender tools/demonstration/render.py "$body" "$made/motion.npz" "$made/images"

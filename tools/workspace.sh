@@ -9,7 +9,7 @@
 #     lint     ruff, mypy, pre-commit
 #     detector MediaPipe Pose
 #     build    both packages, in build/ and install/
-#     kernels  build and, beside it, what numba compiles
+#     kernels  both packages and, at the same time, the kernels that numba compiles
 #
 # A checksum of its inputs identifies a completed stage, which is skipped. A stage that was
 # interrupted or whose inputs have changed runs again.
@@ -220,7 +220,7 @@ stage_build() {
   echo "$key" >"$stamps/build"
 }
 
-# One core or more builds, one compiles the kernels of the sources, which tools/environment.bash uses.
+# Builds, and compiles the kernels of the sources, which tools/environment.bash uses, at the same time.
 stage_kernels() {
   local key log compiling
   key=$("$venv/bin/python" -c 'from pathlib import Path

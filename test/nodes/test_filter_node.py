@@ -497,11 +497,11 @@ def test_a_track_leaves_lines_in_the_log(running, small_camera, stub_tracker):
 # The executable.
 
 
-def test_ends_cleanly(subject_file, executable):
-    """By the signal of `kill`; the other nodes by that of the interrupt key."""
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_ends_cleanly(number, subject_file, executable):
     file = f'subject_file:={subject_file}'
     node = executable('filter_node', '-p', file, '--params-file', str(CONFIG))
-    lines = node.stop_at('images from /image', signal.SIGTERM)
+    lines = node.stop_at('images from /image', number)
     assert 'images from /image' in lines[-1]
     # Before it listened, it has loaded or compiled what it runs.
     assert 'kernels loaded in' in lines[0] or 'compiling kernels' in lines[0]

@@ -47,7 +47,7 @@ def test_a_node_does_not_outlive_its_owner(monkeypatch, executable):
 
 @pytest.mark.ros
 @pytest.mark.parametrize(
-    ('node', 'chosen'), [('smoother_node', slice(0, 6)), ('bme_node', slice(6, None))]
+    ('node', 'chosen'), [('smoother_node', slice(0, 6)), ('bme_node', slice(5, None))]
 )
 def test_nodes(node, chosen, monkeypatch):
     monkeypatch.setattr(nodes, 'CASES', nodes.CASES[chosen])

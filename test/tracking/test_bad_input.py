@@ -167,6 +167,7 @@ def alterations(film, human32, camera, keypoints_of):
     white, black = (np.full(shape, value, np.uint8) for value in (255, 0))
     return {
         'flash': (1, show(lambda i: white)),
+        'white': (RATE, show(lambda i: white)),
         'covered lens': (RATE, show(lambda i: black)),
         'noise': (RATE, show(lambda i: noise[i])),
         'wall in the colours of the clothes': (RATE, wall),
@@ -209,7 +210,7 @@ def altered(run, alterations):
 
 
 CASES = (
-    'flash', 'covered lens', 'noise', 'wall in the colours of the clothes',
+    'flash', 'white', 'covered lens', 'noise', 'wall in the colours of the clothes',
     'detector sees nobody', 'detector does not answer', 'exchanged sides', 'wrong detector',
     'swapped persons', 'wrong prediction', 'mask from left to right', 'mask from elsewhere',
     'mask of a second before', 'mask without legs', 'depth of another place', 'shifted depth',
@@ -296,7 +297,7 @@ def test_a_wrong_mask_does_not_lead_away_from_keypoints(altered, usual):
     assert np.median(errors[last]) < usual.heaviest[last].mean() + 1.25 * MORE
 
 
-@pytest.mark.parametrize('gap', [0.1, 1.0, 1000.0])
+@pytest.mark.parametrize('gap', [0.1, 1.0, 10.0, 1000.0])
 def test_gaps(run, usual, gap):
     """Of three seeds: a track may take a limb the wrong way."""
     count = BAD + SECOND
