@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 """Slows a robot down near a person, and stops it where nothing is known.
 
     python examples/keep_distance.py --ros-args -r __ns:=/humans/bodies/p1

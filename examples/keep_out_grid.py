@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 """Turns the space to keep out of into a grid of obstacles, such as a costmap of Nav2 takes.
 
     python examples/keep_out_grid.py --ros-args -r __ns:=/humans/bodies/p1

@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 """Draws the height of a joint over time, with its uncertainty, from a bag; needs no ROS.
 
     python examples/plot_joint.py build/demo/reach -o height.png --joint right_wrist

@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 """Tells how probable it is that a hand is above the head.
 
     python examples/raised_hand.py --ros-args -r __ns:=/humans/bodies/p1

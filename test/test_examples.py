@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import runpy
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +19,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hmt_ros.app.replay.one_bag import replay_bag
+from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking.keep_out import keep_out_capsules
@@ -24,7 +28,6 @@ from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message
 from msg_tools.messages.pose_mixtures import (
-    POSE_MIXTURE,
     MixtureKind,
     PoseMixture,
     TrackState,
@@ -45,8 +48,10 @@ def example(name):
 
 def test_the_readme_names_every_example():
     text = (EXAMPLES / 'README.md').read_text('utf-8')
-    programs = [path.name for path in EXAMPLES.iterdir() if path.suffix in ('.py', '.ipynb')]
-    assert len(programs) == 5
+    programs = [
+        path.name for path in EXAMPLES.iterdir() if path.suffix in ('.py', '.cpp', '.ipynb')
+    ]
+    assert len(programs) == 7
     assert all(f'`{name}`' in text for name in programs)
 
 
@@ -78,16 +83,7 @@ def test_a_robot_slows_down_and_stops_where_nothing_is_known():
         (keep_out(KeepOutState.LOST, 9.0, 0.4), 1.0),
         (keep_out(KeepOutState.LOST, 9.0, 0.6), 0.0),
     ):
-        assert scale(with_constants(message)) == pytest.approx(wanted)
-
-
-def with_constants(message):
-    """A message with the constants that one of rclpy has."""
-    names = ('header', 'state', 'unseen', 'starts', 'ends', 'radii')
-    return SimpleNamespace(
-        **{f'STATE_{each.name}': int(each) for each in KeepOutState},
-        **{name: getattr(message, name) for name in names},
-    )
+        assert scale(message) == pytest.approx(wanted)
 
 
 def test_cells_under_capsules_are_occupied():
@@ -116,7 +112,7 @@ def test_cells_under_capsules_are_occupied():
     ],
 )
 def test_everything_is_occupied_where_nothing_is_known(state, unseen, frame, share):
-    message = with_constants(keep_out(state, 1.5, unseen, frame))
+    message = keep_out(state, 1.5, unseen, frame)
     cells = example('keep_out_grid')['occupancy'](message)
     assert set(np.unique(cells)) <= {0, 100}
     assert np.mean(cells == 100) == pytest.approx(share, abs=1e-3)
@@ -141,7 +137,7 @@ def test_the_person_of_a_bag_stands_on_occupied_cells():
             turn.apply(capsules.starts) + across, turn.apply(capsules.ends) + across,
             capsules.radii, unseen=0.0,
         )  # fmt: skip
-        message = with_constants(keep_out_message(MESSAGES, content))
+        message = keep_out_message(MESSAGES, content)
         cells = example('keep_out_grid')['occupancy'](message)
         columns, rows = np.floor((turn.apply(true) + across)[:, :2].T / 0.05).astype(int) + 100
         assert (cells[rows, columns] == 100).all()
@@ -174,6 +170,85 @@ def test_a_raised_hand_is_as_probable_as_its_modes():
     nobody = mixture(0.5, 0.5)
     nobody.state = 3
     assert math.isnan(told(nobody))
+
+
+def hands(state, *deviations):
+    """A mode without hands nearby, and modes whose hand is deviations of 0.1 m beyond 0.8 m."""
+    along, across = np.array([0.6, 0.0, -0.8]), np.array([0.8, 0.0, 0.6])
+    covariance = 0.01 * np.outer(along, along) + np.outer(across, across)
+    modes = []
+    for distance in (5.0, *(0.8 + 0.1 * np.array(deviations))):
+        place = SimpleNamespace(**dict(zip('xyz', distance * along, strict=True)))
+        modes.append(
+            SimpleNamespace(
+                weight=0.25 if modes else 1.0 - 0.25 * len(deviations),
+                joint_positions=[place, SimpleNamespace(x=9.0, y=0.0, z=0.0), place],
+                joint_covariances=[*np.eye(3).ravel(), *np.eye(3).ravel(), *covariance.ravel()],
+            )
+        )
+    return SimpleNamespace(
+        state=int(state),
+        joint_names=['right_elbow', 'left_wrist', 'right_hand'],
+        components=modes,
+        **{f'STATE_{each.name}': int(each) for each in TrackState},
+    )
+
+
+def test_an_arm_stops_while_a_hand_may_be_near():
+    told = example('stop_near_hand')
+    near, must_stop = told['hand_near'], told['must_stop']
+    # The elbow does not count.
+    assert near(hands(TrackState.TRACKING, 0.0)) == pytest.approx(0.25 * 0.5, abs=1e-9)
+    assert near(hands(TrackState.TRACKING, 1.0, -1.0)) == pytest.approx(0.25, abs=1e-9)
+    assert near(hands(TrackState.TRACKING, 0.0), 0.9) == pytest.approx(0.25 * 0.8413, abs=1e-4)
+    # 0.25 of 19 % is less than 5 %, and 0.25 of 21 % more.
+    assert not must_stop(hands(TrackState.TRACKING, 0.8779))
+    assert must_stop(hands(TrackState.TRACKING, 0.8064))
+    assert must_stop(hands(TrackState.TRACKING, math.nan))
+    for state in TrackState:
+        wanted = state not in (TrackState.TRACKING, TrackState.NOBODY)
+        assert must_stop(hands(state, 9.0)) == wanted
+
+
+@pytest.fixture(scope='module')
+def demonstration(tmp_path_factory):
+    """The bag of the demonstration, tracked."""
+    source, target = ROOT / 'bags' / 'living_room', tmp_path_factory.mktemp('demo') / 'tracked'
+    options = ReplayOptions(
+        subject=source / 'subject.yaml',
+        background=source / 'background.png',
+        with_smoother=False,
+        quiet=True,
+    )
+    replay_bag(source, target, options, tell=print)
+    return target
+
+
+def test_examples_tell_what_the_demonstration_shows(demonstration):
+    """Of somebody 3 m away who raises the hands at the end."""
+    with BagReader(demonstration) as bag:
+        mixtures = [x.message for x in bag.messages(['pose_mixture'])]
+        spaces = [x.message for x in bag.messages(['keep_out'])]
+    with np.load(ROOT / 'bags' / 'living_room' / 'truth.npz') as truth:
+        names, joints = list(truth['joint_names']), truth['joints']
+    hands = joints[:, [names.index(x) for x in ('left_wrist', 'right_wrist')]]
+    assert len(mixtures) == len(spaces) == len(joints) == 75
+    raised = example('raised_hand')['raised_hand']
+    above = hands[..., 1].min(1) < joints[:, names.index('head'), 1]
+    wrong = np.array([raised(x) > 0.5 for x in mixtures]) != above
+    assert (above.sum(), wrong.sum() <= 1) == (6, True)
+    stop = example('stop_near_hand')
+    assert not any(stop['must_stop'](x) for x in mixtures)
+    # The hands are 3.08 to 3.52 m away.
+    near = np.array([stop['hand_near'](x, 3.2) for x in mixtures])
+    distances = np.linalg.norm(hands, axis=-1).min(1)
+    assert near[distances < 3.1].mean() > 0.6
+    assert near[distances > 3.4].mean() < 0.4
+    assert [example('keep_distance')['speed_scale'](x) for x in spaces] == [1.0] * 75
+    plotted = example('plot_joint')['heights'](demonstration, 'right_wrist', 'pose_mixture')
+    found = [w @ x for x, w in zip(plotted[1], plotted[3], strict=True)]
+    true = joints[:, names.index('pelvis'), 1] - hands[:, 1, 1]
+    assert np.abs(np.array(found) - true).mean() < 0.1
 
 
 def test_the_height_of_a_joint_is_drawn(tmp_path, monkeypatch):
@@ -220,60 +295,60 @@ def test_the_notebook_runs_from_its_first_cell_to_its_last(monkeypatch, capsys):
     assert f'{count} modes: heaviest' in capsys.readouterr().out
 
 
-@pytest.mark.ros
-def test_examples_answer():
-    """All at once, each in a namespace and a process of its own."""
-    import rclpy
-    from hmt_msgs.msg import KeepOut as KeepOutOfRos
-    from hmt_msgs.msg import PoseMixture as MixtureOfRos
-    from nav_msgs.msg import OccupancyGrid
-    from std_msgs.msg import Float64
+def python(name):
+    return [sys.executable, EXAMPLES / f'{name}.py']
 
+
+@pytest.fixture(scope='module')
+def standing():
+    """Messages on topics of somebody who stands 3 m away, or lies 1.25 m away."""
     body = load_body('human37')
     pose = body.prior_mean[None].copy()
     pose[:, 2] = 3.0
     posterior = GaussianMixture([1.0], pose, [1e-4 * np.eye(body.dimension)])
     content = PoseMixture.of_body(
-        body, posterior, MixtureKind.POSTERIOR, 10**9, 'eye', state=TrackState.TRACKING
+        body, posterior, MixtureKind.POSTERIOR, 10**9, 'odom', state=TrackState.TRACKING
     )
-    given = {
-        'keep_distance': ('keep_out', KeepOutOfRos, keep_out(KeepOutState.TRACKING, 1.25)),
-        'raised_hand': ('pose_mixture', MixtureOfRos, pose_mixture_message(MESSAGES, content)),
-        'keep_out_grid': (
-            'keep_out', KeepOutOfRos, keep_out(KeepOutState.TRACKING, 1.25, frame='odom')
-        ),
-    }  # fmt: skip
-    answers = {
-        'keep_distance': ('speed_scale', Float64, 0.5),
-        'raised_hand': ('raised_hand', Float64, 0.0),
-        'keep_out_grid': ('keep_out_grid', OccupancyGrid, LYING),
+    return {
+        'pose_mixture': pose_mixture_message(MESSAGES, content),
+        'keep_out': keep_out(KeepOutState.TRACKING, 1.25, frame='odom'),
     }
 
-    def value(told):
-        return told.data if isinstance(told, Float64) else np.mean(np.array(told.data) == 100)
 
-    assert POSE_MIXTURE.endswith('PoseMixture')
+def check_answers(standing, programs):
+    """All programs at once, each in a namespace and a process of its own.
+
+    `programs` has by name the command, the topic that it takes, the topic that it publishes with
+    its type, and the answer.
+    """
+    import rclpy
+    from hmt_msgs.msg import KeepOut as KeepOutOfRos
+    from hmt_msgs.msg import PoseMixture as MixtureOfRos
+
+    kinds = {'pose_mixture': MixtureOfRos, 'keep_out': KeepOutOfRos}
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node('robot', context=context)
     executor = rclpy.executors.SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    heard: dict[str, list[float]] = {name: [] for name in answers}
+    heard: dict[str, list[float]] = {name: [] for name in programs}
     publishers, processes = [], []
-    for name, (topic, kind, _) in answers.items():
-        node.create_subscription(
-            kind, f'/{name}_lab/{topic}', lambda x, name=name: heard[name].append(value(x)), 10
-        )
-        source, kind, message = given[name]
-        publisher = node.create_publisher(kind, f'/{name}_lab/{source}', 10)
-        publishers.append((publisher, serialise(message)))
+
+    def hear(name, told):
+        several = hasattr(told, 'info')
+        heard[name].append(np.mean(np.array(told.data) == 100) if several else float(told.data))
+
+    for name, (command, source, topic, kind, _) in programs.items():
+        node.create_subscription(kind, f'/{name}_lab/{topic}', partial(hear, name), 10)
+        publisher = node.create_publisher(kinds[source], f'/{name}_lab/{source}', 10)
+        publishers.append((publisher, serialise(standing[source])))
         words = ['--ros-args', '-r', f'__ns:=/{name}_lab']
-        processes.append(subprocess.Popen([sys.executable, EXAMPLES / f'{name}.py', *words]))
+        processes.append(subprocess.Popen([*command, *words]))
 
     def silent():
         return [
             name
-            for name, (*_, wanted) in answers.items()
+            for name, (*_, wanted) in programs.items()
             if not any(abs(x - wanted) < 1e-3 for x in heard[name])
         ]
 
@@ -289,3 +364,34 @@ def test_examples_answer():
     node.destroy_node()
     rclpy.shutdown(context=context)
     assert silent() == [], {name: heard[name][-3:] for name in silent()}
+
+
+@pytest.mark.ros
+def test_examples_answer(standing):
+    from nav_msgs.msg import OccupancyGrid
+    from std_msgs.msg import Bool, Float64
+
+    programs = {
+        'keep_distance': ('keep_out', 'speed_scale', Float64, 0.5),
+        'stop_near_hand': ('pose_mixture', 'stop', Bool, 0.0),
+        'raised_hand': ('pose_mixture', 'raised_hand', Float64, 0.0),
+        'keep_out_grid': ('keep_out', 'keep_out_grid', OccupancyGrid, LYING),
+    }
+    check_answers(standing, {name: (python(name), *rest) for name, rest in programs.items()})
+
+
+@pytest.mark.ros
+def test_the_example_in_cpp_answers(standing, tmp_path):
+    """With the real rclcpp, where there is one; test_workspace.py builds it everywhere."""
+    from std_msgs.msg import Bool
+
+    prefixes = os.environ['AMENT_PREFIX_PATH'].split(os.pathsep)
+    if not any(Path(prefix, 'share', 'rclcpp').is_dir() for prefix in prefixes):
+        pytest.skip('no rclcpp in AMENT_PREFIX_PATH: it has no wheel')
+    for step in (['-S', str(EXAMPLES), '-B', 'build'], ['--build', 'build']):
+        done = subprocess.run(
+            ['cmake', *step], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+    command = [tmp_path / 'build' / 'stop_near_hand']
+    check_answers(standing, {'cpp': (command, 'pose_mixture', 'stop', Bool, 0.0)})

@@ -168,7 +168,8 @@ def xml(path: Path) -> ET.Element:
 def test_versions_agree(setup_arguments: dict[str, Any]) -> None:
     assert setup_arguments['version'] == hmt_ros.__version__
     assert xml(ROOT / 'package.xml').findtext('version') == hmt_ros.__version__
-    assert xml(HMT_MSGS / 'package.xml').findtext('version') == hmt_ros.__version__
+    for folder in (HMT_MSGS, ROOT / 'examples'):
+        assert xml(folder / 'package.xml').findtext('version') == hmt_ros.__version__
 
 
 def test_tests_are_found_by_colcon(setup_arguments: dict[str, Any]) -> None:

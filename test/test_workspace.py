@@ -20,8 +20,9 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 HMT_MSGS = ROOT / 'msg_tools' / 'hmt_msgs'
+EXAMPLES = ROOT / 'examples'
 PARTS = ['colcon.pkg', 'package.xml', 'setup.py', 'setup.cfg', 'resource', 'hmt_ros', 'msg_tools']
-PARTS += ['launch', 'rviz', 'foxglove', 'security']
+PARTS += ['launch', 'rviz', 'foxglove', 'security', 'examples']
 
 PAGE = (ROOT / 'docs' / 'consumers.md').read_text('utf-8')
 RCLCPP = ROOT / 'test' / 'rclcpp_stand_in'
@@ -48,7 +49,7 @@ def package_xml(name: str, build_type: str, depends: str) -> str:
 CONSUMERS = {
     'consumer/package.xml': package_xml('consumer', 'ament_cmake', code('xml')),
     'consumer/CMakeLists.txt': code('cmake'),
-    'consumer/consumer.cpp': code('cpp'),
+    'consumer/consumer.cpp': (EXAMPLES / 'stop_near_hand.cpp').read_text('utf-8'),
     'listener/package.xml': package_xml('listener', 'ament_python', code('xml')),
     'listener/setup.py': """from setuptools import setup
 setup(
@@ -118,8 +119,11 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     environment = ros_without_this_package()
     # It comes before an rclcpp that is installed, and answers without a publisher.
     environment['CMAKE_PREFIX_PATH'] = f'{RCLCPP}:{environment["CMAKE_PREFIX_PATH"]}'
+    # The line of the page on the examples.
+    page = (EXAMPLES / 'README.md').read_text('utf-8')
+    (line,) = re.findall(r'^colcon build .*$', page, re.M)
     done = subprocess.run(
-        ['colcon', 'build'],
+        line.split(),
         cwd=folder,
         env=environment,
         capture_output=True,
@@ -127,7 +131,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert 'Summary: 3 packages finished' in done.stdout
+    assert 'Summary: 4 packages finished' in done.stdout
     return folder
 
 
@@ -162,9 +166,13 @@ def test_colcon_build_in_a_workspace_builds_the_messages(workspace: Path) -> Non
 
 @pytest.mark.ros
 def test_packages_that_use_the_messages_run(workspace: Path) -> None:
-    ran = sourced(workspace, 'install/consumer/lib/consumer/consumer')
-    # 0.75 of 16 % and 0.25 of 98 %.
-    assert (ran.returncode, ran.stdout) == (0, 'right wrist within 2 m: 36%'), ran.stderr
+    for package, name in (('consumer', 'consumer'), ('hmt_ros_examples', 'stop_near_hand')):
+        ran = sourced(workspace, f'install/{package}/lib/{package}/{name}')
+        # Stops before anything has come, for a hand that may be near, and for a lost person.
+        assert (ran.returncode, ran.stdout) == (0, '10101'), ran.stderr
+    programs = workspace / 'install' / 'hmt_ros_examples' / 'lib' / 'hmt_ros_examples'
+    for path in EXAMPLES.glob('*.py'):
+        assert os.access(programs / path.name, os.X_OK), path.name
     program = 'from importlib.metadata import entry_points as found; '
     program += '(one,) = found(group="console_scripts", name="listener"); '
     program += 'print(one.load().__module__)'
@@ -402,7 +410,7 @@ def test_colcon_builds_the_messages_first_where_both_are_named(tmp_path: Path) -
     assert described == {'dependencies': ['hmt_msgs']}
 
 
-@pytest.mark.parametrize('folder', [ROOT, HMT_MSGS], ids=['hmt_ros', 'hmt_msgs'])
+@pytest.mark.parametrize('folder', [ROOT, HMT_MSGS, EXAMPLES], ids=lambda folder: folder.name)
 def test_metadata_of_a_release(folder: Path) -> None:
     package = pytest.importorskip('catkin_pkg.package').parse_package(str(folder))
     assert {url.type for url in package.urls} == {'website', 'bugtracker', 'repository'}
@@ -411,11 +419,12 @@ def test_metadata_of_a_release(folder: Path) -> None:
     assert package.licenses == ['Apache-2.0']
 
 
-def test_both_packages_have_the_same_metadata() -> None:
+def test_all_packages_have_the_same_metadata() -> None:
     package = pytest.importorskip('catkin_pkg.package')
-    ours, messages = (package.parse_package(str(folder)) for folder in (ROOT, HMT_MSGS))
-    assert [url.url for url in ours.urls] == [url.url for url in messages.urls]
-    assert ours.version == messages.version
+    ours, *others = (package.parse_package(str(folder)) for folder in (ROOT, HMT_MSGS, EXAMPLES))
+    for other in others:
+        assert [url.url for url in ours.urls] == [url.url for url in other.urls]
+        assert ours.version == other.version
 
 
 # ---- A file that is not run here: its one command is ----
