@@ -30,6 +30,7 @@ progress.INTERVAL = 3600.0
 # Files of tests that take longest, the longest first. They begin first, so that at the end no
 # process waits for another that has just begun a long one.
 LONGEST = (
+    'test_workspace.py',
     'app/replay/test_live_node.py',
     'test_benchmarks.py',
     'tracking/test_bad_input.py',

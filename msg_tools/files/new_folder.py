@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,6 +53,7 @@ class FolderKind:
         """
         target = target.absolute()
         self.check_place(target, overwrite=overwrite)
+        missing = [folder for folder in target.parents if not folder.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
         around = Path(
             tempfile.mkdtemp(prefix=f'.{target.name}.', suffix='.partial', dir=target.parent)
@@ -71,3 +72,6 @@ class FolderKind:
                 raise
         finally:
             shutil.rmtree(around, ignore_errors=True)
+            for folder in missing:
+                with suppress(OSError):  # the new folder is in it
+                    folder.rmdir()

@@ -58,9 +58,9 @@ def test_commands_explain_themselves(command, capsys):
     assert line.startswith(f'{command}: the following arguments are required')
 
 
-def test_module_is_the_command():
+def test_module_is_the_command(tmp_path):
     result = subprocess.run(
-        [sys.executable, '-m', 'hmt_ros', 'make-bag', 'swim', '-o', '/nowhere/bag'],
+        [sys.executable, '-m', 'hmt_ros', 'make-bag', 'swim', '-o', str(tmp_path / 'new' / 'bag')],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -68,6 +68,7 @@ def test_module_is_the_command():
     )
     assert result.returncode == 1
     assert result.stderr.startswith('make-bag: ')
+    assert not any(tmp_path.iterdir())
 
 
 def output_of_reader_that_leaves(lines, *command):
