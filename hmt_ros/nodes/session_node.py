@@ -60,6 +60,8 @@ from msg_tools.messages.cdr import serialise
 
 AnySession = TypeVar('AnySession', bound=Session[Any, Any])
 Parameters = TypeVar('Parameters', bound=NodeParameters)
+# Periods of the diagnostics between two lines on the console that tell of the same status.
+QUIET_PERIODS = 10
 
 
 class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
@@ -120,7 +122,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._own = OwnMessages()
         self._failure = ''
         self._inner_faults = InnerFaults()
-        self._told_at = 0
+        self._told_at = self._untold = 0
+        self._told_status = ''
         self._events = MiddlewareEvents(self.get_logger().warn)
         self._silent = SilentTopics(self, self.get_logger().warn)
         self._counted = f'{self.SESSION.UNIT}s'
@@ -442,14 +445,17 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._log_status(counts)
 
     def _log_status(self, counts: Counter[str]) -> None:
-        """One line a period while messages arrive."""
-        if counts['received'] == self._told_at:
+        """A line while messages arrive: at once where the status is another, else now and then."""
+        if self._session is None or counts['received'] == self._told_at:
             return
-        self._told_at = counts['received']
-        if self._session is not None:
-            label = self._state_machine.current_state[1]
-            _, text = self._judgement(label, self._session.state)
-            self.get_logger().info(f'{text}; {self._rates.line()}')
+        state, self._told_at = self._session.state, counts['received']
+        self._untold += 1
+        if state.status == self._told_status and self._untold < QUIET_PERIODS:
+            return
+        self._told_status, self._untold = state.status, 0
+        label = self._state_machine.current_state[1]
+        _, text = self._judgement(label, state)
+        self.get_logger().info(f'{text}; {self._rates.line()}')
 
     def _judgement(self, label: str, state: SessionState | None) -> tuple[bytes, str]:
         """Level and message of the diagnostics."""

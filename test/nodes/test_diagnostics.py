@@ -167,8 +167,8 @@ def status_lines(world):
     return lines[1 + next(i for i, line in enumerate(lines) if 'waits for' in line) :]
 
 
-def test_status_line(running, small_camera):
-    """One a period of diagnostics, which is a second, and only when something has come."""
+def test_status_line(running, small_camera, stub_tracker):
+    """At once, then after ten periods of diagnostics in which something has come."""
     period = running.own_periods()
     period()
     assert status_lines(running) == []
@@ -182,10 +182,20 @@ def test_status_line(running, small_camera):
     assert re.fullmatch(
         rf'tracking, 2 modes; {number} images a second, {number} tracked, latency \d+ ms', line
     )
-    for index in range(1, 3):
+    for index in range(1, 11):
+        assert status_lines(running) == [start, line]
         running.send('image', small_camera.image(index))
         period()
-    assert len(status_lines(running)) == 4
+        period()
+    assert len(status_lines(running)) == 3
+    # Another status is told at once.
+    image = small_camera.image(11)
+    stub_tracker.empty.add(image.header.stamp.sec * 10**9 + image.header.stamp.nanosec)
+    running.send('image', image)
+    period()
+    period()
+    *_, last = status_lines(running)
+    assert not last.startswith('tracking')
 
 
 def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
