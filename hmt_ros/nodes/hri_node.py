@@ -106,7 +106,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         known = {listener.topic for listener in self._listeners}
         for namespace in self._found():
             one = self._mixtures_in(namespace)
-            if one.topic in known:
+            if self._local_name(one.topic) in known:
                 continue
             if len(known) >= _MOST_TOPICS:
                 self.get_logger().warn(
@@ -117,7 +117,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
                 return
             thread.listen(one)
             self._subscribe(one)
-            known.add(one.topic)
+            known.add(self._local_name(one.topic))
             self.get_logger().info(f'mixtures from {one.topic}')
 
     # Bodies come and go; called by the thread that estimates.

@@ -263,7 +263,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         for one in inputs:
             self._subscribe(one)
         self._warn_of_unknown(qos=True)
-        topic = self._listeners[-1].topic
+        topic = session.topic_names[inputs[-1].source]
         wants = session.state.wants
         self.get_logger().info(f'{self._counted} from {topic}; waits for {wants}')
         return result
@@ -476,7 +476,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """The camera: the frame that its messages name, or else the topic that they come on."""
         if state is not None and state.frame_id:
             return state.frame_id
-        return self._listeners[-1].topic if self._listeners else ''
+        # Before its name, a topic that is not shared in this process has that of the node.
+        return self._listeners[-1].topic.rpartition(' ')[2] if self._listeners else ''
 
     def _diagnose(self) -> None:
         label = self._state_machine.current_state[1]

@@ -139,6 +139,35 @@ def test_people_who_are_gone_make_room(installed, world_of, monkeypatch):
     one.spin_until(second.get_subscription_count, 'a subscription to the other')
 
 
+@pytest.fixture
+def without_hri(monkeypatch):
+    """A node that publishes nothing, and needs no hri_msgs."""
+    from hmt_ros.nodes import hri_node
+
+    monkeypatch.setattr(hri_node.HriSession, 'TOPICS', {})
+    monkeypatch.setattr(hri_node.HriNode, '_messages_of_others', lambda *_: {})
+    return hri_node
+
+
+def test_a_person_is_subscribed_to_once(without_hri, world_of, monkeypatch):
+    from hmt_msgs.msg import PoseMixture as PoseMixtureMessage
+    from sensor_msgs.msg import CameraInfo
+
+    monkeypatch.setattr(without_hri, '_MOST_TOPICS', 3)
+    inputs = {'camera_info': CameraInfo}
+    one = world_of(without_hri.HriNode, 'hri_node', inputs, publish_cropped=False).start()
+    first = one.other.create_publisher(PoseMixtureMessage, TOPIC, 100)
+    one.spin_until(first.get_subscription_count, 'a subscription')
+    # Whoever comes later is found by a later search, which finds the first person again.
+    later = one.other.create_publisher(PoseMixtureMessage, TOPIC.replace('p1', 'p2'), 100)
+    one.spin_until(later.get_subscription_count, 'a subscription')
+    assert one.other.count_subscribers(TOPIC) == 1
+    one.other.destroy_publisher(first)
+    one.spin_until(lambda: one.other.count_subscribers(TOPIC) == 0, 'an end')
+    assert one.other.count_subscribers(TOPIC.replace('p1', 'p2')) == 1
+    assert one.warnings() == []
+
+
 def test_namespaces_that_are_named(installed, world_of, likelihoods):
     from hmt_msgs.msg import PoseMixture as PoseMixtureMessage
     from hri_msgs.msg import IdsList
