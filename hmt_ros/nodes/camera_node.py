@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import signal
 import sys
 import threading
 import time
@@ -29,6 +28,7 @@ from rclpy.utilities import remove_ros_args
 
 from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Image
+from hmt_ros.nodes.signals import on_signals
 from hmt_ros.sessions.camera_file import camera_of_view, read_camera
 from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
@@ -110,8 +110,7 @@ def main(args: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if args is None else args
     given = _parser().parse_args(remove_ros_args([NAME, *arguments])[1:])
     stopped = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
+    on_signals(lambda *_: stopped.set())
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(NAME)
     try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import ctypes
 import math
 import os
-import signal
 import sys
 import textwrap
 import threading
@@ -25,6 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from hmt_ros.nodes.node_parameters import files_for_others
 from hmt_ros.nodes.session_node import SessionNode
+from hmt_ros.nodes.signals import on_signals
 from hmt_ros.sessions.declared_parameters import DeclaredParameter, declared_parameters
 from hmt_ros.sessions.parameter_file import yaml_scalar
 from msg_tools.files.error_line import error_line
@@ -72,8 +72,7 @@ def run_together(
             sys.stderr.flush()
             os._exit(0)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
+    on_signals(stop)
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         nodes = make()

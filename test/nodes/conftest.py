@@ -353,13 +353,24 @@ class Executable:
         )
 
     def stop_at(self, text, number=signal.SIGINT):
-        """Sends a signal when the node says a text; all lines of a node that ends well."""
+        """Sends signals from when the node says a text; all lines of a node that ends well.
+
+        One more comes while it ends: a terminal and "ros2 launch" send one each.
+        """
         lines = []
+
+        def insist():
+            while self.process.poll() is None:
+                self.process.send_signal(number)
+                time.sleep(0.02)
+
+        insisting = threading.Thread(target=insist)
         for line in self.process.stdout:
             lines.append(line)
             if text in line:
-                self.process.send_signal(number)
+                insisting.start()
         assert self.process.wait(PATIENCE) == 0
+        insisting.join()
         return lines
 
     def refusal(self):
