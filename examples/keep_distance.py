@@ -50,6 +50,7 @@ def main() -> None:
     """Runs until it is interrupted."""
     import rclpy
     from hmt_msgs.msg import KeepOut
+    from rclpy.executors import ExternalShutdownException
     from std_msgs.msg import Float64
 
     rclpy.init()
@@ -66,7 +67,7 @@ def main() -> None:
 
     node.create_subscription(KeepOut, 'keep_out', hear, 10)
     node.create_timer(0.1, tell)
-    with contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
 
 

@@ -62,6 +62,7 @@ def main() -> None:
     import rclpy
     from hmt_msgs.msg import KeepOut
     from nav_msgs.msg import OccupancyGrid
+    from rclpy.executors import ExternalShutdownException
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
     rclpy.init()
@@ -90,7 +91,7 @@ def main() -> None:
 
     node.create_subscription(KeepOut, 'keep_out', hear, 10)
     node.create_timer(0.1, tell)
-    with contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
 
 

@@ -39,6 +39,7 @@ def main() -> None:
     """Runs until it is interrupted."""
     import rclpy
     from hmt_msgs.msg import PoseMixture
+    from rclpy.executors import ExternalShutdownException
     from std_msgs.msg import Float64
 
     rclpy.init()
@@ -50,7 +51,7 @@ def main() -> None:
         lambda mixture: publisher.publish(Float64(data=raised_hand(mixture))),
         10,
     )
-    with contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
 
 

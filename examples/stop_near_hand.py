@@ -51,6 +51,7 @@ def main() -> None:
     """Runs until it is interrupted."""
     import rclpy
     from hmt_msgs.msg import PoseMixture
+    from rclpy.executors import ExternalShutdownException
     from std_msgs.msg import Bool
 
     rclpy.init()
@@ -67,7 +68,7 @@ def main() -> None:
 
     node.create_subscription(PoseMixture, 'pose_mixture', hear, 10)
     node.create_timer(0.1, tell)
-    with contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
 
 
