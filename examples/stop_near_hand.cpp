@@ -27,7 +27,7 @@ bool ends_with(const std::string & name, const std::string & end)
   return name.size() >= end.size() && name.compare(name.size() - end.size(), end.size(), end) == 0;
 }
 
-// Probability that a hand is nearer to the origin.
+// Probability that a hand is nearer to the origin; NaN where the mixture does not tell.
 double hand_near(const PoseMixture & mixture, double near)
 {
   std::vector<std::size_t> points;
@@ -37,8 +37,12 @@ double hand_near(const PoseMixture & mixture, double near)
       points.push_back(j);
     }
   }
-  double total = 0.0;
+  const auto count = mixture.joint_names.size();
+  double total = points.empty() || mixture.components.empty() ? std::nan("") : 0.0;
   for (const auto & mode : mixture.components) {
+    if (mode.joint_positions.size() != count || mode.joint_covariances.size() != 9 * count) {
+      return std::nan("");
+    }
     double none = 1.0;
     for (const auto j : points) {
       const auto & place = mode.joint_positions[j];

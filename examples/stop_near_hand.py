@@ -22,10 +22,12 @@ HAND = ('wrist', 'hand')  # how names of points of a hand end
 
 
 def hand_near(mixture: Any, near: float = NEAR) -> float:
-    """Probability that a hand is nearer to the origin, by an hmt_msgs/PoseMixture."""
+    """Probability that a hand is nearer to the origin, by an hmt_msgs/PoseMixture; NaN: unknown."""
     points = [j for j, name in enumerate(mixture.joint_names) if name.endswith(HAND)]
-    total = 0.0
+    total = 0.0 if points and mixture.components else math.nan
     for mode in mixture.components:
+        if len(mode.joint_covariances) != 9 * len(mixture.joint_names):
+            return math.nan
         none = 1.0
         for j in points:
             place = mode.joint_positions[j]

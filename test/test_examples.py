@@ -205,6 +205,13 @@ def test_an_arm_stops_while_a_hand_may_be_near():
     assert not must_stop(hands(TrackState.TRACKING, 0.8779))
     assert must_stop(hands(TrackState.TRACKING, 0.8064))
     assert must_stop(hands(TrackState.TRACKING, math.nan))
+    # Without hands, modes or covariances it does not show that no hand is near.
+    without_hands, without_modes = hands(TrackState.TRACKING, 9.0), hands(TrackState.TRACKING, 9.0)
+    without_covariances = hands(TrackState.TRACKING, 9.0)
+    without_hands.joint_names[1:] = ['left_knee', 'left_ankle']
+    without_modes.components.clear()
+    without_covariances.components[-1].joint_covariances = []
+    assert all(map(must_stop, (without_hands, without_modes, without_covariances)))
     for state in TrackState:
         wanted = state not in (TrackState.TRACKING, TrackState.NOBODY)
         assert must_stop(hands(state, 9.0)) == wanted

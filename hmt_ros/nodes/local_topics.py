@@ -27,7 +27,7 @@ class Listener:
     """A node that listens to a topic.
 
     Attributes:
-        topic: its full name.
+        topic: its full name; before it, of a topic that is not shared here, that of the node.
         receive: takes the bytes of a message; may be called by any thread.
         connect: subscribes to the topic of other processes, and returns the subscription.
         subscription: the node's own; None while another node, or none, has it.

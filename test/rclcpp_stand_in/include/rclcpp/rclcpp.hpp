@@ -70,5 +70,20 @@ inline void spin(const std::shared_ptr<Node> & node)
   node->tick();
   node->callback(mixture(PoseMixture::STATE_LOST, 9.0));
   node->tick();
+  node->callback(mixture(PoseMixture::STATE_TRACKING, 9.0));
+  node->tick();
+  // One that does not tell of hands, of modes, of covariances.
+  auto unknown = mixture(PoseMixture::STATE_TRACKING, 9.0);
+  unknown.joint_names[1] = "right_knee";
+  node->callback(unknown);
+  node->tick();
+  unknown = mixture(PoseMixture::STATE_TRACKING, 9.0);
+  unknown.components.clear();
+  node->callback(unknown);
+  node->tick();
+  unknown = mixture(PoseMixture::STATE_TRACKING, 9.0);
+  unknown.components[1].joint_covariances.clear();
+  node->callback(unknown);
+  node->tick();
 }
 }
