@@ -45,7 +45,7 @@ class MarkovChain:
     def usual(self) -> Array:
         """Probabilities (n,) after a long time in which nothing was observed."""
         if len(self.rates) == 2:
-            return np.array([self.rates[1, 0], self.rates[0, 1]]) / -np.trace(self.generator)
+            return np.asarray(self.rates[[1, 0], [0, 1]] / -np.trace(self.generator))
         found = null_space(self.generator.T)[:, 0]
         return np.asarray(found / found.sum())
 

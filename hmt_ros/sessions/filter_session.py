@@ -194,7 +194,8 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         """
         if len(message.components) == 0:
             # A predictor that leaves the image to the track has seen neither somebody nor nobody.
-            return None if message.state == TrackState.TRACKING else Status.NOBODY
+            left = message.state == TrackState.TRACKING or getattr(message, 'reason', '')
+            return None if left else Status.NOBODY
         try:
             content = pose_mixture_of(message)
             return PosePrediction(content.mixture, body_of(content, self.start.body))
@@ -276,6 +277,9 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             elif len(self._weights):
                 self._publish_nobody(self._tracker, waiting)
             answered = True
+            if not starts and self._tracker.status is Status.WAITING:
+                # The track was of nobody.
+                self.robot.forget()
             self._tell_robot(waiting, self._tracker, posterior)
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
@@ -352,10 +356,14 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                 )  # fmt: skip
             else:
                 state = KeepOutState.LOST
-        number = self._tracks if tracker is None else tracker.track_id
-        existence = math.nan if tracker is None else tracker.existence_probability
+        number, existence, reason = self._tracks, math.nan, 'the image can not be tracked'
+        if tracker is not None:
+            number, existence = tracker.track_id, tracker.existence_probability
+            reason = tracker.reason
+            if tracker.status is Status.WAITING and self.start.initial is not None:
+                reason = f'waiting for {self.start.wants(())}'
         with self._telling:
-            self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen)
+            self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen, reason)
             for made in robot_messages(self.robot, p, self._wanted):
                 self._publish(*made)
             self.answered += 1

@@ -161,18 +161,19 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
 def nobody_messages(
     tracker: Tracker, waiting: WaitingImage, p: FilterParameters, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Any]]:
-    """Topics and messages of an image that ends a track: nobody is in view any more.
+    """Topics and messages of an image that ends a track: nobody is in view, or it was of nobody.
 
     The overlay shows the image without modes; markers of all ranks are removed.
     """
     body, stamp = tracker.body, waiting.stamp_ns
     frame = f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id
+    state = TrackState.NOBODY if tracker.status is Status.NOBODY else TrackState.UNKNOWN
     kinds = {'pose_mixture': MixtureKind.POSTERIOR, 'likelihood_mixture': MixtureKind.LIKELIHOOD}
     for topic, kind in kinds.items():
         if wanted(topic):
             content = PoseMixture.of_body(
-                body, None, kind, stamp, frame, state=TrackState.NOBODY, track_id=tracker.track_id,
-                existence_probability=tracker.existence_probability,
+                body, None, kind, stamp, frame, state=state, track_id=tracker.track_id,
+                existence_probability=tracker.existence_probability, reason=tracker.reason,
             )  # fmt: skip
             yield topic, pose_mixture_message(MESSAGES, content)
     if wanted('markers'):
@@ -229,6 +230,7 @@ def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
         track_id=tracker.track_id,
         existence_probability=tracker.existence_probability,
         cue_probabilities=_in_range(tracker.validity.shown),
+        reason=tracker.reason,
         identities=tracker.modes.identities,
         velocities=velocities,
     )
@@ -255,6 +257,7 @@ def _likelihood(track: TrackedImage) -> PoseMixture:
         error_share=errors.independent,
         error_time=errors.time,
         shape_covariance=shape,
+        reason=tracker.reason,
     )
 
 

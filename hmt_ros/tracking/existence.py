@@ -15,11 +15,14 @@ nobody by cue g, and a_g the share that is left to it because its errors last (`
                  the shape of a person / usual area), asked in the whole image
     detector     sum of the confidences of the keypoints
     predictor    whether it expects somebody; a yes counts only where there is no silhouette
+    motion       whether the model moved, and nothing else; only where no other cue tells
     colours      whether the person's are anywhere; only where nothing else shows somebody, and
                  against somebody only where the scene is the one they were learned in
 
 Before a track, keypoints count once for a picture: a detector that takes the foot of a table for a
 person does so in every image that shows the same. People move, if only a little.
+
+Who was there still is if nothing at all has moved: time does not count then.
 
 An image that has changed for the most part is no evidence: a covered lens, a flash, noise. The
 colours of a track are no evidence against somebody when the camera has moved: they may have been
@@ -43,7 +46,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds, share_of_time
 from hmt_ros.inference.markov_chain import MarkovChain, of_log_odds, update
-from hmt_ros.tracking.appearance import MOST, Appearance
+from hmt_ros.tracking.appearance import MOST, Appearance, Motion
 from hmt_ros.tracking.keypoint_evidence import keypoint_evidence, suffices
 from hmt_ros.tracking.view import View
 
@@ -58,6 +61,7 @@ PRESENT, ABSENT = 0.85, 0.03
 PART = 0.6
 
 
+NO_MOTION = Motion(moved=False, still=False)
 # Blur of images that are compared, px; least change of a pixel that noise does not make, grey
 # levels; share of the pixels around keypoints that change when a person breathes or sways within
 # tenths of a second (0.003 and more on ten clips of people, 0 on a table); least contrast.
@@ -103,7 +107,7 @@ class Existence:
         probability: before the first image.
 
     Attributes:
-        llr: sum of the cues of the last image, nats; positive: it shows somebody.
+        said: log likelihood ratios of the last image by cue, nats; positive: somebody.
         seen: whether the last image shows a filter something to follow: a cue shows somebody, or
             none shows nobody and the image can be used.
         hidden: whether others hid most of the person in the last image.
@@ -113,7 +117,7 @@ class Existence:
 
     def __init__(self, probability: float = NOBODY_YET) -> None:
         self._p = np.array([1.0 - probability, probability])
-        self.llr = 0.0
+        self.said: dict[str, float] = {}
         self.seen = self.hidden = self.elsewhere = False
         self._stamps: tuple[int, int] | None = None  # of the first and of the last image
         self._asked: dict[str, int] = {}  # when each cue spoke last
@@ -124,6 +128,16 @@ class Existence:
     def probability(self) -> float:
         """R, given all images so far."""
         return float(self._p[1])
+
+    @property
+    def llr(self) -> float:
+        """Sum of the cues of the last image, nats; positive: it shows somebody."""
+        return sum(self.said.values())
+
+    @property
+    def told(self) -> bool:
+        """Whether any cue has spoken."""
+        return bool(self._asked)
 
     @property
     def somebody(self) -> bool:
@@ -152,20 +166,25 @@ class Existence:
             body: of the person.
             waiting: whether a track has still to start.
         """
-        if self._stamps is not None:
+        # Nothing but the image tells, so that its changes are worth a look.
+        alone = view.anywhere is None and view.keypoints is None and not waiting
+        motion = self._appearance.motion(view) if alone else NO_MOTION
+        if self._stamps is not None and not motion.still:
             self._p = CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
         # After so long a time the person who was seen last may have gone.
         forgotten = CHAIN.transition(self._appearance.unseen(stamp))[1, 1] < MOST
         self.hidden = self._appearance.open_to_view(view.others) < 1.0 - MOST
         cues, usable, apart = self._cues(view, stamp, body)
+        if motion.moved:
+            cues['motion'] = 1.0, DOUBTFUL
         if waiting and cues.get('detector', (0.0, CLEAR))[0] > 0.0 and self._is_counted(view):
             del cues['detector']
         if self.hidden:
             cues = {name: cue for name, cue in cues.items() if cue[0] > 0.0}
-        self.llr = sum(
-            value * cue.nats * share_of_time(self._time_since(name, stamp), cue.tau)
+        self.said = {
+            name: value * cue.nats * share_of_time(self._time_since(name, stamp), cue.tau)
             for name, (value, cue) in cues.items()
-        )
+        }
         self._p = update(self._p, [0.0, self.llr])
         values = [value for value, _ in cues.values()]
         shown = any(value > 0.0 for value in values)

@@ -228,4 +228,3 @@ def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
 def _mixed(p: Array | float, evidence: Array) -> Array:
     """log(p exp(e) + 1 - p)."""
     return np.asarray(np.logaddexp(np.log(p) + evidence, np.log1p(-p)))
-
