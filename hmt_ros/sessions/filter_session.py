@@ -29,6 +29,7 @@ from hmt_ros.sessions.camera_session import (
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.fixed_frame import FixedFrame
+from hmt_ros.sessions.focal_length import with_depth_error
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.image_inputs import (
     INPUTS,
@@ -272,6 +273,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                     'to the colour camera',
                 )
             if posterior is not None and likelihood is not None:
+                posterior = with_depth_error(posterior, self.parameters.focal_length_sigma)
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
                 self._publish_nobody(self._tracker, waiting)
@@ -348,7 +350,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             if placed and posterior is not None and not tracker.foreseen:
                 seen = LastSeen(
                     waiting.stamp_ns, waiting.frame_id, tracker.body, posterior, tracker.forecaster,
-                    fixed, p.keep_out_probability,
+                    fixed, p.keep_out_probability, p.focal_length_sigma,
                 )  # fmt: skip
             else:
                 state = KeepOutState.LOST
