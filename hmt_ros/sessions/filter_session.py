@@ -390,7 +390,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             misfit=math.nan if tracker is None else tracker.misfit,
             evaluations=0 if tracker is None else tracker.evaluations,
             background='unknown' if silhouettes is None else silhouettes.known,
-            doubted=silhouettes is not None and silhouettes.doubted,
+            doubted=TrackCondition.of(self._tracker).doubted,
             moved=silhouettes is not None and silhouettes.watch.moved,
             track_id=self._tracks if self._tracker is None else self._tracker.track_id,
             existence=math.nan if self._tracker is None else self._tracker.existence_probability,
