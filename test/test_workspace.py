@@ -184,6 +184,48 @@ def test_packages_that_use_the_messages_run(workspace: Path) -> None:
     assert (ran.returncode, ran.stdout) == (0, 'listener.node\n'), ran.stderr
 
 
+# Asks for the support of a message, which loads the libraries of its package and of the middleware.
+CONSUMER = """
+#include <hmt_msgs/msg/pose_mixture.hpp>
+#include <rosidl_typesupport_cpp/message_type_support.hpp>
+int main() {
+  namespace support = rosidl_typesupport_cpp;
+  auto any = support::get_message_type_support_handle<hmt_msgs::msg::PoseMixture>();
+  return get_message_typesupport_handle(any, "rosidl_typesupport_fastrtps_cpp") == nullptr;
+}
+"""
+
+
+@pytest.mark.ros
+def test_a_program_in_cpp_starts_in_the_environment_of_a_clone(tmp_path: Path) -> None:
+    if not (ROOT / 'install' / 'local_setup.bash').is_file() or not (ROOT / '.venv').is_dir():
+        pytest.skip('no clone that "make setup" has set up')
+    source, program = tmp_path / 'consumer.cpp', tmp_path / 'consumer'
+    source.write_text(CONSUMER, 'utf-8')
+    built = (ROOT / 'install' / 'hmt_msgs', ROOT / '.venv')
+    names = 'hmt_msgs__rosidl_typesupport_cpp', 'rosidl_typesupport_cpp', 'rosidl_runtime_c'
+    subprocess.run(
+        [
+            *(os.environ.get('CXX', 'c++'), '-std=c++17', str(source), '-o', str(program)),
+            *(f'-I{folder}' for prefix in built for folder in prefix.glob('include/*')),
+            *(f'-L{prefix}/lib' for prefix in built),
+            *(f'-l{name}' for name in names),
+            '-Wl,--allow-shlib-undefined',
+        ],
+        check=True,
+    )
+    bare = {name: value for name, value in os.environ.items() if name != 'LD_LIBRARY_PATH'}
+    outside = subprocess.run([program], env=bare, capture_output=True, text=True, check=False)
+    assert 'error while loading shared libraries' in outside.stderr
+    inside = subprocess.run(
+        ['bash', '-c', f'source tools/environment.bash && {program} && echo $LD_LIBRARY_PATH'],
+        cwd=ROOT, env=bare, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert inside.returncode == 0, inside.stderr
+    # An empty element would be the working directory.
+    assert all(inside.stdout.strip().split(':'))
+
+
 @pytest.mark.ros
 def test_a_node_of_a_workspace_starts(workspace: Path) -> None:
     node = subprocess.Popen(
