@@ -215,7 +215,7 @@ def _await_active(node: Any, names: list[str], stopped: threading.Event) -> None
                 node.destroy_client(clients.pop(name))
         if time.monotonic() - told > _AGAIN:
             told = time.monotonic()
-            node.get_logger().warn(f'not active yet: {", ".join(clients)}; see "ros2 node list"')
+            node.get_logger().info(f'not active yet: {", ".join(clients)}; see "ros2 node list"')
         stopped.wait(_GLANCE)
 
 
