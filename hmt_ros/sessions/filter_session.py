@@ -29,6 +29,7 @@ from hmt_ros.sessions.camera_session import (
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.fixed_frame import FixedFrame
+from hmt_ros.sessions.focal_length import with_depth_error
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.image_inputs import (
     INPUTS,
@@ -273,6 +274,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                     'to the colour camera',
                 )
             if posterior is not None and likelihood is not None:
+                posterior = with_depth_error(posterior, self.parameters.focal_length_sigma)
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
                 self._publish_nobody(self._tracker, waiting)
@@ -352,7 +354,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             if placed and posterior is not None and not tracker.foreseen:
                 seen = LastSeen(
                     waiting.stamp_ns, waiting.frame_id, tracker.body, posterior, tracker.forecaster,
-                    fixed, p.keep_out_probability,
+                    fixed, p.keep_out_probability, p.focal_length_sigma,
                 )  # fmt: skip
             else:
                 state = KeepOutState.LOST
@@ -396,7 +398,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             misfit=math.nan if tracker is None else tracker.misfit,
             evaluations=0 if tracker is None else tracker.evaluations,
             background='unknown' if silhouettes is None else silhouettes.known,
-            doubted=silhouettes is not None and silhouettes.doubted,
+            doubted=TrackCondition.of(self._tracker).doubted,
             moved=silhouettes is not None and silhouettes.watch.moved,
             track_id=self._tracks if self._tracker is None else self._tracker.track_id,
             existence=math.nan if self._tracker is None else self._tracker.existence_probability,

@@ -18,6 +18,7 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.fixed_frame import FixedFrame
+from hmt_ros.sessions.focal_length import with_depth_error
 from hmt_ros.tracking.keep_out import Capsules, keep_out_capsules, reach_after
 from hmt_ros.tracking.prediction import Forecaster
 from msg_tools.messages.headers import SECOND_NS
@@ -41,6 +42,7 @@ class LastSeen:
         forecaster: of the track.
         fixed: frame that is published in; None: the frame of the camera.
         probability: of the capsules.
+        focal_length_sigma: relative standard deviation of the focal length; `posterior` has it.
     """
 
     stamp_ns: int
@@ -50,6 +52,7 @@ class LastSeen:
     forecaster: Forecaster
     fixed: FixedFrame | None
     probability: float
+    focal_length_sigma: float = 0.0
 
     @cached_property
     def capsules(self) -> Capsules:
@@ -154,7 +157,8 @@ class RobotOutputs:
                 f'the newest image is of {told.stamp_ns} ns; wanted a time from then to '
                 f'{LONGEST_FORECAST:g} s later, saw {stamp_ns} ns'
             )
-        mixture, frame = seen.forecaster.at(stamp_ns), seen.frame_id
+        mixture = with_depth_error(seen.forecaster.at(stamp_ns), seen.focal_length_sigma)
+        frame = seen.frame_id
         if seen.fixed is not None:
             mixture, _ = seen.fixed.placed(seen.body, mixture)
             frame = seen.fixed.optical

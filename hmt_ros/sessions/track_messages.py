@@ -20,6 +20,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
+from hmt_ros.sessions.focal_length import depth_covariances
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.robot_outputs import RobotOutputs
 from hmt_ros.sessions.session import PublishedTopic
@@ -239,7 +240,9 @@ def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
 def _likelihood(track: TrackedImage) -> PoseMixture:
     """The likelihood, which is undiscounted, with the duration of its errors."""
     tracker, likelihood, frame = track.tracker, track.likelihood, track.waiting.frame_id
-    shape, errors = tracker.shape_covariance, tracker.likelihood_errors
+    # The focal length errs alike in all images, as the shape does.
+    focal = depth_covariances(track.posterior.means[:1], track.parameters.focal_length_sigma)[0]
+    shape, errors = tracker.shape_covariance + focal, tracker.likelihood_errors
     if (fixed := track.fixed) is not None:
         likelihood, _ = fixed.placed(tracker.body, likelihood)
         at_best = GaussianMixture(np.ones(1), track.posterior.means[:1], shape[None])

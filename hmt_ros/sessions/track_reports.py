@@ -10,6 +10,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import IN_BACKGROUND, camera_moved_fault
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.tracking import Status, Subject, Tracker
+from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import CONTRARY
 from msg_tools.messages.headers import SECOND_NS
 
@@ -22,7 +23,8 @@ class TrackCondition(NamedTuple):
 
     Attributes:
         status: of the tracker.
-        doubted: whether the background was learned with the person in it.
+        doubted: whether the background was learned with the person in it, and silhouettes are
+            wanted: keypoints track the person without.
         moved: whether the camera has moved since the background was taken.
         contradicted: whether the lines of the scene contradict the gravity that is given.
     """
@@ -40,7 +42,9 @@ class TrackCondition(NamedTuple):
         silhouettes = tracker.silhouettes
         return cls(
             tracker.status,
-            silhouettes.doubted,
+            silhouettes.doubted
+            and tracker.settings.likelihood.coverage.weight > 0.0
+            and tracker.started_from is not Source.KEYPOINTS,
             silhouettes.watch.moved,
             tracker.gravity_contradicted,
         )
