@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from hmt_ros.image.background import WIDTH, BackgroundModel, edges_of
-from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.error_model import seconds, share_of_time
 
 UNSEEN = (
@@ -52,20 +52,22 @@ class EmptyScene:
 
     Attributes:
         background: the scene as it is known.
+        seen: whether it was seen long enough to have silhouettes, which are judged from then on.
         log_odds: of somebody in it, nats.
     """
 
     def __init__(self, background: BackgroundModel, *, trusted: bool = False) -> None:
         self.background = background
-        self.log_odds = -math.inf if background.frames or trusted else 0.0
+        self.seen = bool(background.frames or trusted)
+        self.log_odds = -math.inf if self.seen else 0.0
         self._recent: Array | None = None
         self._learned = self._judged = 0
         self._edges: Array | None = None
 
     @property
     def known(self) -> bool:
-        """Whether it was seen without anybody."""
-        return self.background.frames > 0 and self.log_odds < KNOWN
+        """Whether it was seen, and nobody is in it."""
+        return self.background.frames > 0 and self.seen and self.log_odds < KNOWN
 
     @property
     def wants(self) -> str:
@@ -74,8 +76,8 @@ class EmptyScene:
 
     @property
     def is_of_somebody(self) -> bool:
-        """Whether more likely than not somebody was in it."""
-        return self.background.frames > 0 and self.log_odds > 0.0
+        """Whether it was seen, and more likely than not somebody is in it."""
+        return self.seen and self.log_odds > 0.0
 
     def learn(self, image: Image, stamp: int, detected: bool | None = None) -> None:
         """Takes an image (H, W, 3), unless a detector sees somebody in it.
@@ -89,23 +91,25 @@ class EmptyScene:
             return
         dt = seconds(stamp - self._learned) if self._recent is not None else 0.0
         if self._has_moved(image, dt):
-            if self.known:
+            if self.seen:
                 return
             self.background, self.log_odds = BackgroundModel(self.background.settings), 0.0
         elif self.log_odds > STILLEST:
             still = min(dt / (STILL if detected is None else UNDETECTED), MOST)
             self.log_odds = max(self.log_odds - still, STILLEST)
+            self.seen |= self.log_odds < KNOWN
         self._learned, self._edges = stamp, None
         self.background.learn(image)
 
-    def judge(self, image: Image, silhouette: Mask, stamp: int) -> None:
-        """Takes the silhouette (H, W) of an image before the scene that was learned."""
-        if self.log_odds <= SURE:
+    def judge(self, image: Image, stamp: int) -> None:
+        """Takes an image (H, W, 3) before the scene that was learned, and its silhouette."""
+        if not self.seen or self.log_odds <= SURE:
             return
         now, size = edges_of(image), image.shape[1::-1]
         if self._edges is None:
             empty = cv2.resize(self.background.empty, size)
             self._edges = edges_of(np.asarray(empty, dtype=np.uint8))
+        silhouette = self.background.silhouette(image)
         pixels = cv2.resize(silhouette.view(np.uint8), now.shape[::-1])
         square = np.ones((3, 3), np.uint8)
         outline = cv2.morphologyEx(pixels, cv2.MORPH_GRADIENT, square) > 0

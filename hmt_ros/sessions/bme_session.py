@@ -374,12 +374,11 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         """The silhouette of an image, empty as long as the scene was not seen empty."""
         scene, stamp = self._scene, waiting.stamp_ns
         with self._background_in_use:
-            if scene.known:
+            if scene.seen:
                 self._look_at_scene(waiting, scene.background, 'configure the node anew')
-                mask = scene.background.silhouette(waiting.image)
-                scene.judge(waiting.image, mask, stamp)
+                scene.judge(waiting.image, stamp)
                 if scene.known:
-                    return mask
+                    return scene.background.silhouette(waiting.image)
             if scene.is_of_somebody:
                 self._scene = scene = EmptyScene(BackgroundModel(self.parameters.background))
             scene.learn(waiting.image, stamp)

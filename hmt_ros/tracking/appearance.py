@@ -69,7 +69,7 @@ LEAST_CONTRAST = 0.15
 BINS = 8
 # Shares of the pixels of a model that change where it moves, and at most where nothing does; how
 # many times denser changes are there than elsewhere. Least contrast of a model, grey levels.
-MOVED, UNMOVED, APART, CONTRAST = 0.03, 0.005, 4.0, 4.0
+MOVED, UNMOVED, APART, CONTRAST = 0.03, 0.005, 8.0, 4.0
 # A pixel that differs by more than this in a channel shows something else, grey levels; the means
 # of 3 x 3 pixels of the raster do not differ by that much from noise.
 OTHER = 24

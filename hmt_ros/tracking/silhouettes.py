@@ -121,15 +121,14 @@ class Silhouettes:
             mask = mask if others is None else mask & ~others
             return Silhouette(one_person(mask, self.background.settings, region))
         scene = self.scene
-        if self.doubted or not scene.known:
+        if self.doubted or not (scene.seen and scene.background.frames):
             return None
         if not self._shared:
             self.watch.look(image, self.background)
-        found = self.background.split(image, region, others)
-        scene.judge(image, found.foreground, stamp)
+        scene.judge(image, stamp)
         if scene.is_of_somebody:
             self._doubt()
-        return found if scene.known else None
+        return self.background.split(image, region, others) if scene.known else None
 
     def anywhere(self, image: Image, mask: Mask | None, others: Mask | None, step: int) -> Mask:
         """All foreground of an image, at every step-th pixel (H / step, W / step).
@@ -176,7 +175,7 @@ class Silhouettes:
         known = unknown is None or (unknown & around).sum() <= MOST_UNKNOWN * area.sum()
         trusted, self.doubted = not self.doubted, not known
         if known and not trusted:
-            self.scene.log_odds = COMPLETED
+            self.scene.log_odds, self.scene.seen = COMPLETED, True
             self.check(image, body, camera, poses[:1])
 
 

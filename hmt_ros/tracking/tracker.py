@@ -554,11 +554,11 @@ class Tracker:
                         said = 1.0 if view.silhouette.any() else -1.0
                     self.silhouettes.learn(view.image, stamp, said > 0.0 if said else None)
                 return None
-            if not masked:
-                self.silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
+            if beginning.source in FROM_JOINTS:
+                if not masked:
+                    self.silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
                 if self.silhouettes.doubted:
                     view = view._replace(silhouette=None, anywhere=None, unsure=None)
-            if beginning.source in FROM_JOINTS:
                 pose, depths = beginning.best[0], depths_of(view.depth)
                 self._track.check_depths(beginning.body, pose, depths, np.inf)
             observation = self._observe(view, beginning.best[0])

@@ -90,8 +90,7 @@ def test_a_ghost_gives_itself_away(crossing):
     assert ghost.known
     for i, image in enumerate(images[8:]):
         for scene in (ghost, true):
-            silhouette = scene.background.silhouette(image)
-            scene.judge(image, silhouette, 4 * SECOND + i * SECOND // 10)
+            scene.judge(image, 4 * SECOND + i * SECOND // 10)
         if i == 0:
             # Nothing is made of the first silhouette.
             assert not ghost.known
@@ -104,7 +103,7 @@ def test_an_empty_silhouette_says_nothing(crossing):
     empty = crossing[1]
     scene = seen_for(empty, 2.0, 10.0)
     before = scene.log_odds
-    scene.judge(empty, np.zeros(empty.shape[:2], np.bool_), 9 * SECOND)
+    scene.judge(empty, 9 * SECOND)
     assert scene.log_odds == before
 
 
@@ -116,7 +115,7 @@ def test_what_is_given_is_neither_learned_nor_judged(crossing):
     assert not shared.known
     for scene in (given, shared):
         scene.learn(empty, 0)
-        scene.judge(empty, np.ones(empty.shape[:2], np.bool_), 1)
+        scene.judge(images[5], 1)
         assert scene.log_odds == -math.inf
     assert given.background.frames == 1
     shared.background.learn(empty)

@@ -1099,6 +1099,32 @@ def test_an_image_that_shows_nothing_frees_nothing(session, outputs, small_camer
     assert found[2].radii.min() > found[1].radii.min() > found[0].radii.min()
 
 
+def test_a_track_of_nobody_leaves_nothing_behind(session, outputs, small_camera, stub_tracker):
+    """What it began from was a ghost: neither a place to keep out of, nor that nobody is there."""
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    (tracker,) = stub_tracker.made
+
+    def step(*_, **__):
+        tracker.status, tracker.reason = Status.WAITING, 'the scene was not seen empty'
+        tracker.existence_probability = np.nan
+        return None, None
+
+    tracker.step = step
+    one.take(IMAGE, small_camera.image(1))
+    found = kept_out(outputs)
+    assert [content.state.name for content in found] == ['TRACKING', 'UNKNOWN']
+    assert len(found[1].radii) == 0
+    # The start that is still given is what is awaited.
+    assert found[1].reason.startswith('waiting for an image of')
+    last = [
+        pose_mixture_of(deserialise(x.data, TOPICS['pose_mixture'].msgtype))
+        for x in outputs if x.topic == 'pose_mixture'
+    ][-1]  # fmt: skip
+    assert (last.state, last.reason) == (TrackState.UNKNOWN, 'the scene was not seen empty')
+
+
 def test_a_reset_does_not_free_the_space(session, outputs, small_camera):
     one = session()
     one.take(CAMERA_INFO, small_camera.info())

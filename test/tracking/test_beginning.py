@@ -9,16 +9,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.body.camera import Viewpoint
+from hmt_ros.body.camera import Camera, Viewpoint
 from hmt_ros.body.mirror import left_directions
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.empty_scene import UNSEEN
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference import GaussianMixture
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking import Status, Tracker, TrackerSettings
-from hmt_ros.tracking.beginning import Source, with_reversals
+from hmt_ros.tracking.beginning import (
+    FARTHEST,
+    LENS,
+    NEAREST,
+    STARTS,
+    Source,
+    log_prior_of_distance,
+    with_reversals,
+)
 from hmt_ros.tracking.keypoint_evidence import suffices
+from hmt_ros.tracking.proposals import PosePrediction
 
 FRAME = 100_000_000  # ns
 SHARED = Path(os.environ.get('HMT_SHARED', Path(__file__).resolve().parents[3] / 'shared'))
@@ -234,3 +245,52 @@ def test_keypoints_of_a_detector_start_a_track(human37, name):
     sigma = np.sqrt(tracker.posterior.covariances[0, 2, 2])
     depth = found[hips].mean(0)[2] - true[hips].mean(0)[2]
     assert abs(depth) < 2.5 * sigma
+
+
+def test_distances_that_people_and_cameras_have():
+    """Log-normal with 95 % between the limits, which a longer lens moves away; never a limit."""
+    focal = 320.0 / np.tan(0.5 * LENS)
+    usual = Camera(focal, focal, 319.5, 239.5, 640, 480)
+    far = replace(usual, fx=3.0 * focal, fy=3.0 * focal)
+    middle = np.sqrt(NEAREST * FARTHEST)
+    assert log_prior_of_distance(usual, middle) == pytest.approx(0.0)
+    for limit in (NEAREST, FARTHEST):
+        assert log_prior_of_distance(usual, limit) == pytest.approx(-2.0)
+        assert log_prior_of_distance(far, 3.0 * limit) == pytest.approx(-2.0)
+    assert -6.0 < log_prior_of_distance(usual, 50.0) < -5.0
+    assert all(kind.sure >= 0.0 for kind in STARTS)
+
+
+def test_why_no_track_starts_is_said(camera, human37, filmed):
+    """Somebody is in view from the first image on, and nothing says who."""
+    _, images, _ = filmed('walk', 1.2, camera)
+    tracker = Tracker(human37, camera, FAST)
+    for i in range(60):
+        assert tracker.step(images[i % len(images)], i * FRAME) == (None, None)
+    assert tracker.status is Status.WAITING
+    assert tracker.reason == UNSEEN
+    assert np.isnan(tracker.existence_probability)
+    assert not tracker.silhouettes.scene.known
+
+
+def test_a_track_that_a_ghost_began_ends(camera, human37, filmed):
+    """Somebody keeps still while the scene is learned, then walks: a prediction begins a track."""
+    _, images, _ = filmed('walk', 1.2, camera)
+    tracker = Tracker(human37, camera, TrackerSettings(candidates=8, max_hypotheses=4))
+    for i in range(21):
+        tracker.step(images[0], i * FRAME)
+    assert tracker.silhouettes.scene.known
+    covariances = np.tile(1e-2 * np.eye(human37.dimension), (1, 1, 1))
+    mean = human37.prior_mean.copy()
+    mean[:3] = 0.0, 0.0, 30.0
+    prediction = PosePrediction(GaussianMixture(np.ones(1), mean[None], covariances), human37)
+    statuses = []
+    for i, image in enumerate(images[4:]):
+        tracker.step(image, (21 + i) * FRAME, prediction=prediction if i == 0 else None)
+        statuses.append(tracker.status)
+    assert statuses[0] is Status.TRACKING
+    ended = statuses.index(Status.WAITING)
+    assert ended <= 4
+    assert set(statuses[ended:]) == {Status.WAITING}
+    assert tracker.reason == UNSEEN
+    assert np.isnan(tracker.existence_probability)

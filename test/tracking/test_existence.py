@@ -12,6 +12,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.inference.markov_chain import update
 from hmt_ros.rendering.renderer import render_silhouettes
+from hmt_ros.tracking.appearance import Motion
 from hmt_ros.tracking.existence import (
     ABSENT,
     CHAIN,
@@ -426,3 +427,49 @@ def test_a_detector_says_the_same_of_the_same_picture(waiting, human37, camera, 
     assert moving > PRESENT
     assert blank > PRESENT
     assert (still > PRESENT) != waiting
+
+
+# Without any other cue.
+
+
+def bare_views(film, indices):
+    return [View(film[1][i]) for i in indices]
+
+
+def test_a_person_who_moves_is_there(film, watched):
+    """Though nothing else tells: by the rates alone it would be two thirds after two seconds."""
+    found, seen, watching = watched(bare_views(film, range(10)), 5.0)
+    assert all(seen)
+    assert found.min() > 0.95
+    assert 'motion' in watching.said
+
+
+def test_where_nothing_moves_nobody_leaves(film, watched):
+    found, _, watching = watched(bare_views(film, [0] * 10), 0.5)
+    assert found.min() >= GIVEN
+    assert 'motion' not in watching.said
+    appearance = watching._appearance
+    assert appearance.motion(View(film[1][0])) == Motion(moved=False, still=True)
+    # What moves elsewhere may be who has left; what moves everywhere is the camera.
+    other = film[1][0].copy()
+    other[:60, :60] = 255 - other[:60, :60]
+    for image in (other, np.roll(film[1][0], 9, axis=1), 255 - film[1][0]):
+        assert appearance.motion(View(image)) == Motion(moved=False, still=False)
+    assert appearance.motion(View(film[1][6])) == Motion(moved=True, still=False)
+
+
+def test_a_black_image_is_no_still_one(film, watched):
+    black = View(np.zeros_like(film[1][0]))
+    found, *_ = watched([View(film[1][0]), *[black] * 5], 1.0)
+    assert found[-1] < PRESENT
+
+
+def test_before_anything_has_spoken_nothing_is_told(film, human32):
+    existence = Existence()
+    existence.look(View(film[1][0]), 0, human32, waiting=True)
+    assert not existence.told
+    existence.look(View(film[1][0], keypoints=NO_KEYPOINTS), SECOND, human32, waiting=True)
+    assert existence.told
+    assert existence.log_odds == pytest.approx(
+        math.log(existence.probability / (1 - existence.probability))
+    )
