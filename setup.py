@@ -208,6 +208,7 @@ setup(
         'tqdm',
         'lz4',
         'zstandard',
+        'tomli; python_version < "3.11"',
         *opencv(),
     ],
     extras_require={

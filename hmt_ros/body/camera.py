@@ -10,7 +10,7 @@ to the person's right (left in the image), y towards the camera, z up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +22,10 @@ DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equid
 
 NEAR = 0.01  # least depth of a point that has an image, m
 STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
+# Tangents at which a distortion is checked, and the largest factor by which a lens magnifies more
+# farther out: calibrations of real lenses reach 2.5, at the corners of wide images.
+CHECKED = np.tan(np.linspace(0.0, 0.499 * np.pi, 200))
+LARGEST_RISE = 4.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Camera:
 
     Raises:
         ValueError: a focal length is not positive, a value is not finite, the model is unknown or
-            has another number of coefficients.
+            has another number of coefficients, or the distortion folds inside the image.
     """
 
     fx: float
@@ -75,6 +79,49 @@ class Camera:
         if bends and not coefficients:
             coefficients = (0.0,) * max(counts)
         object.__setattr__(self, 'distortion', coefficients if bends else ())
+        if bends:
+            self._check_distortion()
+
+    def _check_distortion(self) -> None:
+        """Raises ValueError where rays farther out do not lie farther out in the image.
+
+        From the principal point to each corner the distorted radius must rise with the ideal one,
+        and nowhere so much faster than farther in that no lens does it.
+        """
+        x, y = (np.array([-0.5, n - 0.5]) for n in (self.width, self.height))
+        a, b = np.meshgrid((x - self.cx) / self.fx, (y - self.cy) / self.fy)
+        corners = np.hypot(a, b).reshape(-1, 1)
+        ideal = CHECKED * np.stack([a, b]).reshape(2, -1, 1) / np.maximum(corners, 1e-9)
+        with np.errstate(all='ignore'):  # a rational model has poles, which lie outside
+            radius = np.hypot(*self._distort(*ideal)[0])
+        slope = np.diff(radius) / np.diff(CHECKED)
+        # A fold may lead back into the image from outside, which matters to no pixel.
+        inside = np.maximum.accumulate(radius, axis=1)[:, :-1] < corners
+        steepest = LARGEST_RISE * np.minimum.accumulate(slope, axis=1)
+        if np.any(inside & ((slope <= 0) | (slope > steepest))):
+            raise ValueError(
+                f'the distortion {self.distortion_model} of {self.distortion} folds or '
+                f'overstretches the image of {self.width}x{self.height} pixels: it is of another '
+                'camera or size, or the pattern was not seen near the corners; calibrate again, as '
+                'a fisheye if the lens is wide'
+            )
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same camera with images of another size, px.
+
+        Raises:
+            ValueError: the size has another shape, beyond rounding to whole pixels.
+        """
+        if abs(width * self.height - height * self.width) >= max(self.width, self.height):
+            raise ValueError(
+                f'the calibration is for images of {self.width}x{self.height} pixels, which have '
+                f'another shape than {width}x{height}'
+            )
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * x, fy=self.fy * y, cx=(self.cx + 0.5) * x - 0.5,
+            cy=(self.cy + 0.5) * y - 0.5, width=width, height=height,
+        )  # fmt: skip
 
     @property
     def matrix(self) -> Array:

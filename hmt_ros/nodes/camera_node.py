@@ -141,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     view.add_argument(
         '--calibration', type=Path, metavar='FILE',
-        help='calibration of camera_calibration or of OpenCV, for images of this size',
+        help='calibration file, as import-video --camera takes it',
     )  # fmt: skip
     parser.add_argument('--frame-id', default=FRAME_ID, help=f'of the images ({FRAME_ID})')
     return parser
@@ -185,7 +185,7 @@ def _show(node: Any, video: Video, given: argparse.Namespace, stopped: threading
 def _camera(node: Any, given: argparse.Namespace, size: tuple[int, int]) -> Camera:
     """The calibration; a warning where it is assumed."""
     if given.calibration is not None:
-        return read_camera(given.calibration, size)
+        return read_camera(given.calibration, size, node.get_logger().warn)
     if given.fov is None:
         node.get_logger().warn(
             f'neither --calibration nor --fov is given: the field of view is taken to be '

@@ -150,7 +150,8 @@ def add_camera_arguments(parser: CommandParser) -> None:
     )
     camera.add_argument(
         '--camera', type=Path, metavar='FILE',
-        help='calibration file of OpenCV (YAML, XML, JSON) or of ROS (camera_info YAML)',
+        help='calibration file of OpenCV (YAML, XML, JSON), ROS (YAML), kalibr (camchain YAML), '
+        'anipose, Pose2Sim or caliscope (TOML); FILE:NAME is camera NAME of several',
     )  # fmt: skip
 
 
@@ -250,7 +251,7 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
         )
         shown = opened.enter_context(closing(counted))
         lifts = options.detector is not None or (found is not None and found.lifts)
-        result = _write(writer, options, shown, see, lifts)
+        result = _write(writer, options, shown, see, lifts, tell)
         if not result.images:
             raise ValueError(
                 f'{options.source}: no frame was read'
@@ -312,16 +313,19 @@ def _same_size(source: FrameSource, selection: Selection) -> Generator[Frame, No
         yield frame
 
 
-def camera_of(options: ImportOptions | argparse.Namespace, size: tuple[int, int]) -> Camera:
+def camera_of(
+    options: ImportOptions | argparse.Namespace, size: tuple[int, int], tell: Tell
+) -> Camera:
     """The camera that options describe, with images of a size."""
     if options.camera is not None:
-        return read_camera(options.camera, size)
+        return read_camera(options.camera, size, tell)
     return camera_of_view(size, options.fov, options.vertical_fov)
 
 
 def _write(
-    bag: BagWriter, options: ImportOptions, frames: Iterable[Frame], see: Seer, lifts: bool
-) -> Imported:
+    bag: BagWriter, options: ImportOptions, frames: Iterable[Frame], see: Seer, lifts: bool,
+    tell: Tell,
+) -> Imported:  # fmt: skip
     """Writes frame after frame; one is in memory at a time.
 
     With `lifts` every image has a message with positions, maybe of none.
@@ -334,7 +338,7 @@ def _write(
         result.with_masks = 0
     for frame in frames:
         height, width = frame.image.shape[:2]
-        camera = camera or camera_of(options, (width, height))
+        camera = camera or camera_of(options, (width, height), tell)
         stamp = options.first_stamp + frame.time_ns
         jpeg = frame.jpeg or encode_jpeg(frame.image, options.jpeg_quality)
         bag.write(IMAGE, stamp, jpeg_message(messages, jpeg, stamp, FRAME_ID))

@@ -96,7 +96,7 @@ def test_size_of_the_picture() -> None:
         ({'d': [np.inf, 0, 0, 0, 0]}, r'values that are not finite'),
         ({'k': [-600.0, *K[1:]]}, r'focal lengths are -600.0 and 590.0, wanted positive'),
         ({'k': [*K[:4], 0.0, *K[5:]]}, r'focal lengths are 600.0 and 0.0'),
-        ({'k': [600.0, 0.5, *K[2:]]}, r'without skew'),
+        ({'k': [600.0, 6.0, *K[2:]]}, r'with a skew K\[1\] below 6; calibrate'),
         ({'k': [*K[:8], 0.0]}, r'wanted \[fx, 0, cx, 0, fy, cy, 0, 0, 1\]'),
         ({'width': 0}, r'size is 0x480'),
         ({'height': 0, 'width': 0}, r'size is 0x0'),
