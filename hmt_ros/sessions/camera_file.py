@@ -47,20 +47,25 @@ Tell = Callable[[str], object]
 
 
 def camera_of_view(
-    size: tuple[int, int], horizontal: float | None = None, vertical: float | None = None
+    size: tuple[int, int],
+    horizontal: float | None = None,
+    vertical: float | None = None,
+    aspect: float = 1.0,
 ) -> Camera:
-    """A camera with square pixels whose axis meets the middle of the image.
+    """A camera whose axis meets the middle of the image.
 
     Args:
         size: width and height of the image, px.
         horizontal: angle from the left border to the right, degrees; or
         vertical: angle from the upper border to the lower, degrees.
+        aspect: width of a pixel over its height.
     """
     width, height = size
     side, angle = (width, horizontal) if horizontal is not None else (height, vertical)
     assert angle is not None
     focal = 0.5 * side / math.tan(math.radians(angle) / 2)
-    return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+    fx, fy = (focal, focal * aspect) if horizontal is not None else (focal / aspect, focal)
+    return Camera(fx, fy, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
 def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: None) -> Camera:

@@ -55,6 +55,20 @@ def test_horizontal_and_vertical_view():
     assert np.degrees(np.arccos(edges[0] @ edges[1])) == pytest.approx(45.0)
 
 
+def test_view_through_pixels_that_are_not_square():
+    # 720x576 shown as 1024x576: the same angles as in the picture of square pixels.
+    narrow, shown = (
+        camera_of_view((720, 576), 60.0, aspect=64 / 45),
+        camera_of_view((1024, 576), 60.0),
+    )
+    points = np.array([[0.3, -0.2, 2.0], [-0.5, 0.4, 2.0]])
+    scale = np.array([1024 / 720, 1.0])
+    assert np.allclose((narrow.project(points) + 0.5) * scale - 0.5, shown.project(points))
+    upright = camera_of_view((720, 576), vertical=40.0, aspect=64 / 45)
+    assert upright.fy / upright.fx == pytest.approx(64 / 45)
+    assert upright.fy == camera_of_view((1024, 576), vertical=40.0).fy
+
+
 @pytest.mark.parametrize('text', [ROS, ECHO])
 def test_files_of_ros(text, tmp_path):
     camera = read_camera(write(tmp_path / 'camera.yaml', text), SIZE)

@@ -238,6 +238,8 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
         raise ValueError('--detector-masks goes with --detector, and not with --masks')
     selection = Selection(options.start, options.end, options.every)
     source = open_source(options.source, options.fps, options.first_number)
+    for note in source.notes:
+        tell(note)
     masks = None if options.masks is None else Masks(options.masks, source)
     found = None
     if options.keypoints is not None:
@@ -314,12 +316,15 @@ def _same_size(source: FrameSource, selection: Selection) -> Generator[Frame, No
 
 
 def camera_of(
-    options: ImportOptions | argparse.Namespace, size: tuple[int, int], tell: Tell
+    options: ImportOptions | argparse.Namespace,
+    size: tuple[int, int],
+    tell: Tell,
+    aspect: float = 1.0,
 ) -> Camera:
     """The camera that options describe, with images of a size."""
     if options.camera is not None:
         return read_camera(options.camera, size, tell)
-    return camera_of_view(size, options.fov, options.vertical_fov)
+    return camera_of_view(size, options.fov, options.vertical_fov, aspect)
 
 
 def _write(
@@ -338,7 +343,7 @@ def _write(
         result.with_masks = 0
     for frame in frames:
         height, width = frame.image.shape[:2]
-        camera = camera or camera_of(options, (width, height), tell)
+        camera = camera or camera_of(options, (width, height), tell, frame.aspect)
         stamp = options.first_stamp + frame.time_ns
         jpeg = frame.jpeg or encode_jpeg(frame.image, options.jpeg_quality)
         bag.write(IMAGE, stamp, jpeg_message(messages, jpeg, stamp, FRAME_ID))
