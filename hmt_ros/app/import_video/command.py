@@ -10,10 +10,11 @@ import argparse
 import math
 from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
@@ -290,8 +291,10 @@ def _seer(options: ImportOptions, found: FoundPersons | None, masks: Masks | Non
     def see(frame: Frame, stamp_ns: int) -> tuple[Keypoints | None, Mask | None]:
         mask = None if masks is None else masks.of(frame)
         if detector is not None:
-            keypoints = detector.detect(frame.image, stamp_ns)
-            return keypoints, detector.mask if options.detector_masks else mask
+            keypoints = _detected(detector, frame, stamp_ns)
+            if options.detector_masks and detector.mask is not None:
+                mask = _in_pixels_of(frame, detector.mask)
+            return keypoints, mask
         if found is None:
             return None, mask
         found.check_size(frame)
@@ -299,6 +302,27 @@ def _seer(options: ImportOptions, found: FoundPersons | None, masks: Masks | Non
         return None if chosen is None else chosen.keypoints, mask
 
     return see
+
+
+def _detected(detector: BlazePose, frame: Frame, stamp_ns: int) -> Keypoints | None:
+    """The keypoints of a frame, which the detector sees with square pixels."""
+    if frame.aspect == 1.0:
+        return detector.detect(frame.image, stamp_ns)
+    height, width = frame.image.shape[:2]
+    wide = round(width * frame.aspect)
+    square = cv2.resize(frame.image, (wide, height), interpolation=cv2.INTER_AREA)
+    found = detector.detect(np.asarray(square, dtype=np.uint8), stamp_ns)
+    if found is None:
+        return None
+    scale = np.array([width / wide, 1.0])
+    covariances = found.covariances * np.outer(scale, scale)
+    return replace(found, pixels=(found.pixels + 0.5) * scale - 0.5, covariances=covariances)
+
+
+def _in_pixels_of(frame: Frame, mask: Mask) -> Mask:
+    height, width = frame.image.shape[:2]
+    resized = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(resized).view(np.bool_)
 
 
 def _same_size(source: FrameSource, selection: Selection) -> Generator[Frame, None, None]:

@@ -213,8 +213,8 @@ class VideoFile(FrameSource):
                 done, image = self._capture.retrieve()
                 if not done:
                     raise ValueError(f'{self.path}: frame {number} can not be decoded')
-                image = shown(np.asarray(image, dtype=np.uint8), self._matrix)
-                yield Frame(number, time_ns, '', image, None, self._aspect)
+                upright = shown(np.asarray(image, dtype=np.uint8), self._matrix)
+                yield Frame(number, time_ns, '', upright, None, self._aspect)
         finally:
             self._capture.release()
 

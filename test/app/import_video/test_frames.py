@@ -140,19 +140,7 @@ def test_display_matrix_of_damaged_and_other_files(video, tmp_path):
     assert display_matrix(path) == (-1 << 16, 0, 0, 1 << 16)
 
 
-def with_pixel_aspect(content, across, down):
-    """An MP4 file whose pixels have another shape."""
-    above, end = find(content, 'moov', 'trak', 'mdia', 'minf', 'stbl', 'stsd')
-    changed = bytearray(content)
-    box = struct.pack('>I4sII', 16, b'pasp', across, down)
-    # The description of the images is in the box that follows the count of descriptions.
-    for begin in (*above, above[-1] + 16):
-        struct.pack_into('>I', changed, begin, struct.unpack_from('>I', content, begin)[0] + 16)
-    changed[end:end] = box
-    return bytes(changed)
-
-
-def test_pixels_that_are_not_square(video):
+def test_pixels_that_are_not_square(video, with_pixel_aspect):
     stored, _ = read(video)
     assert stored[0].aspect == 1.0
     content = with_pixel_aspect(video.read_bytes(), 64, 45)
