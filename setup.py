@@ -216,6 +216,7 @@ setup(
         'dask': ['distributed'],
         'learning': ['jax', 'optax'],
         'detector': ['ai-edge-litert'],
+        'video': ['av'],
     },
     zip_safe=False,
     cmdclass={'install': Install, 'develop': Develop},

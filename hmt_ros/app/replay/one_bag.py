@@ -74,6 +74,7 @@ def replay_bag(
         if not options.keep_going:
             bag.raise_damage()
         recorded = options.recorded(bag)
+        recorded.check_stamps(bag)
         parameters = node_parameters(options, recorded)
         # The files that the parameters name are read before a node starts.
         subject = prepare_start(parameters.filter).initial
