@@ -115,7 +115,7 @@ class Camera:
         if abs(width * self.height - height * self.width) >= max(self.width, self.height):
             raise ValueError(
                 f'the calibration is for images of {self.width}x{self.height} pixels, which have '
-                f'another shape than {width}x{height}'
+                f'another shape than {width}x{height}; calibrate with images of this size'
             )
         x, y = width / self.width, height / self.height
         return replace(

@@ -8,6 +8,7 @@ kalibr, and the `.toml` of anipose, Pose2Sim and caliscope.
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -113,7 +114,9 @@ def _content(path: Path, text: str) -> tuple[Any, str]:
     if path.suffix.lower() == '.toml':
         return tomllib.loads(text), 'pinhole'
     if not text.lstrip().startswith(_OPENCV):
-        return load_plain_yaml(text.strip().removesuffix('---')), ''
+        # An echoed topic has a line of --- behind each message: the first counts.
+        first = re.split('^---', text.strip().removeprefix('---'), flags=re.MULTILINE)[0]
+        return load_plain_yaml(first), ''
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         return _of_opencv(storage.root()), 'pinhole'
@@ -181,7 +184,9 @@ def _numbers(value: Any) -> list[float]:
     if isinstance(value, dict):
         value = value.get('data')
     rows = value if isinstance(value, list) else [value]
-    flat = [x for row in rows for x in (row if isinstance(row, list) else [row])]
-    if not all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in flat):
-        raise ValueError('not a calibration: its sizes, matrix and coefficients must be numbers')
-    return [float(x) for x in flat]
+    try:
+        # YAML takes 1e-05, without a point, for text.
+        return [float(x) for row in rows for x in (row if isinstance(row, list) else [row])]
+    except (TypeError, ValueError) as error:
+        text = 'not a calibration: its sizes, matrix and coefficients must be numbers'
+        raise ValueError(f'{text} ({error})') from error

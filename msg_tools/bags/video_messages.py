@@ -16,7 +16,7 @@ import numpy as np
 from msg_tools.bags.bag_reader import BagMessage, BagReader, Topic
 from msg_tools.bags.contents import BagError
 from msg_tools.messages.headers import time_ns
-from msg_tools.messages.images import image_message
+from msg_tools.messages.images import MAX_PIXELS, image_message
 from msg_tools.messages.message_types import RosbagsMessages
 
 VIDEO_TYPE = 'foxglove_msgs/msg/CompressedVideo'
@@ -66,7 +66,9 @@ def with_pictures(messages: Iterator[BagMessage], topic: str) -> Iterator[BagMes
     if video is not None:
         yield from video.pictures(None)
         if not video.started:
-            raise BagError(f'{topic}: none of its {video.count} packets of video is a key frame')
+            raise BagError(
+                f'{topic}: none of its {video.count} packets of video is a whole key frame'
+            )
 
 
 def _codec_of(message: Any) -> str | None:
@@ -93,6 +95,7 @@ class _Video:
     def __init__(self, topic: str, codec: str) -> None:
         self._av = _library(topic, codec)
         self._decoder = self._av.CodecContext.create(codec, 'r')
+        self._decoder.options = {'max_pixels': str(MAX_PIXELS)}
         self._packets: dict[int, BagMessage] = {}  # whose pictures have not come
         self.count, self.started = 0, False
 

@@ -121,6 +121,8 @@ fisheye = false
 adjusted = false
 """
 OTHERS = {
+    'exponents.yaml': ROS.replace(', 0.0]}', ', 1e-05]}'),
+    'several.yaml': ECHO + ECHO.replace('500.0', '700.0'),
     'rostopic.yaml': ECHO.replace('d: [', 'D: [').replace('k: [', 'K: [').replace(', 0.0]', ']', 1),
     'camchain.yaml': KALIBR,
     'Calib.toml': TOML,

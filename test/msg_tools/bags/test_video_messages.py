@@ -111,7 +111,7 @@ def test_pictures_have_the_stamps_of_their_packets(tmp_path):
 
 @pytest.mark.usefixtures('stand_in')
 def test_without_a_key_frame_there_is_no_picture(tmp_path):
-    with pytest.raises(BagError, match='none of its 2 packets of video is a key frame'):
+    with pytest.raises(BagError, match='none of its 2 packets of video is a whole key frame'):
         pictures(write(tmp_path / 'bag', [b'P1', b'P2']))
 
 
