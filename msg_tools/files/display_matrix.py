@@ -5,13 +5,15 @@ OpenCV tells an angle only, which is wrong where the matrix mirrors.
 
 from __future__ import annotations
 
+import mmap
 import struct
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from msg_tools.files.mp4_boxes import boxes_at
 
 # Images as stored; after a turn to the right by 90 degrees; by 180; by 270.
 STORED = 1, 0, 0, 1
@@ -28,14 +30,18 @@ def display_matrix(path: Path) -> Matrix | None:
     The stored pixel (u, v) is shown at (a u + c v, b u + d v), up to a shift and a scale.
     """
     with path.open('rb') as file:
-        for begin, end in _boxes(file, 0, path.stat().st_size, b'moov', b'trak'):
-            if b'vide' not in _contents(file, begin, end, 8, 12, b'mdia', b'hdlr'):
-                continue
-            for head in _contents(file, begin, end, 0, 100, b'tkhd'):
-                at = _MATRIX_AT[head[:1] == b'\x01']
-                if len(head) >= at + 20:
-                    a, b, _, c, d = struct.unpack_from('>5i', head, at)
-                    return (a, b, c, d) if a * d != b * c else None
+        if not path.stat().st_size:
+            return None
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            for start, end in boxes_at(data, 0, len(data), b'moov', b'trak'):
+                handlers = boxes_at(data, start, end, b'mdia', b'hdlr')
+                if b'vide' not in [data[at + 8 : at + 12] for at, _ in handlers]:
+                    continue
+                for at, last in boxes_at(data, start, end, b'tkhd'):
+                    at += _MATRIX_AT[data[at : at + 1] == b'\x01']
+                    if at + 20 <= last:
+                        a, b, _, c, d = struct.unpack_from('>5i', data, at)
+                        return (a, b, c, d) if a * d != b * c else None
     return None
 
 
@@ -57,28 +63,3 @@ def shown(image: NDArray[Any], matrix: Matrix) -> NDArray[Any]:
         across, down = matrix[2], matrix[1]
         image = image.swapaxes(0, 1)
     return np.ascontiguousarray(image[:: 1 if down > 0 else -1, :: 1 if across > 0 else -1])
-
-
-def _contents(
-    file: BinaryIO, begin: int, end: int, first: int, last: int, *kinds: bytes
-) -> Iterator[bytes]:
-    """Bytes `first` to `last` of the boxes of some kinds."""
-    for at, stop in _boxes(file, begin, end, *kinds):
-        file.seek(at + first)
-        yield file.read(min(last, stop - at) - first) if stop - at > first else b''
-
-
-def _boxes(file: BinaryIO, begin: int, end: int, *kinds: bytes) -> Iterator[tuple[int, int]]:
-    """Begins and ends of the contents of boxes of a kind, in those of the kinds before it."""
-    while begin + 8 <= end:
-        file.seek(begin)
-        size, kind, large = struct.unpack('>I4sQ', file.read(16).ljust(16, b'\0'))
-        inner = begin + (16 if size == 1 else 8)
-        stop = {0: end, 1: begin + large}.get(size, begin + size)
-        if not inner <= stop <= end:
-            return
-        if kind == kinds[0] and kinds[1:]:
-            yield from _boxes(file, inner, stop, *kinds[1:])
-        elif kind == kinds[0]:
-            yield inner, stop
-        begin = stop
