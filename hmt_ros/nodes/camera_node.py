@@ -31,6 +31,7 @@ from hmt_ros.inference.arrays import Image
 from hmt_ros.nodes.signals import on_signals
 from hmt_ros.sessions.camera_file import camera_of_view, read_camera
 from msg_tools import RosbagsMessages
+from msg_tools.files.display_matrix import STORED, display_matrix, is_mirrored
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.cdr import serialise
@@ -75,6 +76,12 @@ class Video:
         if not self._capture.isOpened():
             kind = 'a video that OpenCV reads' if self.is_file else 'a webcam that nobody uses'
             raise CameraError(f'{source} can not be opened; wanted {kind}')
+        if self.is_file and is_mirrored(display_matrix(Path(source)) or STORED):
+            # OpenCV would turn it by 180 degrees.
+            raise CameraError(
+                f'{source}: its metadata mirror the images; write them as players show them, by '
+                f'ffmpeg -i {source} shown.mp4'
+            )
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         self._rate = rate if math.isfinite(rate) and rate > 0.0 else _USUAL_RATE
 
