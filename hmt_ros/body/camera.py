@@ -94,7 +94,7 @@ class Camera:
         ideal = CHECKED * np.stack([a, b]).reshape(2, -1, 1) / np.maximum(corners, 1e-9)
         with np.errstate(all='ignore'):  # a rational model has poles, which lie outside
             radius = np.hypot(*self._distort(*ideal)[0])
-        slope = np.diff(radius) / np.diff(CHECKED)
+            slope = np.diff(radius) / np.diff(CHECKED)
         # A fold may lead back into the image from outside, which matters to no pixel.
         inside = np.maximum.accumulate(radius, axis=1)[:, :-1] < corners
         steepest = LARGEST_RISE * np.minimum.accumulate(slope, axis=1)

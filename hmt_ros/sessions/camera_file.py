@@ -96,17 +96,9 @@ def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: Non
                 f'calibrations of the cameras {", ".join(calibrations)}: name one, as {file}:{some}'
             )
         entries = _entries(calibrations.get(name, next(iter(calibrations.values()))), model, size)
-        camera = camera_from_info(SimpleNamespace(**entries), tell=lambda x: tell(f'{path}: {x}'))
-        if (camera.width, camera.height) == size:
-            return camera
-        scaled = camera.scaled(*size)
+        return camera_from_info(SimpleNamespace(**entries), size, lambda x: tell(f'{path}: {x}'))
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f'{path}: {error}') from error
-    tell(
-        f'{path}: the calibration is for images of {camera.width}x{camera.height} pixels and is '
-        f'scaled to {size[0]}x{size[1]}; it is wrong if these are cut from larger ones'
-    )
-    return scaled
 
 
 def _content(path: Path, text: str) -> tuple[Any, str]:

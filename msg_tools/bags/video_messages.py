@@ -21,7 +21,6 @@ from msg_tools.messages.message_types import RosbagsMessages
 
 VIDEO_TYPE = 'foxglove_msgs/msg/CompressedVideo'
 _TYPES = ('sensor_msgs/msg/CompressedImage', VIDEO_TYPE)
-_RAW = 'sensor_msgs/msg/Image'
 _MOST_WAITING = 32  # packets whose pictures have not come; more have none
 # Name of the decoder by the format that a message names.
 _CODECS = {'h264': 'h264', 'h265': 'hevc', 'hevc': 'hevc', 'vp9': 'vp9', 'av1': 'av1'}
@@ -127,5 +126,5 @@ def image_stamp(message: Any) -> int:
 def _with_picture(stored: BagMessage, picture: Any) -> BagMessage:
     message = stored.message
     frame_id = str(getattr(message, 'header', message).frame_id)
-    image = image_message(RosbagsMessages(), picture, image_stamp(message), frame_id)
-    return BagMessage(stored.topic, _RAW, stored.log_time_ns, memoryview(b''), lambda _: image)
+    stamp = image_stamp(message)
+    return stored.with_message(image_message(RosbagsMessages(), picture, stamp, frame_id))

@@ -52,7 +52,8 @@ def camera_from_info(
 
     Args:
         message: sensor_msgs/CameraInfo, of `rosbags` or of ROS.
-        image_size: (width, height) of a picture that it has to fit, px.
+        image_size: (width, height) of a picture that it has to fit, px; one of the same shape is
+            scaled.
         tell: takes a line on what is neglected.
 
     Raises:
@@ -85,12 +86,8 @@ def camera_from_info(
         raise CameraInfoError(
             f'camera info: binning of {binning_x} and {binning_y} leaves {width}x{height} pixels'
         )
-    if image_size is not None and tuple(image_size) != (width, height):
-        raise CameraInfoError(
-            f'camera info is for pictures of {width}x{height}, saw {image_size[0]}x{image_size[1]}'
-        )
     try:
-        return Camera(
+        camera = Camera(
             fx=k[0] / binning_x,
             fy=k[4] / binning_y,
             cx=(k[2] - x) / binning_x,
@@ -100,8 +97,17 @@ def camera_from_info(
             distortion=coefficients,
             distortion_model=model,
         )
+        if image_size is None or tuple(image_size) == (width, height):
+            return camera
+        wide, high = image_size
+        scaled = camera.scaled(wide, high)
     except ValueError as error:
         raise CameraInfoError(f'camera info: {error}') from error
+    tell(
+        f'camera info: the calibration for images of {width}x{height} pixels is scaled to '
+        f'{wide}x{high}; it is wrong if these are cut from larger ones'
+    )
+    return scaled
 
 
 def _check_plausible(k: list[float], coefficients: tuple[float, ...], size: int) -> None:

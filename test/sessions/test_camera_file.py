@@ -191,7 +191,7 @@ def test_calibration_for_another_size_is_scaled_and_told(tmp_path):
     # The border of the first pixel is at -0.5 in both.
     assert np.allclose(2 * (half.project(points) + 0.5), whole.project(points) + 0.5)
     assert len(told) == 1
-    assert 'images of 640x480 pixels and is scaled to 320x240' in told[0]
+    assert 'images of 640x480 pixels is scaled to 320x240' in told[0]
 
 
 def test_distortion_that_folds_is_refused(tmp_path):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 
@@ -21,7 +21,9 @@ from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools import BagError, BagMessage, BagReader, RosbagsMessages, Topic
 from msg_tools.bags.contents import absolute_name
 from msg_tools.bags.video_messages import VIDEO_TYPE, image_stamp, is_video, with_pictures
+from msg_tools.messages.camera_info import camera_from_info, camera_info_message
 from msg_tools.messages.headers import time_message, time_ns
+from msg_tools.messages.images import decode_image
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
@@ -49,6 +51,8 @@ class RecordedInput:
         upright_frame: one of `UPRIGHT_FRAMES` that transforms lead to from the camera; empty: they
             lead to none.
         video: whether the images are packets of a video, which `messages` decodes.
+        scaled: size (width, height), px, of images for which `messages` scales the calibration,
+            which is that of another size of the same shape; None: it fits.
         by_log: whether `messages` replaces stamps by the times at which images were recorded.
     """
 
@@ -59,6 +63,7 @@ class RecordedInput:
     transforms: Mapping[str, Topic] | None = None
     upright_frame: str = ''
     video: bool = False
+    scaled: tuple[int, int] | None = None
     by_log: bool = False
 
     @property
@@ -89,7 +94,10 @@ class RecordedInput:
         if self.by_log:
             found = _by_log(found, self.image.name)
         for stored in found:
-            yield sources[stored.topic], stored
+            if self.scaled is not None and stored.topic == self.camera_info.name:
+                yield CAMERA_INFO, _scaled(stored, self.scaled)
+            else:
+                yield sources[stored.topic], stored
 
     def check_stamps(self, bag: BagReader) -> None:
         """Raises BagError where images have no stamps, and none are made up for them."""
@@ -102,6 +110,35 @@ class RecordedInput:
                 f'{bag.path}: the images on {self.image.name} have no stamps (all are 0): '
                 '--times log takes the times at which they were recorded'
             )
+
+
+def _scaled(stored: BagMessage, size: tuple[int, int]) -> BagMessage:
+    """A camera_info for images of another size."""
+    try:
+        camera, header = camera_from_info(stored.message, size), stored.message.header
+    except ValueError:
+        return stored  # who takes it reports it
+    stamp, frame = time_ns(header.stamp), str(header.frame_id)
+    return stored.with_message(camera_info_message(RosbagsMessages(), camera, stamp, frame))
+
+
+def fitted(bag: BagReader, recorded: RecordedInput, tell: Callable[[str], object]) -> RecordedInput:
+    """The same topics, with a calibration that is scaled where images have another size."""
+    messages = bag.messages([recorded.image.name])
+    if recorded.video:
+        messages = with_pictures(messages, recorded.image.name)
+    told: list[str] = []
+    try:
+        height, width = decode_image(next(messages).message).shape[:2]
+        info = next(bag.messages([recorded.camera_info.name])).message
+        camera = camera_from_info(info)
+        if (camera.width, camera.height) == (width, height):
+            return recorded
+        camera_from_info(info, (width, height), told.append)
+    except (ValueError, StopIteration):
+        return recorded  # the replay itself reports what is wrong
+    tell(f'{bag.path}: {told[-1]}')
+    return replace(recorded, scaled=(width, height))
 
 
 def _by_log(messages: Iterator[BagMessage], image: str) -> Iterator[BagMessage]:

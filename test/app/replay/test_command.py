@@ -27,6 +27,7 @@ from hmt_ros.tracking.validity import Validity
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.bodies import body_of
+from msg_tools.messages.camera_info import camera_from_info, camera_info_message
 from msg_tools.messages.headers import header_message, time_message, time_ns
 from msg_tools.messages.images import decode_image, depth_message, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
@@ -530,6 +531,25 @@ def test_raw_images(still, entries, tmp_path):
         bag = write(out.parent / 'bag', given)
         assert main([str(bag), '-o', str(out), *SUBJECT, '--quiet']) == 0
     assert content(both[0]) == content(both[1])
+
+
+def test_calibration_of_larger_images_is_scaled(still, entries, tmp_path, capsys):
+    larger = []
+    for topic, time, message in copy.deepcopy(entries):
+        if topic == 'camera_info':
+            camera = camera_from_info(message)
+            camera = camera.scaled(2 * camera.width, 2 * camera.height)
+            message = camera_info_message(MESSAGES, camera, time, message.header.frame_id)
+        larger.append((topic, time, message))
+    outs = [tmp_path / name / 'out' for name in ('larger', 'given')]
+    for out, given in zip(outs, (larger, entries), strict=True):
+        bag = write(out.parent / 'bag', given)
+        assert main([str(bag), '-o', str(out), *SUBJECT, '--quiet']) == 0
+        if given is larger:
+            (line,) = capsys.readouterr().err.splitlines()
+            assert 'for images of 960x720 pixels is scaled to 480x360' in line
+    assert content(outs[0]) == content(outs[1])
+    assert still[0].camera == still[1].camera
 
 
 def stamped(message, stamp):

@@ -82,8 +82,12 @@ def test_region_and_binning() -> None:
 
 def test_size_of_the_picture() -> None:
     assert camera_from_info(info(), (640, 480)).width == 640
-    with pytest.raises(CameraInfoError, match='is for pictures of 640x480, saw 320x240'):
-        camera_from_info(info(), (320, 240))
+    told: list[str] = []
+    assert camera_from_info(info(), (320, 240), told.append).fx == 300.0
+    assert len(told) == 1
+    assert 'for images of 640x480 pixels is scaled to 320x240' in told[0]
+    with pytest.raises(CameraInfoError, match='640x480 pixels, which have another shape than 320x'):
+        camera_from_info(info(), (320, 200))
     assert camera_from_info(info(binning_x=2, binning_y=2), (320, 240)).fx == 300.0
 
 
