@@ -24,7 +24,7 @@ NEAR = 0.01  # least depth of a point that has an image, m
 STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
 # Tangents at which a distortion is checked, and the largest factor by which a lens magnifies more
 # farther out: calibrations of real lenses reach 2.5, at the corners of wide images.
-CHECKED = np.tan(np.linspace(0.0, 0.499 * np.pi, 200))
+CHECKED = np.tan(0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2)
 LARGEST_RISE = 4.0
 
 
@@ -97,7 +97,8 @@ class Camera:
             slope = np.diff(radius) / np.diff(CHECKED)
         # A fold may lead back into the image from outside, which matters to no pixel.
         inside = np.maximum.accumulate(radius, axis=1)[:, :-1] < corners
-        steepest = LARGEST_RISE * np.minimum.accumulate(slope, axis=1)
+        # In the middle the slope is 1.
+        steepest = LARGEST_RISE * np.minimum.accumulate(slope, axis=1).clip(max=1.0)
         if np.any(inside & ((slope <= 0) | (slope > steepest))):
             raise ValueError(
                 f'the distortion {self.distortion_model} of {self.distortion} folds or '

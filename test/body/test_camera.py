@@ -112,6 +112,8 @@ def test_zero_coefficients_are_no_distortion():
         ({'distortion': (0.1, 0.2, 0.3)}, 'coefficients, saw 3'),
         ({'distortion': (0.1,) * 5, 'distortion_model': 'equidistant'}, 'coefficients, saw 5'),
         ({'distortion': (-5.0, 30.0, 0.0, 0.0)}, 'folds or overstretches the image of 640x480'),
+        ({'distortion': (1e6, 1e6, 1e6, 1e6, 1e6)}, 'folds or overstretches'),
+        ({'fx': 9e3, 'fy': 9e3, 'distortion': (-300.0, 0.0, 0.0, 0.0)}, 'folds or'),
         ({'distortion': (-0.8, 0.0, 0.0, 0.0)}, 'folds or overstretches'),
         ({'distortion_model': 'fisheye624'}, "unknown distortion model 'fisheye624'"),
     ],
