@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Camera
+from hmt_ros.body.camera import unfolded_share
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import MessageFactory
 
@@ -97,6 +98,11 @@ def camera_from_info(
             distortion=coefficients,
             distortion_model=model,
         )
+        if (share := unfolded_share(camera)) < 1.0:
+            tell(
+                f'camera info: the distortion folds or overstretches the image from {share:.0%} of '
+                'the way to a corner on: nothing is right there; calibrate with the pattern there'
+            )
         if image_size is None or tuple(image_size) == (width, height):
             return camera
         wide, high = image_size
@@ -133,6 +139,8 @@ def _distortion(model: str, coefficients: list[float]) -> tuple[str, tuple[float
     model = _ALIASES.get(model.lower(), model)
     if model.lower() in _PINHOLE:
         model = 'plumb_bob' if len(coefficients) < 8 else 'rational_polynomial'
+    if model == 'plumb_bob' and not any(coefficients[5:]):
+        coefficients = coefficients[:5]
     if not any(coefficients):
         if model not in ('', 'plumb_bob', 'rational_polynomial', 'equidistant'):
             raise CameraInfoError(f'camera info: unknown distortion model {model!r}')

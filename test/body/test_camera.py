@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmt_ros.body import Camera
+from hmt_ros.body.camera import unfolded_share
 
 LENSES = {
     'none': ('plumb_bob', ()),
@@ -157,6 +158,8 @@ def test_magnification_behind_the_camera_is_finite(depth):
         (191.0, (512, 512), 'equidistant', (0.0034, 0.0007, -0.0020, 0.0002)),
         (286.0, (848, 800), 'equidistant', (-0.0084, 0.0443, -0.0419, 0.0076)),
         (200.0, (1000, 1000), 'equidistant', (0.0, 0.0, 0.0, 0.0)),
+        (370.0, (640, 480), 'plumb_bob', (-0.3319, 0.0683, -0.0029, 0.0049, 0.0)),
+        (1727.0, (1920, 1080), 'plumb_bob', (0.17, -0.6973, -0.0029, -0.005, 0.0)),
         (
             915.0, (1920, 1080), 'rational_polynomial',
             (0.5, -2.6, 0.0007, -0.0002, 1.5, 0.38, -2.45, 1.44),
@@ -170,11 +173,13 @@ def test_distortions_of_real_cameras_do_not_fold(focal, size, model, coefficient
 
 
 def test_a_fold_outside_of_the_image_does_not_matter():
-    # It folds at a radius of 0.43 focal lengths; the corners of the image lie at 0.42.
-    values = (480.0, 480.0, 159.5, 119.5, 320, 240)
-    Camera(*values, (-0.8, 0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match='folds'):
-        Camera(460.0, 460.0, *values[2:], (-0.8, 0.0, 0.0, 0.0))
+    # It folds at a radius of 0.43 focal lengths: 2 / 3 of the ideal one, where 1 - 2.4 r^2 is 0.
+    at = 2 / 3 / np.sqrt(2.4)
+    for focal, share in ((480.0, 1.0), (420.0, at * 420 / 200)):
+        camera = Camera(focal, focal, 159.5, 119.5, 320, 240, (-0.8, 0.0, 0.0, 0.0))
+        assert unfolded_share(camera) == pytest.approx(share, abs=0.003)
+    with pytest.raises(ValueError, match='pixels from 75% of the way to a corner on'):
+        Camera(350.0, 350.0, 159.5, 119.5, 320, 240, (-0.8, 0.0, 0.0, 0.0))
 
 
 def test_scaled_camera_sees_the_same_through_larger_pixels():

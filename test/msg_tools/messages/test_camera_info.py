@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,6 +48,7 @@ def info(**changes: Any) -> SimpleNamespace:
         ('rational_polynomial', RATIONAL),
         ('rational_polynomial', [*RATIONAL, 0.0, 0.0, 0.0, 0.0]),
         ('rational_polynomial', [0.0] * 14),
+        ('plumb_bob', [*PLUMB_BOB, 0.0, 0.0, 0.0]),
     ],
 )
 def test_projects_as_opencv(model: str, coefficients: list[float]) -> None:
@@ -66,6 +68,16 @@ def test_fisheye_projects_as_opencv() -> None:
         points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(EQUIDISTANT)
     )
     np.testing.assert_allclose(camera.project(points), wanted[:, 0], atol=1e-8)
+
+
+def test_a_distortion_that_folds_in_the_corners_is_told() -> None:
+    told: list[str] = []
+    camera_from_info(info(d=np.array([0.17, -0.3, 0.0, 0.0, 0.0])), tell=told.append)
+    assert told == []
+    camera_from_info(info(d=np.array([-0.34, 0.0, 0.0, 0.0, 0.0])), tell=told.append)
+    (line,) = told
+    # It folds at 2 / 3 of the ideal radius, where 1 - 1.02 r^2 is 0; a corner lies at 0.677.
+    assert re.search('the image from 9[678]% of the way to a corner on', line)
 
 
 def test_region_and_binning() -> None:
