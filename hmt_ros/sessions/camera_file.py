@@ -90,12 +90,13 @@ def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: Non
         calibrations = _calibrations(found)
         if not calibrations:
             raise ValueError(f'no calibration: none of the names {", ".join(_MATRIX)} is in it')
-        if len(calibrations) > 1 and name not in calibrations:
+        named = {str(x.get('name')): x for x in calibrations.values()} | calibrations
+        if name not in named and (name or len(calibrations) > 1):
             some = next(iter(calibrations))
             raise ValueError(
                 f'calibrations of the cameras {", ".join(calibrations)}: name one, as {file}:{some}'
             )
-        entries = _entries(calibrations.get(name, next(iter(calibrations.values()))), model, size)
+        entries = _entries(named.get(name, next(iter(calibrations.values()))), model, size)
         return camera_from_info(SimpleNamespace(**entries), size, lambda x: tell(f'{path}: {x}'))
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f'{path}: {error}') from error

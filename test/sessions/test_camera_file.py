@@ -171,6 +171,12 @@ def test_one_camera_of_several(tmp_path):
         read_camera(tmp_path / 'calib.toml:cam_2', SIZE)
     assert read_camera(tmp_path / 'calib.toml:cam_0', SIZE).fy == 510.0
     assert read_camera(tmp_path / 'calib.toml:cam_1', SIZE).fy == 520.0
+    write(path, second.replace('left', 'right') + TOML)
+    assert read_camera(tmp_path / 'calib.toml:right', SIZE).fy == 520.0
+    write(tmp_path / 'one.toml', TOML)
+    assert read_camera(tmp_path / 'one.toml:left', SIZE).fy == 510.0
+    with pytest.raises(ValueError, match=r'cam_0: name one, as .*one\.toml:cam_0$'):
+        read_camera(tmp_path / 'one.toml:right', SIZE)
 
 
 def test_small_skew_is_dropped_and_told(tmp_path):
