@@ -54,7 +54,7 @@ exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Arguments of the command, see its help."""
+    """Arguments of the command, see its help; `notes` are lines that the page shows, too."""
 
     bag: Path
     output: Path
@@ -67,6 +67,7 @@ class ReportOptions:
     image_topic: str | None = None
     camera_info_topic: str | None = None
     body: str | None = None
+    notes: Sequence[str] = ()
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -163,7 +164,7 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
         )
     stamps = _shown(everything, options.times)
     mixtures = everything.at(stamps)
-    notes = []
+    notes = [*options.notes]
     if len(stamps) < len(everything.stamps):
         notes.append(f'{len(stamps)} of {len(everything.stamps)} times are shown')
     notes += [
