@@ -208,6 +208,7 @@ setup(
         'tqdm',
         'lz4',
         'zstandard',
+        'tomli; python_version < "3.11"',
         *opencv(),
     ],
     extras_require={
@@ -215,6 +216,7 @@ setup(
         'dask': ['distributed'],
         'learning': ['jax', 'optax'],
         'detector': ['ai-edge-litert'],
+        'video': ['av'],
     },
     zip_safe=False,
     cmdclass={'install': Install, 'develop': Develop},

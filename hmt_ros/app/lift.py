@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from hmt_ros.app.command_line import (
 from hmt_ros.app.import_video.command import add_camera_arguments, camera_of, person_choice
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection
 from hmt_ros.app.import_video.keypoint_files import Choice, Chooser, FoundPersons, read_keypoints
-from hmt_ros.app.progress import show_progress
+from hmt_ros.app.progress import show_progress, tell_user
 from hmt_ros.app.rendered_bag import START_NS
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.body import Body, Camera, load_body
@@ -135,7 +136,7 @@ def _lift(arguments: argparse.Namespace) -> int:
     size = arguments.size or found.size
     if size is None:
         raise ValueError('the size of the images is unknown: --size WxH')
-    camera = camera_of(arguments, size)
+    camera = camera_of(arguments, size, partial(tell_user, 'lift'))
     times, seen = _chosen(found, arguments.person, arguments.fps)
     stamps = [arguments.first_stamp + time for time in times]
     if not any(len(one.names) for one in seen):

@@ -10,7 +10,8 @@ to the person's right (left in the image), y towards the camera, z up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +23,13 @@ DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equid
 
 NEAR = 0.01  # least depth of a point that has an image, m
 STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
+# Tangents at which a distortion is checked, and the largest factor by which a lens magnifies more
+# farther out: calibrations of real lenses reach 2.5, at the corners of wide images.
+CHECKED = np.tan(0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2)
+LARGEST_RISE = 4.0
+# Part of the way from the principal point to a corner on which a distortion must not fold. The ends
+# of the longer side lie there; polynomials of real calibrations may fold farther out.
+LEAST_UNFOLDED = 0.8
 
 
 @dataclass(frozen=True)
@@ -38,7 +46,7 @@ class Camera:
 
     Raises:
         ValueError: a focal length is not positive, a value is not finite, the model is unknown or
-            has another number of coefficients.
+            has another number of coefficients, or the distortion folds well inside the image.
     """
 
     fx: float
@@ -75,6 +83,30 @@ class Camera:
         if bends and not coefficients:
             coefficients = (0.0,) * max(counts)
         object.__setattr__(self, 'distortion', coefficients if bends else ())
+        if bends and (share := unfolded_share(self)) < LEAST_UNFOLDED:
+            raise ValueError(
+                f'the distortion {self.distortion_model} of {self.distortion} folds or '
+                f'overstretches the image of {self.width}x{self.height} pixels from {share:.0%} of '
+                'the way to a corner on: it is of another camera or size, or the pattern was not '
+                'seen far out; calibrate again, as a fisheye if the lens is wide'
+            )
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same camera with images of another size, px.
+
+        Raises:
+            ValueError: the size has another shape, beyond rounding to whole pixels.
+        """
+        if abs(width * self.height - height * self.width) >= max(self.width, self.height):
+            raise ValueError(
+                f'the calibration is for images of {self.width}x{self.height} pixels, which have '
+                f'another shape than {width}x{height}; calibrate with images of this size'
+            )
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * x, fy=self.fy * y, cx=(self.cx + 0.5) * x - 0.5,
+            cy=(self.cy + 0.5) * y - 0.5, width=width, height=height,
+        )  # fmt: skip
 
     @property
     def matrix(self) -> Array:
@@ -101,7 +133,7 @@ class Camera:
         x, y, z = points
         z = np.where(z > NEAR, z, np.nan)
         a, b = x / z, y / z
-        distorted, inner = self._distort(a, b)
+        distorted, inner = self.distort(a, b)
         lens = ((self.fx, self.cx), (self.fy, self.cy))
         pixels = np.stack([f * x + c for (f, c), x in zip(lens, distorted, strict=True)])
         if not derivative:
@@ -128,7 +160,7 @@ class Camera:
         ab = target.copy()
         if self.distortion:
             for _ in range(20):
-                value, inner = self._distort(ab[0], ab[1])
+                value, inner = self.distort(ab[0], ab[1])
                 error = value - target
                 det = inner[0][0] * inner[1][1] - inner[0][1] * inner[1][0]
                 det = np.where(np.abs(det) > 1e-9, det, 1.0)
@@ -144,7 +176,7 @@ class Camera:
         result: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         return result
 
-    def _distort(self, a: Array, b: Array) -> tuple[Array, tuple[tuple[Array, Array], ...]]:
+    def distort(self, a: Array, b: Array) -> tuple[Array, tuple[tuple[Array, Array], ...]]:
         """Distorted normalised coordinates (2, ...) and their derivatives d(i) / d(a, b)."""
         if not self.distortion:
             one, zero = np.ones(()), np.zeros(())
@@ -186,6 +218,28 @@ class Camera:
         value = np.stack([a * scale, b * scale])
         mixed = a * b * slope
         return value, ((scale + a * a * slope, mixed), (mixed, scale + b * b * slope))
+
+
+@lru_cache(maxsize=64)
+def unfolded_share(camera: Camera) -> float:
+    """The part, 0 to 1, of the way to the corners on which rays farther out lie farther out.
+
+    From the principal point to each corner the distorted radius must rise with the ideal one, and
+    nowhere so much faster than farther in that no lens does it.
+    """
+    x, y = (np.array([-0.5, n - 0.5]) for n in (camera.width, camera.height))
+    a, b = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+    corners = np.hypot(a, b).reshape(-1, 1).clip(min=1e-9)
+    ideal = CHECKED * np.stack([a, b]).reshape(2, -1, 1) / corners
+    with np.errstate(all='ignore'):  # a rational model has poles, which lie outside
+        radius = np.hypot(*camera.distort(*ideal)[0])
+        slope = np.diff(radius) / np.diff(CHECKED)
+    # A fold may lead back into the image from outside, which matters to no pixel.
+    reached = np.maximum.accumulate(radius, axis=1)[:, :-1]
+    # In the middle the slope is 1.
+    steepest = LARGEST_RISE * np.minimum.accumulate(slope, axis=1).clip(max=1.0)
+    folded = (reached < corners) & ((slope <= 0) | (slope > steepest))
+    return float(np.where(folded, reached / corners, 1.0).min())
 
 
 @dataclass(frozen=True)

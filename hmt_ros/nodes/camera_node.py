@@ -43,6 +43,7 @@ from hmt_ros.sessions.declared_parameters import (
 )
 from hmt_ros.sessions.focal_length import USUAL_FOV, usual_camera
 from msg_tools import RosbagsMessages
+from msg_tools.files.display_matrix import STORED, display_matrix, is_mirrored
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.cdr import serialise
@@ -105,6 +106,12 @@ class Video:
         if not self._capture.isOpened():
             kind = 'a video that OpenCV reads' if self.is_file else 'a webcam that nobody uses'
             raise CameraError(f'{source} can not be opened; wanted {kind}')
+        if self.is_file and is_mirrored(display_matrix(Path(source)) or STORED):
+            # OpenCV would turn it by 180 degrees.
+            raise CameraError(
+                f'{source}: its metadata mirror the images; write them as players show them, by '
+                f'ffmpeg -i {source} shown.mp4'
+            )
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         self._rate = rate if math.isfinite(rate) and rate > 0.0 else _USUAL_RATE
 
@@ -177,7 +184,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     view.add_argument(
         '--calibration', type=Path, metavar='FILE',
-        help='calibration of camera_calibration or of OpenCV, for images of this size',
+        help='calibration file, as import-video --camera takes it',
     )  # fmt: skip
     parser.add_argument('--frame-id', default=FRAME_ID, help=f'of the images ({FRAME_ID})')
     return parser
@@ -260,7 +267,7 @@ def _show(
 def _camera(node: Any, given: argparse.Namespace, size: tuple[int, int]) -> Camera:
     """The calibration; a warning where it is assumed."""
     if given.calibration is not None:
-        return read_camera(given.calibration, size)
+        return read_camera(given.calibration, size, node.get_logger().warn)
     if given.fov is None:
         node.get_logger().warn(
             f'neither --calibration nor --fov is given: the field of view is taken to be '

@@ -1,136 +1,185 @@
 """The camera of images: from its field of view, or from a calibration file.
 
-Calibration files are those of OpenCV (FileStorage: YAML, XML or JSON) and those of ROS
-(camera_calibration, or a camera_info as `ros2 topic echo --once` prints it).
+Calibration files are those of OpenCV (FileStorage: YAML, XML or JSON), of ROS (camera_calibration,
+or a camera_info as `ros2 topic echo --once` or `rostopic echo -n1` prints it), the camchain of
+kalibr, and the `.toml` of anipose, Pose2Sim and caliscope.
 """
 
 from __future__ import annotations
 
 import math
+import re
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import cv2
-import numpy as np
 
 from hmt_ros.body import Camera
-from hmt_ros.inference.arrays import Array
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.plain_yaml import load_plain_yaml
-from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
+from msg_tools.messages.camera_info import camera_from_info
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 LARGEST_FILE = 1_000_000  # bytes
-# Names of the entries of an OpenCV file in several programs.
-_MATRIX = ('camera_matrix', 'Camera_Matrix', 'cameraMatrix', 'K', 'M1')
-_DISTORTION = (
-    'distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'dist_coeffs', 'D', 'D1',
+# Names of the entries in several programs.
+_MATRIX = (
+    'camera_matrix', 'Camera_Matrix', 'cameraMatrix', 'K', 'k', 'M1', 'matrix', 'intrinsics',
 )  # fmt: skip
-_WIDTH, _HEIGHT = ('image_width', 'image_Width'), ('image_height', 'image_Height')
-_HEADS = ('%YAML', '<?xml', '{')
+_DISTORTION = (
+    'distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'dist_coeffs', 'D', 'd',
+    'D1', 'distortions', 'distortion_coeffs',
+)  # fmt: skip
+_WIDTH, _HEIGHT = (
+    ('image_width', 'image_Width', 'width'),
+    ('image_height', 'image_Height', 'height'),
+)
+_SIZE = ('size', 'resolution')
+_FISHEYE = ('fisheye', 'fisheye_model')
+_OPENCV = ('%YAML', '<?xml', '{')
+
+Tell = Callable[[str], object]
 
 
 def camera_of_view(
-    size: tuple[int, int], horizontal: float | None = None, vertical: float | None = None
+    size: tuple[int, int],
+    horizontal: float | None = None,
+    vertical: float | None = None,
+    aspect: float = 1.0,
 ) -> Camera:
-    """A camera with square pixels whose axis meets the middle of the image.
+    """A camera whose axis meets the middle of the image.
 
     Args:
         size: width and height of the image, px.
         horizontal: angle from the left border to the right, degrees; or
         vertical: angle from the upper border to the lower, degrees.
+        aspect: width of a pixel over its height.
     """
     width, height = size
     side, angle = (width, horizontal) if horizontal is not None else (height, vertical)
     assert angle is not None
     focal = 0.5 * side / math.tan(math.radians(angle) / 2)
-    return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+    fx, fy = (focal, focal * aspect) if horizontal is not None else (focal / aspect, focal)
+    return Camera(fx, fy, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
-def read_camera(path: Path, size: tuple[int, int]) -> Camera:
+def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: None) -> Camera:
     """The camera that a calibration file describes.
 
     Args:
-        size: width and height of the images, px; the file must be for the same.
+        path: the file; with `:NAME` behind it, the camera NAME of several in the file.
+        size: width and height of the images, px; a calibration for images of the same shape is
+            scaled, one without a size is for these.
+        tell: takes a line on what is neglected or scaled.
 
     Raises:
-        ValueError: no calibration in the file, a damaged one, or one for another size.
+        ValueError: no calibration in the file, a damaged one, or one for another shape.
     """
+    file, name = path, ''
+    if not path.exists() and ':' in path.name:
+        head, _, name = str(path).rpartition(':')
+        file = Path(head)
     try:
-        text = read_bytes(path, LARGEST_FILE).decode('utf-8')
-        entries = _of_opencv(text, size) if text.lstrip().startswith(_HEADS) else _of_ros(text)
-        return camera_from_info(SimpleNamespace(**entries), size)
-    except ValueError as error:
+        found, model = _content(file, read_bytes(file, LARGEST_FILE).decode('utf-8'))
+        calibrations = _calibrations(found)
+        if not calibrations:
+            raise ValueError(f'no calibration: none of the names {", ".join(_MATRIX)} is in it')
+        named = {str(x.get('name')): x for x in calibrations.values()} | calibrations
+        if name not in named and (name or len(calibrations) > 1):
+            some = next(iter(calibrations))
+            raise ValueError(
+                f'calibrations of the cameras {", ".join(calibrations)}: name one, as {file}:{some}'
+            )
+        entries = _entries(named.get(name, next(iter(calibrations.values()))), model, size)
+        return camera_from_info(SimpleNamespace(**entries), size, lambda x: tell(f'{path}: {x}'))
+    except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f'{path}: {error}') from error
 
 
-def _of_opencv(text: str, size: tuple[int, int]) -> dict[str, Any]:
-    """Entries of a camera_info, from a file of OpenCV; one without a size is for the images."""
+def _content(path: Path, text: str) -> tuple[Any, str]:
+    """The entries of a file, and the model of the distortion where they name none."""
+    if path.suffix.lower() == '.toml':
+        return tomllib.loads(text), 'pinhole'
+    if not text.lstrip().startswith(_OPENCV):
+        # An echoed topic has a line of --- behind each message: the first counts.
+        first = re.split('^---', text.strip().removeprefix('---'), flags=re.MULTILINE)[0]
+        return load_plain_yaml(first), ''
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        return _of_opencv(storage.root()), 'pinhole'
     except (cv2.error, SystemError) as error:
         raise ValueError('not a file of OpenCV (FileStorage)') from error
 
-    def node(names: tuple[str, ...]) -> Any:
-        found = (storage.getNode(name) for name in names)
-        return next((x for x in found if not x.empty()), None)
 
-    def matrix(names: tuple[str, ...]) -> Array | None:
-        found = node(names)
-        value = None if found is None else found.mat()
-        return None if value is None else np.asarray(value, dtype=np.float64)
-
-    def whole(names: tuple[str, ...], otherwise: int) -> int:
-        found = node(names)
-        return otherwise if found is None else int(found.real())
-
-    k, d = matrix(_MATRIX), matrix(_DISTORTION)
-    if k is None or k.shape != (3, 3):
-        raise ValueError(f'no 3x3 matrix under one of the names {", ".join(_MATRIX)}')
-    coefficients = [] if d is None else [float(x) for x in d.reshape(-1)]
-    fisheye = node(('fisheye_model',))
-    model = 'rational_polynomial' if len(coefficients) > 5 else 'plumb_bob'
-    if fisheye is not None and fisheye.real():
-        model = 'equidistant'
-    return _entries(
-        k.reshape(-1), coefficients, model, whole(_WIDTH, size[0]), whole(_HEIGHT, size[1])
-    )
+def _of_opencv(node: Any) -> Any:
+    if node.isMap():
+        return {name: _of_opencv(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
+    if node.isSeq():
+        return [_of_opencv(node.at(i)) for i in range(node.size())]
+    return node.string() if node.isString() else node.real()
 
 
-def _of_ros(text: str) -> dict[str, Any]:
-    """Entries of a camera_info, from a file of ROS."""
-    content = load_plain_yaml(text.strip().removesuffix('---'))
+def _calibrations(content: Any, name: str = '') -> dict[str, dict[Any, Any]]:
+    """The tables with a matrix, by their names."""
     if not isinstance(content, dict):
-        raise ValueError('not a calibration: wanted a file of OpenCV or a camera_info of ROS')
-    if 'camera_matrix' in content:
-        k, d = (_data(content, x) for x in ('camera_matrix', 'distortion_coefficients'))
-        width, height = content.get('image_width'), content.get('image_height')
-    elif 'k' in content:
-        k, d = content['k'], content.get('d', [])
-        width, height = content.get('width'), content.get('height')
+        return {}
+    if _first(content, _MATRIX) is not None:
+        return {name: content}
+    return {k: v for x in content for k, v in _calibrations(content[x], str(x)).items()}
+
+
+def _entries(content: dict[Any, Any], model: str, size: tuple[int, int]) -> dict[str, Any]:
+    """Entries of a camera_info.
+
+    Args:
+        model: of the distortion, where the content names none.
+    """
+    k, d = _numbers(_first(content, _MATRIX)), _numbers(_first(content, _DISTORTION) or [])
+    if 4 <= len(k) <= 6:  # as kalibr writes them, those of other models than a pinhole first
+        fx, fy, cx, cy = k[-4:]
+        k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    given = _first(content, _WIDTH), _first(content, _HEIGHT)
+    sides = _numbers(
+        _first(content, _SIZE) or [size[i] if x is None else x for i, x in enumerate(given)]
+    )
+    if len(sides) != 2 or not all(math.isfinite(x) for x in sides):
+        raise ValueError(f'size is {sides}, wanted width and height of the images')
+    lens = str(content.get('camera_model') or 'pinhole')
+    if _first(content, _FISHEYE):
+        model = 'fisheye'
+    elif lens.lower() != 'pinhole':
+        model = lens
     else:
-        raise ValueError('no calibration: neither camera_matrix nor k is in it')
-    values = [width, height, *(k if isinstance(k, list) else [None])]
-    values += d if isinstance(d, list) else [None]
-    if not all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in values):
-        raise ValueError('not a calibration: its sizes, matrix and coefficients must be numbers')
-    entries = _entries(k, d, str(content.get('distortion_model', '')), width, height)
-    region, binning = content.get('roi'), ('binning_x', 'binning_y')
-    if isinstance(region, dict):
-        vars(entries['roi']).update({str(name): value for name, value in region.items()})
-    return entries | {name: content[name] for name in binning if name in content}
-
-
-def _data(content: dict[Any, Any], name: str) -> Any:
-    entry = content.get(name)
-    return entry.get('data') if isinstance(entry, dict) else entry or []
-
-
-def _entries(k: Any, d: Any, model: str, width: Any, height: Any) -> dict[str, Any]:
-    if not (math.isfinite(width) and math.isfinite(height)):
-        raise CameraInfoError(f'size is {width}x{height}, wanted that of the picture')
+        model = str(content.get('distortion_model') or model)
     region = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
+    if isinstance(content.get('roi'), dict):
+        vars(region).update({str(name): value for name, value in content['roi'].items()})
     return {
-        'k': k, 'd': d, 'distortion_model': model, 'width': int(width), 'height': int(height),
-        'roi': region, 'binning_x': 0, 'binning_y': 0,
+        'k': k, 'd': d, 'distortion_model': model, 'width': int(sides[0]), 'height': int(sides[1]),
+        'roi': region, 'binning_x': content.get('binning_x') or 0,
+        'binning_y': content.get('binning_y') or 0,
     }  # fmt: skip
+
+
+def _first(content: dict[Any, Any], names: tuple[str, ...]) -> Any:
+    """The entry under the first of some names that is there; None: under none."""
+    return next((content[name] for name in names if content.get(name) is not None), None)
+
+
+def _numbers(value: Any) -> list[float]:
+    """The numbers of a list, of a list of rows, or of the `data` of a matrix."""
+    if isinstance(value, dict):
+        value = value.get('data')
+    rows = value if isinstance(value, list) else [value]
+    try:
+        # YAML takes 1e-05, without a point, for text.
+        return [float(x) for row in rows for x in (row if isinstance(row, list) else [row])]
+    except (TypeError, ValueError) as error:
+        text = 'not a calibration: its sizes, matrix and coefficients must be numbers'
+        raise ValueError(f'{text} ({error})') from error

@@ -253,8 +253,9 @@ class CameraSession(Session[CameraParameters, State]):
     def _take_camera_info(self, message: Any) -> None:
         self._info_stamp = time_ns(message.header.stamp)
         self._see_frame(CAMERA_INFO, message)
+        neglected: list[str] = []
         try:
-            camera = camera_from_info(message)
+            camera = camera_from_info(message, tell=neglected.append)
         except CameraInfoError as error:
             text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
             self._uncalibrated = text if self._camera is None else ''
@@ -263,6 +264,9 @@ class CameraSession(Session[CameraParameters, State]):
         self._uncalibrated = ''
         self._frame = str(message.header.frame_id)
         known, self._camera = self._camera, camera
+        if camera != known:
+            for text in neglected:
+                self._log.note(Fault.CAMERA_INFO, text, warn=True)
         if known is not None and camera != known:
             text = f'camera_info changes: {self.ESTIMATE} starts anew'
             self._log.note(Fault.CALIBRATION, text)

@@ -163,6 +163,11 @@ class BagMessage:
         """
         return self._deserialise(self)
 
+    def with_message(self, message: Any) -> BagMessage:
+        """Another message of `rosbags` in the place of this one; it has no bytes."""
+        kind = message.__msgtype__
+        return BagMessage(self.topic, kind, self.log_time_ns, memoryview(b''), lambda _: message)
+
 
 class BagReader(AbstractContextManager['BagReader']):
     """A bag that is open for reading.

@@ -8,16 +8,27 @@ picture, the convention of image_geometry.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from hmt_ros.body import Camera
+from hmt_ros.body.camera import unfolded_share
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import MessageFactory
 
 # Number of coefficients that stand for no distortion.
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
+# Other names of the models. Of a pinhole the number of coefficients tells it, as in OpenCV.
+_PINHOLE = ('pinhole', 'perspective', 'none')
+_ALIASES = {
+    'radtan': 'plumb_bob', 'brown_conrady': 'plumb_bob', 'brown-conrady': 'plumb_bob',
+    'fisheye': 'equidistant', 'equi': 'equidistant', 'kannala_brandt': 'equidistant',
+    'kannala_brandt4': 'equidistant',
+}  # fmt: skip
+# Skew that is dropped, in focal lengths; it shifts the border of an image by 2 px at most, about.
+_LARGEST_SKEW = 0.01
 
 # A calibration beyond these is damage: focal lengths and the principal point in sizes of the
 # picture, and coefficients of the distortion.
@@ -33,12 +44,18 @@ class UncalibratedError(CameraInfoError):
     """A camera info of a camera that is not calibrated."""
 
 
-def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) -> Camera:
+def camera_from_info(
+    message: Any,
+    image_size: tuple[int, int] | None = None,
+    tell: Callable[[str], object] = lambda text: None,
+) -> Camera:
     """The camera that took the pictures.
 
     Args:
         message: sensor_msgs/CameraInfo, of `rosbags` or of ROS.
-        image_size: (width, height) of a picture that it has to fit, px.
+        image_size: (width, height) of a picture that it has to fit, px; one of the same shape is
+            scaled.
+        tell: takes a line on what is neglected.
 
     Raises:
         CameraInfoError: not calibrated, values that are not finite or do not fit each other, an
@@ -54,10 +71,13 @@ def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) ->
         raise CameraInfoError('camera info: K or D has values that are not finite')
     if k[0] < 0.0 or k[4] <= 0.0:
         raise CameraInfoError(f'camera info: focal lengths are {k[0]} and {k[4]}, wanted positive')
-    if k[1] != 0.0 or k[3] != 0.0 or k[6:] != [0.0, 0.0, 1.0]:
+    if abs(k[1]) >= _LARGEST_SKEW * k[0] or k[3] != 0.0 or k[6:] != [0.0, 0.0, 1.0]:
         raise CameraInfoError(
-            f'camera info: K is {k}, wanted [fx, 0, cx, 0, fy, cy, 0, 0, 1] without skew'
+            f'camera info: K is {k}, wanted [fx, 0, cx, 0, fy, cy, 0, 0, 1] with a skew K[1] below '
+            f'{_LARGEST_SKEW * k[0]:.3g}; calibrate with the skew fixed at 0'
         )
+    if k[1] != 0.0:
+        tell(f'camera info: the skew of K, {k[1]:.3g} of {k[0]:.4g} pixels, is taken for 0')
     model, coefficients = _distortion(str(message.distortion_model), d)
     x, y, width, height = _region(message)
     _check_plausible(k, coefficients, max(width, height))
@@ -67,12 +87,8 @@ def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) ->
         raise CameraInfoError(
             f'camera info: binning of {binning_x} and {binning_y} leaves {width}x{height} pixels'
         )
-    if image_size is not None and tuple(image_size) != (width, height):
-        raise CameraInfoError(
-            f'camera info is for pictures of {width}x{height}, saw {image_size[0]}x{image_size[1]}'
-        )
     try:
-        return Camera(
+        camera = Camera(
             fx=k[0] / binning_x,
             fy=k[4] / binning_y,
             cx=(k[2] - x) / binning_x,
@@ -82,8 +98,22 @@ def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) ->
             distortion=coefficients,
             distortion_model=model,
         )
+        if (share := unfolded_share(camera)) < 1.0:
+            tell(
+                f'camera info: the distortion folds or overstretches the image from {share:.0%} of '
+                'the way to a corner on: nothing is right there; calibrate with the pattern there'
+            )
+        if image_size is None or tuple(image_size) == (width, height):
+            return camera
+        wide, high = image_size
+        scaled = camera.scaled(wide, high)
     except ValueError as error:
         raise CameraInfoError(f'camera info: {error}') from error
+    tell(
+        f'camera info: the calibration for images of {width}x{height} pixels is scaled to '
+        f'{wide}x{high}; it is wrong if these are cut from larger ones'
+    )
+    return scaled
 
 
 def _check_plausible(k: list[float], coefficients: tuple[float, ...], size: int) -> None:
@@ -106,6 +136,11 @@ def _check_plausible(k: list[float], coefficients: tuple[float, ...], size: int)
 
 
 def _distortion(model: str, coefficients: list[float]) -> tuple[str, tuple[float, ...]]:
+    model = _ALIASES.get(model.lower(), model)
+    if model.lower() in _PINHOLE:
+        model = 'plumb_bob' if len(coefficients) < 8 else 'rational_polynomial'
+    if model == 'plumb_bob' and not any(coefficients[5:]):
+        coefficients = coefficients[:5]
     if not any(coefficients):
         if model not in ('', 'plumb_bob', 'rational_polynomial', 'equidistant'):
             raise CameraInfoError(f'camera info: unknown distortion model {model!r}')

@@ -74,14 +74,20 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     'uyvy': ('u1', 2, cv2.COLOR_YUV2BGR_UYVY),
     'yuv422_yuy2': ('u1', 2, cv2.COLOR_YUV2BGR_YUY2),
     'yuyv': ('u1', 2, cv2.COLOR_YUV2BGR_YUY2),
+    'yvyu': ('u1', 2, cv2.COLOR_YUV2BGR_YVYU),
+    'yuv420': ('u1', 1, cv2.COLOR_YUV2BGR_I420),
+    'i420': ('u1', 1, cv2.COLOR_YUV2BGR_I420),
+    'yv12': ('u1', 1, cv2.COLOR_YUV2BGR_YV12),
     'nv12': ('u1', 1, cv2.COLOR_YUV2BGR_NV12),
     'nv21': ('u1', 1, cv2.COLOR_YUV2BGR_NV21),
 }
 _MASKS = ('mono8', '8UC1')
 # Chroma rows of half the height follow the picture.
-_PLANAR = ('nv12', 'nv21')
+_PLANAR = ('nv12', 'nv21', 'yuv420', 'i420', 'yv12')
+# Their rows are half as long in these, one plane after the other.
+_THREE_PLANES = ('yuv420', 'i420', 'yv12')
 # Two neighbours share their chroma, or a colour pattern repeats.
-_EVEN_WIDTH = ('yuv422', 'uyvy', 'yuv422_yuy2', 'yuyv', *_PLANAR)
+_EVEN_WIDTH = ('yuv422', 'uyvy', 'yuv422_yuy2', 'yuyv', 'yvyu', *_PLANAR)
 # Encoding: dtype and how many of its units are a metre. Some drivers say mono16 for 16UC1.
 _DEPTH_ENCODINGS = {'16UC1': ('u2', 1000), 'mono16': ('u2', 1000), '32FC1': ('f4', 1)}
 
@@ -111,8 +117,16 @@ def _decode_raw(message: Any) -> Picture:
     if (encoding in _EVEN_WIDTH and width % 2) or (encoding in _PLANAR and height % 2):
         raise ImageError(f'image of {width}x{height} can not be {encoding}, wanted even sizes')
     rows = height * 3 // 2 if encoding in _PLANAR else height
+    row_bytes = width * channels * np.dtype(dtype).itemsize
     image: NDArray[Any]
-    image = pixels = _rows_of(message, rows, width * channels * np.dtype(dtype).itemsize)
+    if encoding in _THREE_PLANES:
+        if message.step % 2:
+            raise ImageError(f'image step is {message.step}, wanted an even one for {encoding}')
+        whole = _rows_of(message, rows, max(row_bytes, int(message.step)))
+        chroma = whole[height:].reshape(height, -1)[:, : width // 2]
+        image = pixels = np.concatenate([whole[:height, :width], chroma.reshape(-1, width)])
+    else:
+        image = pixels = _rows_of(message, rows, row_bytes)
     if dtype == 'u2':
         image = pixels.view('>u2' if message.is_bigendian else '<u2').astype(np.uint16)
     image = image.reshape((rows, width, channels) if channels > 1 else (rows, width))

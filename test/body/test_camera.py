@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmt_ros.body import Camera
+from hmt_ros.body.camera import unfolded_share
 
 LENSES = {
     'none': ('plumb_bob', ()),
@@ -111,6 +112,10 @@ def test_zero_coefficients_are_no_distortion():
         ({'width': 0}, 'image size must be positive, saw 0 x 480'),
         ({'distortion': (0.1, 0.2, 0.3)}, 'coefficients, saw 3'),
         ({'distortion': (0.1,) * 5, 'distortion_model': 'equidistant'}, 'coefficients, saw 5'),
+        ({'distortion': (-5.0, 30.0, 0.0, 0.0)}, 'folds or overstretches the image of 640x480'),
+        ({'distortion': (1e6, 1e6, 1e6, 1e6, 1e6)}, 'folds or overstretches'),
+        ({'fx': 9e3, 'fy': 9e3, 'distortion': (-300.0, 0.0, 0.0, 0.0)}, 'folds or'),
+        ({'distortion': (-0.8, 0.0, 0.0, 0.0)}, 'folds or overstretches'),
         ({'distortion_model': 'fisheye624'}, "unknown distortion model 'fisheye624'"),
     ],
 )
@@ -143,3 +148,47 @@ def test_magnification_is_pixels_for_a_metre(depth):
 @pytest.mark.parametrize('depth', [0.0, -1.0])
 def test_magnification_behind_the_camera_is_finite(depth):
     assert 0 < Camera(600.0, 600.0, 320.0, 240.0, 640, 480).magnification(depth) < np.inf
+
+
+@pytest.mark.parametrize(
+    ('focal', 'size', 'model', 'coefficients'),
+    [
+        (517.3, (640, 480), 'plumb_bob', (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+        (458.0, (752, 480), 'plumb_bob', (-0.2834, 0.0739, 0.0002, 0.0)),
+        (191.0, (512, 512), 'equidistant', (0.0034, 0.0007, -0.0020, 0.0002)),
+        (286.0, (848, 800), 'equidistant', (-0.0084, 0.0443, -0.0419, 0.0076)),
+        (200.0, (1000, 1000), 'equidistant', (0.0, 0.0, 0.0, 0.0)),
+        (370.0, (640, 480), 'plumb_bob', (-0.3319, 0.0683, -0.0029, 0.0049, 0.0)),
+        (1727.0, (1920, 1080), 'plumb_bob', (0.17, -0.6973, -0.0029, -0.005, 0.0)),
+        (
+            915.0, (1920, 1080), 'rational_polynomial',
+            (0.5, -2.6, 0.0007, -0.0002, 1.5, 0.38, -2.45, 1.44),
+        ),
+    ],
+)  # fmt: skip
+def test_distortions_of_real_cameras_do_not_fold(focal, size, model, coefficients):
+    """Colour and grey cameras of public data sets, fisheyes that see more than half of a sphere."""
+    width, height = size
+    Camera(focal, focal, width / 2, height / 2, width, height, coefficients, model)
+
+
+def test_a_fold_outside_of_the_image_does_not_matter():
+    # It folds at a radius of 0.43 focal lengths: 2 / 3 of the ideal one, where 1 - 2.4 r^2 is 0.
+    at = 2 / 3 / np.sqrt(2.4)
+    for focal, share in ((480.0, 1.0), (420.0, at * 420 / 200)):
+        camera = Camera(focal, focal, 159.5, 119.5, 320, 240, (-0.8, 0.0, 0.0, 0.0))
+        assert unfolded_share(camera) == pytest.approx(share, abs=0.003)
+    with pytest.raises(ValueError, match='pixels from 75% of the way to a corner on'):
+        Camera(350.0, 350.0, 159.5, 119.5, 320, 240, (-0.8, 0.0, 0.0, 0.0))
+
+
+def test_scaled_camera_sees_the_same_through_larger_pixels():
+    camera = Camera(610.0, 590.0, 322.5, 238.0, 640, 480, (-0.28, 0.09, 1e-3, -2e-3))
+    half = camera.scaled(320, 240)
+    points = points_in_view(50, 5)
+    np.testing.assert_allclose(2 * (half.project(points) + 0.5), camera.project(points) + 0.5)
+    assert camera.scaled(640, 480) == camera
+    # Sizes are whole pixels: 853.3 x 480.
+    assert Camera(900, 900, 640, 360, 1280, 720).scaled(853, 480).width == 853
+    with pytest.raises(ValueError, match='640x480 pixels, which have another shape than 640x360'):
+        camera.scaled(640, 360)

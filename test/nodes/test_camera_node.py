@@ -111,6 +111,18 @@ def test_a_camera_that_can_not_be_used(arguments, code, text, ended, monkeypatch
     assert text in errors
 
 
+def test_a_mirrored_file_is_refused(walk_video, tmp_path, ended):
+    """OpenCV would turn it by 180 degrees."""
+    content = bytearray((walk_video / 'walk.mp4').read_bytes())
+    at = content.index(b'tkhd') + 44
+    struct.pack_into('>i', content, at, -struct.unpack_from('>i', content, at)[0])
+    path = tmp_path / 'selfie.mp4'
+    path.write_bytes(content)
+    code, _, errors = ended('camera_node', str(path), '--fov', '60')
+    assert code == 1
+    assert f'{path}: its metadata mirror the images; write them as players show them' in errors
+
+
 def test_the_end_of_a_file_is_told(shown):
     _, said = shown('--fov', '60')
     assert 'walk.mp4: 8 images shown; the file is over' in said

@@ -55,6 +55,20 @@ def test_horizontal_and_vertical_view():
     assert np.degrees(np.arccos(edges[0] @ edges[1])) == pytest.approx(45.0)
 
 
+def test_view_through_pixels_that_are_not_square():
+    # 720x576 shown as 1024x576: the same angles as in the picture of square pixels.
+    narrow, shown = (
+        camera_of_view((720, 576), 60.0, aspect=64 / 45),
+        camera_of_view((1024, 576), 60.0),
+    )
+    points = np.array([[0.3, -0.2, 2.0], [-0.5, 0.4, 2.0]])
+    scale = np.array([1024 / 720, 1.0])
+    assert np.allclose((narrow.project(points) + 0.5) * scale - 0.5, shown.project(points))
+    upright = camera_of_view((720, 576), vertical=40.0, aspect=64 / 45)
+    assert upright.fy / upright.fx == pytest.approx(64 / 45)
+    assert upright.fy == camera_of_view((1024, 576), vertical=40.0).fy
+
+
 @pytest.mark.parametrize('text', [ROS, ECHO])
 def test_files_of_ros(text, tmp_path):
     camera = read_camera(write(tmp_path / 'camera.yaml', text), SIZE)
@@ -76,22 +90,145 @@ def test_files_of_opencv(suffix, tmp_path):
 
 
 def test_models_of_opencv(tmp_path):
-    eight = read_camera(of_opencv(tmp_path / 'a.yaml', [0.1] * 8), SIZE)
+    d = [0.1, 0.1, 0.001, 0.001, 0.1, 0.1, 0.1, 0.1]
+    eight = read_camera(of_opencv(tmp_path / 'a.yaml', d), SIZE)
     assert eight.distortion_model == 'rational_polynomial'
     fish = read_camera(of_opencv(tmp_path / 'b.yaml', [0.1] * 4, fisheye_model=1), SIZE)
     assert fish.distortion_model == 'equidistant'
 
 
+D = (-0.2, 0.1, 0.001, -0.002)
+KALIBR = """\
+cam0:
+  cam_overlaps: []
+  camera_model: pinhole
+  distortion_coeffs: [-0.2, 0.1, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [500.0, 510.0, 320.5, 239.0]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+"""
+TOML = """\
+[cam_0]
+name = "left"
+size = [ 640.0, 480.0,]
+matrix = [ [ 500.0, 0.0, 320.5,], [ 0.0, 510.0, 239.0,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.2, 0.1, 0.001, -0.002,]
+rotation = [ 0.1, 0.2, 0.3,]
+fisheye = false
+
+[metadata]
+adjusted = false
+"""
+OTHERS = {
+    'exponents.yaml': ROS.replace(', 0.0]}', ', 1e-05]}'),
+    'several.yaml': ECHO + ECHO.replace('500.0', '700.0'),
+    'rostopic.yaml': ECHO.replace('d: [', 'D: [').replace('k: [', 'K: [').replace(', 0.0]', ']', 1),
+    'camchain.yaml': KALIBR,
+    'Calib.toml': TOML,
+    'plain.json': (
+        '{"K": [[500, 0, 320.5], [0, 510, 239], [0, 0, 1]], "dist_coeffs": [-0.2, 0.1, 0.001, '
+        '-0.002]}'
+    ),
+}
+
+
+@pytest.mark.parametrize('name', OTHERS)
+def test_files_of_other_programs(name, tmp_path):
+    told = []
+    camera = read_camera(write(tmp_path / name, OTHERS[name]), SIZE, told.append)
+    assert np.array_equal(camera.matrix, K)
+    assert camera.distortion[:4] == D
+    assert camera.distortion_model == 'plumb_bob'
+    assert not told
+
+
+@pytest.mark.parametrize(
+    ('name', 'text'),
+    [
+        ('kalibr.yaml', KALIBR.replace('radtan', 'equi')),
+        ('anipose.toml', TOML.replace('fisheye = false', 'fisheye = true')),
+        (
+            'narrow.yaml',
+            ROS.replace('distortion_model: plumb_bob', 'camera_model: fisheye')
+            .replace('cols: 5', 'cols: 4')
+            .replace('-0.002, 0.0]', '-0.002]'),
+        ),
+    ],
+)
+def test_fisheyes_of_other_programs(name, text, tmp_path):
+    camera = read_camera(write(tmp_path / name, text), SIZE)
+    assert camera.distortion_model == 'equidistant'
+    assert camera.distortion == D
+
+
+def test_one_camera_of_several(tmp_path):
+    second = TOML.replace('cam_0', 'cam_1').replace('510.0', '520.0').partition('[metadata]')[0]
+    path = write(tmp_path / 'calib.toml', second + TOML)
+    with pytest.raises(ValueError, match=r'cam_1, cam_0: name one, as .*calib\.toml:cam_1$'):
+        read_camera(path, SIZE)
+    with pytest.raises(ValueError, match='cam_1, cam_0: name one'):
+        read_camera(tmp_path / 'calib.toml:cam_2', SIZE)
+    assert read_camera(tmp_path / 'calib.toml:cam_0', SIZE).fy == 510.0
+    assert read_camera(tmp_path / 'calib.toml:cam_1', SIZE).fy == 520.0
+    write(path, second.replace('left', 'right') + TOML)
+    assert read_camera(tmp_path / 'calib.toml:right', SIZE).fy == 520.0
+    write(tmp_path / 'one.toml', TOML)
+    assert read_camera(tmp_path / 'one.toml:left', SIZE).fy == 510.0
+    with pytest.raises(ValueError, match=r'cam_0: name one, as .*one\.toml:cam_0$'):
+        read_camera(tmp_path / 'one.toml:right', SIZE)
+
+
+def test_small_skew_is_dropped_and_told(tmp_path):
+    told = []
+    path = write(tmp_path / 'c.yaml', ROS.replace('[500, 0,', '[500, -4.9,'))
+    assert np.array_equal(read_camera(path, SIZE, told.append).matrix, K)
+    assert told == [f'{path}: camera info: the skew of K, -4.9 of 500 pixels, is taken for 0']
+    path = write(tmp_path / 'c.yaml', ROS.replace('[500, 0,', '[500, 5.1,'))
+    with pytest.raises(ValueError, match=r'a skew K\[1\] below 5; calibrate with the skew fixed'):
+        read_camera(path, SIZE)
+
+
+def test_calibration_for_another_size_is_scaled_and_told(tmp_path):
+    told = []
+    path = write(tmp_path / 'camera.yaml', ROS)
+    whole, half = read_camera(path, SIZE), read_camera(path, (320, 240), told.append)
+    points = np.array([[0.3, -0.2, 2.0], [-0.5, 0.4, 2.0]])
+    # The border of the first pixel is at -0.5 in both.
+    assert np.allclose(2 * (half.project(points) + 0.5), whole.project(points) + 0.5)
+    assert len(told) == 1
+    assert 'images of 640x480 pixels is scaled to 320x240' in told[0]
+
+
+def test_distortion_that_folds_is_refused(tmp_path):
+    text = ROS.replace('[-0.2, 0.1, 0.001, -0.002, 0.0]', '[-5, 30, 0, 0, 0]')
+    with pytest.raises(ValueError, match='folds or overstretches the image of 640x480 pixels'):
+        read_camera(write(tmp_path / 'camera.yaml', text), SIZE)
+
+
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
-        (ROS.replace('640', '1280'), 'camera info is for pictures of 1280x480, saw 640x480'),
-        (ROS.replace('camera_matrix', 'matrix'), 'neither camera_matrix nor k is in it'),
+        (
+            KALIBR.replace('pinhole', 'omni').replace('[500', '[0.9, 500'),
+            "unknown distortion model 'omni'",
+        ),
+        (KALIBR.replace('pinhole', 'omni'), "unknown distortion model 'omni'"),
+        (KALIBR.replace('radtan', 'fov'), "unknown distortion model 'fov'"),
+        (KALIBR.replace('[640, 480]', '[640]'), r'size is \[640\.0\], wanted width and height'),
+        (
+            ROS.replace('image_height: 480', 'image_height: 400'),
+            'is for images of 640x400 pixels, which have another shape than 640x480',
+        ),
+        (
+            ROS.replace('camera_matrix', 'camera'),
+            'no calibration: none of the names camera_matrix, .* is in it',
+        ),
         (ROS.replace('320.5', 'wide'), 'its sizes, matrix and coefficients must be numbers'),
         (ROS.replace('data: [500', 'data: [0'), 'uncalibrated'),
-        ('just words', 'not a calibration: wanted a file of OpenCV or a camera_info'),
+        ('just words', 'no calibration: none of the names'),
         ('a: [', 'while parsing'),
-        ('%YAML:1.0\n---\nnothing: 1\n', 'no 3x3 matrix under one of the names camera_matrix'),
+        ('%YAML:1.0\n---\nnothing: 1\n', 'no calibration: none of the names'),
         ('{ "damaged', 'not a file of OpenCV'),
     ],
 )

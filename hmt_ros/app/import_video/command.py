@@ -10,10 +10,11 @@ import argparse
 import math
 from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
@@ -150,7 +151,8 @@ def add_camera_arguments(parser: CommandParser, *, required: bool = True) -> Non
     )
     camera.add_argument(
         '--camera', type=Path, metavar='FILE',
-        help='calibration file of OpenCV (YAML, XML, JSON) or of ROS (camera_info YAML)',
+        help='calibration file of OpenCV (YAML, XML, JSON), ROS (YAML), kalibr (camchain YAML), '
+        'anipose, Pose2Sim or caliscope (TOML); FILE:NAME is camera NAME of several',
     )  # fmt: skip
 
 
@@ -237,6 +239,8 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
         raise ValueError('--detector-masks goes with --detector, and not with --masks')
     selection = Selection(options.start, options.end, options.every)
     source = open_source(options.source, options.fps, options.first_number)
+    for note in source.notes:
+        tell(note)
     masks = None if options.masks is None else Masks(options.masks, source)
     found = None
     if options.keypoints is not None:
@@ -250,7 +254,7 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
         )
         shown = opened.enter_context(closing(counted))
         lifts = options.detector is not None or (found is not None and found.lifts)
-        result = _write(writer, options, shown, see, lifts)
+        result = _write(writer, options, shown, see, lifts, tell)
         if not result.images:
             raise ValueError(
                 f'{options.source}: no frame was read'
@@ -287,8 +291,10 @@ def _seer(options: ImportOptions, found: FoundPersons | None, masks: Masks | Non
     def see(frame: Frame, stamp_ns: int) -> tuple[Keypoints | None, Mask | None]:
         mask = None if masks is None else masks.of(frame)
         if detector is not None:
-            keypoints = detector.detect(frame.image, stamp_ns)
-            return keypoints, detector.mask if options.detector_masks else mask
+            keypoints = _detected(detector, frame, stamp_ns)
+            if options.detector_masks and detector.mask is not None:
+                mask = _in_pixels_of(frame, detector.mask)
+            return keypoints, mask
         if found is None:
             return None, mask
         found.check_size(frame)
@@ -296,6 +302,27 @@ def _seer(options: ImportOptions, found: FoundPersons | None, masks: Masks | Non
         return None if chosen is None else chosen.keypoints, mask
 
     return see
+
+
+def _detected(detector: BlazePose, frame: Frame, stamp_ns: int) -> Keypoints | None:
+    """The keypoints of a frame, which the detector sees with square pixels."""
+    if frame.aspect == 1.0:
+        return detector.detect(frame.image, stamp_ns)
+    height, width = frame.image.shape[:2]
+    wide = round(width * frame.aspect)
+    square = cv2.resize(frame.image, (wide, height), interpolation=cv2.INTER_AREA)
+    found = detector.detect(np.asarray(square, dtype=np.uint8), stamp_ns)
+    if found is None:
+        return None
+    scale = np.array([width / wide, 1.0])
+    covariances = found.covariances * np.outer(scale, scale)
+    return replace(found, pixels=(found.pixels + 0.5) * scale - 0.5, covariances=covariances)
+
+
+def _in_pixels_of(frame: Frame, mask: Mask) -> Mask:
+    height, width = frame.image.shape[:2]
+    resized = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(resized).view(np.bool_)
 
 
 def _same_size(source: FrameSource, selection: Selection) -> Generator[Frame, None, None]:
@@ -312,16 +339,22 @@ def _same_size(source: FrameSource, selection: Selection) -> Generator[Frame, No
         yield frame
 
 
-def camera_of(options: ImportOptions | argparse.Namespace, size: tuple[int, int]) -> Camera:
+def camera_of(
+    options: ImportOptions | argparse.Namespace,
+    size: tuple[int, int],
+    tell: Tell,
+    aspect: float = 1.0,
+) -> Camera:
     """The camera that options describe, with images of a size."""
     if options.camera is not None:
-        return read_camera(options.camera, size)
-    return camera_of_view(size, options.fov, options.vertical_fov)
+        return read_camera(options.camera, size, tell)
+    return camera_of_view(size, options.fov, options.vertical_fov, aspect)
 
 
 def _write(
-    bag: BagWriter, options: ImportOptions, frames: Iterable[Frame], see: Seer, lifts: bool
-) -> Imported:
+    bag: BagWriter, options: ImportOptions, frames: Iterable[Frame], see: Seer, lifts: bool,
+    tell: Tell,
+) -> Imported:  # fmt: skip
     """Writes frame after frame; one is in memory at a time.
 
     With `lifts` every image has a message with positions, maybe of none.
@@ -334,7 +367,7 @@ def _write(
         result.with_masks = 0
     for frame in frames:
         height, width = frame.image.shape[:2]
-        camera = camera or camera_of(options, (width, height))
+        camera = camera or camera_of(options, (width, height), tell, frame.aspect)
         stamp = options.first_stamp + frame.time_ns
         jpeg = frame.jpeg or encode_jpeg(frame.image, options.jpeg_quality)
         bag.write(IMAGE, stamp, jpeg_message(messages, jpeg, stamp, FRAME_ID))

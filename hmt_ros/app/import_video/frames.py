@@ -15,6 +15,14 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Image, Mask
 from msg_tools.files.bounded_file import read_bytes
+from msg_tools.files.display_matrix import (
+    STORED,
+    TURNED,
+    display_matrix,
+    is_mirrored,
+    is_turned,
+    shown,
+)
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import MAX_PIXELS, ImageError, decode_picture
 
@@ -25,11 +33,7 @@ FASTEST = 1000.0  # frames per second; a container that claims more is damaged
 _EXIF_WITHIN = 2**16  # bytes at the beginning of a JPEG
 _QUIET = '-8'  # AV_LOG_QUIET of FFmpeg
 _HALF = 127  # grey levels, of masks
-_TURNS = {
-    90: cv2.ROTATE_90_CLOCKWISE,
-    180: cv2.ROTATE_180,
-    270: cv2.ROTATE_90_COUNTERCLOCKWISE,
-}
+_SQUAREST, _THINNEST = 0.99, 0.1  # sides of pixels, over the longer ones
 # Ubuntu 24.04 ships OpenCV 4.6, which tells the turn of a video in the wrong direction.
 _TURNS_BACKWARDS = cv2.__version__.startswith('4.6.')
 
@@ -44,6 +48,7 @@ class Frame:
         name: of its file; '' in a video file.
         image: (H, W, 3) BGR, upright.
         jpeg: the file that it was read from, if that is a JPEG with the same content; else None.
+        aspect: width of a pixel over its height.
     """
 
     number: int
@@ -51,6 +56,7 @@ class Frame:
     name: str
     image: Image
     jpeg: bytes | None = None
+    aspect: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -92,6 +98,7 @@ class FrameSource(ABC):
         claimed: number of frames that the source announces; 0: it does not tell.
         count: number of frames that were passed so far, wanted or not.
         ended: whether the last frame was passed.
+        notes: lines on how frames are shown.
     """
 
     def __init__(self, path: Path, names: tuple[str, ...] = (), first_number: int = 0) -> None:
@@ -100,6 +107,7 @@ class FrameSource(ABC):
         self.claimed = len(names)
         self.count = 0
         self.ended = False
+        self.notes: list[str] = []
         self._first_number = first_number
         self._by_name = {Path(x).stem: i for i, x in reversed([*enumerate(names)])}
         self._by_name |= {x: i for i, x in enumerate(names)}
@@ -156,7 +164,7 @@ def open_source(path: Path, fps: float | None, first_number: int = 0) -> FrameSo
 
 
 class VideoFile(FrameSource):
-    """A video file. Phones write how they were held: the frames are turned upright.
+    """A video file. Phones write how they were held: frames are turned and mirrored as players do.
 
     Args:
         fps: frames per second; None: the times in the file.
@@ -174,7 +182,24 @@ class VideoFile(FrameSource):
         # Versions of OpenCV differ in whether they turn frames, and in which direction.
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         angle = round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META))
-        self._turn = _TURNS.get((-angle if _TURNS_BACKWARDS else angle) % 360)
+        turned = TURNED.get((-angle if _TURNS_BACKWARDS else angle) % 360, STORED)
+        self._matrix = display_matrix(path) or turned
+        if is_mirrored(self._matrix):
+            self.notes.append(
+                f'{path}: its metadata mirror the frames; they are taken as players show them, so '
+                'that left and right of the person are exchanged if the file is right without'
+            )
+        across = self._capture.get(cv2.CAP_PROP_SAR_NUM)
+        down = self._capture.get(cv2.CAP_PROP_SAR_DEN)
+        if is_turned(self._matrix):
+            across, down = down, across
+        self._aspect = 1.0
+        if _THINNEST * max(across, down) < min(across, down) < _SQUAREST * max(across, down):
+            self._aspect = across / down
+            self.notes.append(
+                f'{path}: pixels are {self._aspect:.3g} times as wide as high: frames stay as they '
+                'are stored, and a field of view is that of the picture as players show it'
+            )
         self._fps = fps
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.claimed = int(count) if 0 < count < MOST else 0
@@ -188,9 +213,8 @@ class VideoFile(FrameSource):
                 done, image = self._capture.retrieve()
                 if not done:
                     raise ValueError(f'{self.path}: frame {number} can not be decoded')
-                if self._turn is not None:
-                    image = cv2.rotate(image, self._turn)
-                yield Frame(number, time_ns, '', np.asarray(image, dtype=np.uint8))
+                upright = shown(np.asarray(image, dtype=np.uint8), self._matrix)
+                yield Frame(number, time_ns, '', upright, None, self._aspect)
         finally:
             self._capture.release()
 
@@ -199,10 +223,10 @@ class VideoFile(FrameSource):
         step = self._step()
         first, last = 0.0, -1
         while self._capture.grab():
-            shown = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+            time = self._capture.get(cv2.CAP_PROP_POS_MSEC)
             if self.count == 0:
-                first = shown
-            time_ns = round((shown - first) * 1e6)
+                first = time
+            time_ns = round((time - first) * 1e6)
             if self._fps is not None:
                 time_ns = round(self.count * SECOND_NS / self._fps)
             elif time_ns <= last:

@@ -12,6 +12,8 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
+from msg_tools.files.mp4_boxes import boxes
+
 KEY = b'com.apple.quicktime.camera.focal_length.35mm_equivalent'
 # Width of a picture on 35 mm film, mm; focal lengths that lenses have, in its terms, mm.
 FILM, FOCAL_LENGTHS = 36.0, (6.0, 1200.0)
@@ -38,18 +40,18 @@ def told_fov(path: Path) -> float | None:
 
 def _focal_lengths(data: mmap.mmap, start: int, end: int) -> Iterator[float]:
     """Values of the key in the boxes of a part of a file."""
-    for kind, first, last in _boxes(data, start, end):
+    for kind, first, last in boxes(data, start, end):
         if kind in (b'moov', b'trak'):
             yield from _focal_lengths(data, first, last)
         elif kind == b'meta':
             # In MP4 files a version stands before the boxes.
             first += 0 if data[first + 4 : first + 8] == b'hdlr' else 4
-            inner = {name: (a, b) for name, a, b in _boxes(data, first, last)}
+            inner = {name: (a, b) for name, a, b in boxes(data, first, last)}
             first, last = inner.get(b'keys', (0, 0))
-            names = [data[a:b] for _, a, b in _boxes(data, first + 8, last)]
-            for number, a, b in _boxes(data, *inner.get(b'ilst', (0, 0))):
+            names = [data[a:b] for _, a, b in boxes(data, first + 8, last)]
+            for number, a, b in boxes(data, *inner.get(b'ilst', (0, 0))):
                 if names[int.from_bytes(number, 'big') - 1 :][:1] == [KEY]:
-                    yield from (_number(data[c:d]) for _, c, d in _boxes(data, a, b))
+                    yield from (_number(data[c:d]) for _, c, d in boxes(data, a, b))
 
 
 def _number(value: bytes) -> float:
@@ -58,18 +60,3 @@ def _number(value: bytes) -> float:
     if kind in _FLOATS:
         return float(struct.unpack(_FLOATS[kind], content)[0])
     return float(content) if kind == _TEXT else float(int.from_bytes(content, 'big'))
-
-
-def _boxes(data: mmap.mmap, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Kinds of the boxes in a part of a file, and where their contents begin and end."""
-    while start + 8 <= end:
-        size, kind = struct.unpack_from('>I4s', data, start)
-        head = 8
-        if size == 1 and start + 16 <= end:
-            size, head = struct.unpack_from('>Q', data, start + 8)[0], 16
-        elif size == 0:
-            size = end - start
-        if size < head:
-            return
-        yield kind, start + head, min(start + size, end)
-        start += size

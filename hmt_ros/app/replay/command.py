@@ -19,7 +19,7 @@ from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.progress import tell_user
 from hmt_ros.app.replay.many_bags import is_many, replay_many
 from hmt_ros.app.replay.one_bag import replay_bag
-from hmt_ros.app.replay.options import ReplayOptions
+from hmt_ros.app.replay.options import LOG_TIMES, STAMPS, ReplayOptions
 
 EPILOG = """\
 A track starts from a subject file, which gives the joints of the person in one image. Without one
@@ -152,6 +152,11 @@ def _parser() -> CommandParser:
     topics.add_argument(
         '--keypoints-topic', metavar='NAME',
         help='topic of the 2D keypoints (default: keypoints)',
+    )  # fmt: skip
+    topics.add_argument(
+        '--times', choices=(STAMPS, LOG_TIMES), default=STAMPS,
+        help='times of the images: their stamps, or log: when they were recorded, where stamps are '
+        'missing or wrong (default: stamps)',
     )  # fmt: skip
     topics.add_argument(
         '--namespace', type=_namespace, default='', metavar='NAME',

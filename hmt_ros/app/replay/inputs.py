@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 
@@ -18,8 +18,12 @@ from hmt_ros.sessions.image_inputs import (
     SOURCES,
 )
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
-from msg_tools import BagError, BagMessage, BagReader, Topic
+from msg_tools import BagError, BagMessage, BagReader, RosbagsMessages, Topic
 from msg_tools.bags.contents import absolute_name
+from msg_tools.bags.video_messages import VIDEO_TYPE, image_stamp, is_video, with_pictures
+from msg_tools.messages.camera_info import camera_from_info, camera_info_message
+from msg_tools.messages.headers import time_message, time_ns
+from msg_tools.messages.images import decode_image
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
@@ -46,6 +50,10 @@ class RecordedInput:
             transforms are not used.
         upright_frame: one of `UPRIGHT_FRAMES` that transforms lead to from the camera; empty: they
             lead to none.
+        video: whether the images are packets of a video, which `messages` decodes.
+        scaled: size (width, height), px, of images for which `messages` scales the calibration,
+            which is that of another size of the same shape; None: it fits.
+        by_log: whether `messages` replaces stamps by the times at which images were recorded.
     """
 
     image: Topic
@@ -54,11 +62,15 @@ class RecordedInput:
     ground_truth: Topic | None = None
     transforms: Mapping[str, Topic] | None = None
     upright_frame: str = ''
+    video: bool = False
+    scaled: tuple[int, int] | None = None
+    by_log: bool = False
 
     @property
     def transport(self) -> str:
         """Value of the parameter `image_transport`."""
-        return 'compressed' if self.image.msgtype == COMPRESSED_TYPE else 'raw'
+        compressed = self.image.msgtype == COMPRESSED_TYPE and not self.video
+        return 'compressed' if compressed else 'raw'
 
     def of(self, name: str) -> Topic | None:
         """Topic of an input of `RECORDED`, by its name; None if the bag has none."""
@@ -76,8 +88,80 @@ class RecordedInput:
             sources[self.ground_truth.name] = GROUND_TRUTH
         for topics in (self.given, self.transforms or {}):
             sources |= {topic.name: source for source, topic in topics.items()}
-        for stored in bag.messages(sources):
-            yield sources[stored.topic], stored
+        found = bag.messages(sources)
+        if self.video:
+            found = with_pictures(found, self.image.name)
+        if self.by_log:
+            found = _by_log(found, self.image.name)
+        for stored in found:
+            if self.scaled is not None and stored.topic == self.camera_info.name:
+                yield CAMERA_INFO, _scaled(stored, self.scaled)
+            else:
+                yield sources[stored.topic], stored
+
+    def check_stamps(self, bag: BagReader) -> None:
+        """Raises BagError where images have no stamps, and none are made up for them."""
+        try:
+            first = [x.message for x in islice(bag.messages([self.image.name]), 2)]
+        except BagError:
+            return  # the replay itself reports the damage and the remedy
+        if not self.by_log and len(first) == 2 and not any(map(image_stamp, first)):
+            raise BagError(
+                f'{bag.path}: the images on {self.image.name} have no stamps (all are 0): '
+                '--times log takes the times at which they were recorded'
+            )
+
+
+def _scaled(stored: BagMessage, size: tuple[int, int]) -> BagMessage:
+    """A camera_info for images of another size."""
+    try:
+        camera, header = camera_from_info(stored.message, size), stored.message.header
+    except ValueError:
+        return stored  # who takes it reports it
+    stamp, frame = time_ns(header.stamp), str(header.frame_id)
+    return stored.with_message(camera_info_message(RosbagsMessages(), camera, stamp, frame))
+
+
+def fitted(bag: BagReader, recorded: RecordedInput, tell: Callable[[str], object]) -> RecordedInput:
+    """The same topics, with a calibration that is scaled where images have another size."""
+    messages = bag.messages([recorded.image.name])
+    if recorded.video:
+        messages = with_pictures(messages, recorded.image.name)
+    told: list[str] = []
+    try:
+        height, width = decode_image(next(messages).message).shape[:2]
+        info = next(bag.messages([recorded.camera_info.name])).message
+        camera = camera_from_info(info)
+        if (camera.width, camera.height) == (width, height):
+            return recorded
+        camera_from_info(info, (width, height), told.append)
+    except (ValueError, StopIteration):
+        return recorded  # the replay itself reports what is wrong
+    tell(f'{bag.path}: {told[-1]}')
+    return replace(recorded, scaled=(width, height))
+
+
+def _by_log(messages: Iterator[BagMessage], image: str) -> Iterator[BagMessage]:
+    """Messages with other stamps: an image that at which it was recorded.
+
+    Others get that of the newest image that had their stamp, or else that of their own.
+    """
+    times: dict[int, int] = {}
+    for stored in messages:
+        try:
+            message = stored.message
+        except BagError:
+            message = None  # who takes it reports it
+        for each in getattr(message, 'transforms', [message]):
+            if (header := getattr(each, 'header', None)) is None:
+                continue
+            stamp, new = time_ns(header.stamp), stored.log_time_ns
+            if stored.topic == image:
+                times[stamp] = new
+            elif each is message:
+                new = times.get(stamp, new)
+            header.stamp = time_message(RosbagsMessages(), new)
+        yield stored
 
 
 def recorded_input(
@@ -128,6 +212,7 @@ def recorded_input(
         given,
         named(GROUND_TRUTH, (POSE_MIXTURE,)),
         {source: topic for source, topic in transforms.items() if topic is not None},
+        video=is_video(bag, image),
     )
 
 
@@ -168,7 +253,7 @@ def _upright_above(frame: str, parents: Mapping[str, str]) -> str:
 def _image_topic(
     bag: BagReader, name: str | None, namespace: str, besides: tuple[str, ...]
 ) -> Topic:
-    kinds = (COMPRESSED_TYPE, IMAGE_TYPE)
+    kinds = (COMPRESSED_TYPE, IMAGE_TYPE, VIDEO_TYPE)
     if name is not None:
         return bag.find_topic(kinds, name)
     for usual in _USUAL:
@@ -184,8 +269,8 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
         return bag.find_topic(kinds, name)
     # /camera/image_raw/compressed has its calibration in /camera/camera_info.
     namespace = image.name.strip('/')
-    if image.msgtype == COMPRESSED_TYPE:
-        namespace = namespace.removesuffix('/compressed')
+    if image.msgtype != IMAGE_TYPE:
+        namespace = namespace.removesuffix('/compressed').removesuffix('/foxglove')
     namespace = namespace.rpartition('/')[0]
     beside = _named(bag, f'{namespace}/camera_info'.lstrip('/'), kinds)
     if beside is not None:

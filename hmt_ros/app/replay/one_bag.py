@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from hmt_ros.app.progress import Progress, show_progress
-from hmt_ros.app.replay.inputs import GROUND_TRUTH, RECORDED, RecordedInput
+from hmt_ros.app.replay.inputs import GROUND_TRUTH, RECORDED, RecordedInput, fitted
 from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_parameters
 from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PeopleTrack, PlayedTrack
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
@@ -74,6 +74,8 @@ def replay_bag(
         if not options.keep_going:
             bag.raise_damage()
         recorded = options.recorded(bag)
+        recorded.check_stamps(bag)
+        recorded = fitted(bag, recorded, tell)
         parameters = node_parameters(options, recorded)
         # The files that the parameters name are read before a node starts.
         subject = prepare_start(parameters.filter).initial

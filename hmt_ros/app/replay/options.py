@@ -29,6 +29,8 @@ from msg_tools.files.plain_yaml import load_plain_yaml
 
 FILTER, SMOOTHER, BME = 'filter_node', 'smoother_node', 'bme_node'
 PEOPLE_NODE = 'people_node'
+# Times of images: their stamps, or when they were recorded.
+STAMPS, LOG_TIMES = 'stamps', 'log'
 # Prefixes of the parameters of a node in --set.
 _PREFIXES = {SMOOTHER: 'smoother.', BME: 'bme.', FILTER: ''}
 # Parameters that the bag and the command decide, whatever a parameter file says.
@@ -67,6 +69,7 @@ class ReplayOptions:
     namespace: str = ''
     with_images: bool = False
     people: bool = False
+    times: str = STAMPS
 
     def recorded(self, bag: BagReader) -> RecordedInput:
         """The topics of a bag that a replay with these options reads.
@@ -85,7 +88,8 @@ class ReplayOptions:
             },
             namespace=self.namespace,
         )
-        return replace(found, upright_frame=upright_frame(bag, found))
+        frame = upright_frame(bag, found)
+        return replace(found, upright_frame=frame, by_log=self.times == LOG_TIMES)
 
     def of_bag(self, source: Path) -> ReplayOptions:
         """The options for one bag: `{bag}` in names of files becomes its folder."""

@@ -14,6 +14,7 @@ from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE
 from msg_tools import BagReader
+from msg_tools.bags.video_messages import with_pictures
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image, encode_jpeg
@@ -123,11 +124,13 @@ def film_strip(
     seen: list[int] = []
     level, left = 0, allowed
     with BagReader(source.bag) as bag:
-        for stored in bag.messages([source.topic]):
+        for stored in with_pictures(bag.messages([source.topic]), source.topic):
             if progress is not None:
                 progress(1)
             message = stored.message
             stamp = time_ns(message.header.stamp)
+            if stamp not in wanted and stored.log_time_ns in wanted:
+                stamp = stored.log_time_ns  # tracked with --times log
             seen.append(stamp)
             if stamp not in wanted or stamp in result.jpegs:
                 continue

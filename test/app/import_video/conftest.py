@@ -1,5 +1,7 @@
 """Small videos, and what detectors write."""
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -47,3 +49,20 @@ def folder(tmp_path):
     for i in range(10):
         assert cv2.imwrite(str(path / f'img_{i + 1}.jpg'), shade(i))
     return path
+
+
+def _with_pixel_aspect(content, across, down):
+    changed = bytearray(content)
+    above = [content.index(x) - 4 for x in (b'moov', b'trak', b'mdia', b'minf', b'stbl', b'stsd')]
+    end = above[-1] + struct.unpack_from('>I', content, above[-1])[0]
+    # The description of the images is in the box that follows the count of descriptions.
+    for begin in (*above, above[-1] + 16):
+        struct.pack_into('>I', changed, begin, struct.unpack_from('>I', content, begin)[0] + 16)
+    changed[end:end] = struct.pack('>I4sII', 16, b'pasp', across, down)
+    return bytes(changed)
+
+
+@pytest.fixture
+def with_pixel_aspect():
+    """Function (MP4 file, width, height) -> the file with pixels of such a shape."""
+    return _with_pixel_aspect

@@ -165,6 +165,30 @@ def test_detector(video, tmp_path, monkeypatch):
     assert [decode_mask(x).any(1).sum() for _, x in found['/mask']] == [1, 2, 3, 4, 5]
 
 
+def test_detector_sees_square_pixels(video, with_pixel_aspect, tmp_path, monkeypatch):
+    sizes = []
+
+    class Pose(FakePose):
+        def detect(self, image, stamp_ns):
+            sizes.append(image.shape[:2])
+            return super().detect(image, stamp_ns)
+
+    monkeypatch.setattr(command, 'BlazePose', Pose)
+    video.write_bytes(with_pixel_aspect(video.read_bytes(), 2, 1))
+    options = ['--detector', 'mediapipe', '--detector-masks']
+    assert run(video, tmp_path / 'bag', *options) == 0
+    assert set(sizes) == {(48, 128)}
+    found = content(tmp_path / 'bag')
+    second = found['/keypoints'][1][1]
+    # Where it sees (2, 2); the centre of the first pixel is 0.
+    assert (second.u[0], second.v[0]) == (0.75, 2.0)
+    assert np.allclose(np.reshape(second.covariance, (3, 2, 2))[0], [[0.25, 0], [0, 1]])
+    assert decode_mask(found['/mask'][3][1]).sum() == 4 * 64
+    camera = camera_from_info(found['/camera_info'][0][1], (64, 48))
+    assert camera.fx == pytest.approx(32 / np.tan(np.radians(30)))
+    assert camera.fy == pytest.approx(2 * camera.fx)
+
+
 def test_mediapipe_pose_itself(mediapipe_pose, walk_video, tmp_path):
     """It finds the hips of a rendered person, each on its side."""
     out = tmp_path / 'bag'

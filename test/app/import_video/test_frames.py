@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.app.import_video.frames import Selection, natural_order, open_source
+from msg_tools.files.display_matrix import display_matrix
 
 
 def boxes(content, start, end):
@@ -102,6 +103,56 @@ def test_video_of_a_phone_is_upright(matrix, turn, video):
     frames, _ = read(video)
     assert len(frames) == 10
     assert np.array_equal(frames[0].image, cv2.rotate(stored[0].image, turn))
+
+
+@pytest.mark.parametrize(
+    ('matrix', 'mirrored'),
+    [
+        ((-1, 0, 0, 1, 64, 0), lambda x: x[:, ::-1]),
+        ((1, 0, 0, -1, 0, 48), lambda x: x[::-1]),
+        ((0, 1, 1, 0, 0, 0), lambda x: x.swapaxes(0, 1)),
+        ((0, -1, -1, 0, 48, 64), lambda x: x.swapaxes(0, 1)[::-1, ::-1]),
+    ],
+)
+def test_mirrored_video_is_shown_as_players_do(matrix, mirrored, video):
+    stored, plain = read(video)
+    video.write_bytes(turned(video.read_bytes(), *matrix))
+    frames, source = read(video)
+    assert np.array_equal(frames[3].image, mirrored(stored[3].image))
+    assert frames[3].image.flags.c_contiguous
+    assert plain.notes == []
+    assert [x for x in source.notes if 'mirror the frames' in x] == source.notes != []
+
+
+def test_display_matrix_of_damaged_and_other_files(video, tmp_path):
+    content = video.read_bytes()
+    assert display_matrix(video) == (1 << 16, 0, 0, 1 << 16)
+    for damaged in (content[: content.index(b'tkhd') + 30], b'', b'RIFF' + bytes(40), bytes(64)):
+        path = tmp_path / 'damaged.mp4'
+        path.write_bytes(damaged)
+        assert display_matrix(path) is None
+    # Lengths of 64 bits, and a sound track before that of images.
+    (moov, *_), end = find(content, 'moov', 'trak')
+    (_, trak), _ = find(content, 'moov', 'trak')
+    sound = content[trak:end].replace(b'vide', b'soun')
+    inside = content[moov + 8 : trak] + sound + turned(content, -1, 0, 0, 1, 64, 0)[trak:]
+    path.write_bytes(content[:moov] + struct.pack('>I4sQ', 1, b'moov', 16 + len(inside)) + inside)
+    assert display_matrix(path) == (-1 << 16, 0, 0, 1 << 16)
+
+
+def test_pixels_that_are_not_square(video, with_pixel_aspect):
+    stored, _ = read(video)
+    assert stored[0].aspect == 1.0
+    content = with_pixel_aspect(video.read_bytes(), 64, 45)
+    video.write_bytes(content)
+    frames, source = read(video)
+    assert np.array_equal(frames[0].image, stored[0].image)
+    assert frames[0].aspect == pytest.approx(64 / 45)
+    assert len(source.notes) == 1
+    assert 'pixels are 1.42 times as wide as high' in source.notes[0]
+    video.write_bytes(turned(content, 0, 1, -1, 0, 48, 0))
+    frames, _ = read(video)
+    assert frames[0].aspect == pytest.approx(45 / 64)
 
 
 def test_folder_is_read_in_the_order_of_numbers(folder, number_in):

@@ -130,8 +130,8 @@ IMAGE, INFO = ('image', image(0)), ('camera_info', info(0))
             id='damaged picture',
         ),
         pytest.param(
-            [('camera_info', info(0, width=32, height=24)), IMAGE],
-            'image has 64x48 pixels, wanted the 32x24 of camera_info',
+            [('camera_info', info(0, width=32, height=32)), IMAGE],
+            'image has 64x48 pixels, wanted the 32x32 of camera_info',
             id='size',
         ),
         pytest.param(

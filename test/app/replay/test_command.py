@@ -1,5 +1,6 @@
 """replay, offline."""
 
+import copy
 import sys
 from operator import itemgetter
 from pathlib import Path
@@ -26,7 +27,8 @@ from hmt_ros.tracking.validity import Validity
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.bodies import body_of
-from msg_tools.messages.headers import header_message, time_ns
+from msg_tools.messages.camera_info import camera_from_info, camera_info_message
+from msg_tools.messages.headers import header_message, time_message, time_ns
 from msg_tools.messages.images import decode_image, depth_message, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from test.msg_tools.conftest import limited_file_size
@@ -529,6 +531,98 @@ def test_raw_images(still, entries, tmp_path):
         bag = write(out.parent / 'bag', given)
         assert main([str(bag), '-o', str(out), *SUBJECT, '--quiet']) == 0
     assert content(both[0]) == content(both[1])
+
+
+def test_calibration_of_larger_images_is_scaled(still, entries, tmp_path, capsys):
+    larger = []
+    for topic, time, message in copy.deepcopy(entries):
+        if topic == 'camera_info':
+            camera = camera_from_info(message)
+            camera = camera.scaled(2 * camera.width, 2 * camera.height)
+            message = camera_info_message(MESSAGES, camera, time, message.header.frame_id)
+        larger.append((topic, time, message))
+    outs = [tmp_path / name / 'out' for name in ('larger', 'given')]
+    for out, given in zip(outs, (larger, entries), strict=True):
+        bag = write(out.parent / 'bag', given)
+        assert main([str(bag), '-o', str(out), *SUBJECT, '--quiet']) == 0
+        if given is larger:
+            (line,) = capsys.readouterr().err.splitlines()
+            assert 'for images of 960x720 pixels is scaled to 480x360' in line
+    assert content(outs[0]) == content(outs[1])
+    assert still[0].camera == still[1].camera
+
+
+def stamped(message, stamp):
+    message = copy.deepcopy(message)
+    message.header.stamp = time_message(MESSAGES, stamp)
+    return message
+
+
+def test_times_of_recording_replace_missing_stamps(still, entries, tmp_path, capsys):
+    """Inputs go on belonging to the images that came before them with the same stamp."""
+    times = sorted({time for topic, time, _ in entries if topic == 'image/compressed'})
+    seen = [('keypoints', time, keypoints(time)) for time in times]
+    given = sorted([*entries, *seen], key=lambda entry: entry[1])
+    without = [(topic, time, stamped(message, 0)) for topic, time, message in given]
+    # A detector takes its time, and a clock may be wrong by a day.
+    later = {'keypoints': 5_000_000}
+    wrong = [
+        (topic, time + later.get(topic, 0), stamped(message, time - 86_400_000_000_000))
+        for topic, time, message in given
+    ]
+    outs = []
+    for name, bag in (('given', given), ('without', without), ('wrong', wrong)):
+        outs.append(tmp_path / name / 'out')
+        write(outs[-1].parent / 'bag', bag)
+        options = [] if name == 'given' else ['--times', 'log']
+        command = [str(outs[-1].parent / 'bag'), '-o', str(outs[-1]), *SUBJECT, '--quiet']
+        assert main([*command, *options]) == 0
+        assert [x is not None for x in still[-1].keypoints] == [True] * IMAGES
+        if name == 'without':
+            command[2] = str(tmp_path / 'none')
+            assert main(command) == 1
+            (line,) = capsys.readouterr().err.splitlines()
+            assert 'on /image/compressed have no stamps (all are 0): --times log takes' in line
+    copied = {'/keypoints', '/ground_truth'}
+    found = [
+        [x.data.tobytes() for name, those in read(out).items() if name not in copied for x in those]
+        for out in outs
+    ]
+    assert found[0] == found[1] == found[2]
+
+
+def test_images_of_a_video(still, entries, tmp_path, monkeypatch):
+    """A stand-in for the library of videos, whose pictures are JPEG files."""
+
+    class Decoder:
+        def decode(self, packet):
+            if packet is None:
+                return []
+            picture = cv2.imdecode(np.frombuffer(packet.data, np.uint8), cv2.IMREAD_COLOR)
+            frame = SimpleNamespace(pts=packet.pts, key_frame=True)
+            frame.to_ndarray = lambda format: picture  # noqa: A006
+            return [frame]
+
+    av = SimpleNamespace(
+        CodecContext=SimpleNamespace(create=lambda codec, mode: Decoder()),
+        Packet=lambda data: SimpleNamespace(data=data, pts=None),
+        error=SimpleNamespace(FFmpegError=ValueError),
+    )
+    monkeypatch.setitem(sys.modules, 'av', av)
+    changed = copy.deepcopy(entries)
+    for topic, _, message in changed:
+        if topic == 'image/compressed':
+            message.format = 'h264'
+    both = [tmp_path / name / 'out' for name in ('video', 'plain')]
+    for out, given in zip(both, (changed, entries), strict=True):
+        bag = write(out.parent / 'bag', given)
+        assert main([str(bag), '-o', str(out), *SUBJECT, '--quiet']) == 0
+    assert content(both[0]) == content(both[1])
+    # Whoever has no library is told by one line.
+    monkeypatch.setitem(sys.modules, 'av', None)
+    bag = both[0].parent / 'bag'
+    with BagReader(bag) as opened, pytest.raises(BagError, match='needs PyAV'):
+        recorded_input(opened)
 
 
 def test_topics_are_found_by_their_names(entries, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,6 +48,7 @@ def info(**changes: Any) -> SimpleNamespace:
         ('rational_polynomial', RATIONAL),
         ('rational_polynomial', [*RATIONAL, 0.0, 0.0, 0.0, 0.0]),
         ('rational_polynomial', [0.0] * 14),
+        ('plumb_bob', [*PLUMB_BOB, 0.0, 0.0, 0.0]),
     ],
 )
 def test_projects_as_opencv(model: str, coefficients: list[float]) -> None:
@@ -68,6 +70,16 @@ def test_fisheye_projects_as_opencv() -> None:
     np.testing.assert_allclose(camera.project(points), wanted[:, 0], atol=1e-8)
 
 
+def test_a_distortion_that_folds_in_the_corners_is_told() -> None:
+    told: list[str] = []
+    camera_from_info(info(d=np.array([0.17, -0.3, 0.0, 0.0, 0.0])), tell=told.append)
+    assert told == []
+    camera_from_info(info(d=np.array([-0.34, 0.0, 0.0, 0.0, 0.0])), tell=told.append)
+    (line,) = told
+    # It folds at 2 / 3 of the ideal radius, where 1 - 1.02 r^2 is 0; a corner lies at 0.677.
+    assert re.search('the image from 9[678]% of the way to a corner on', line)
+
+
 def test_region_and_binning() -> None:
     roi = {'x_offset': 100, 'y_offset': 50, 'width': 400, 'height': 300}
     whole = camera_from_info(info())
@@ -82,8 +94,12 @@ def test_region_and_binning() -> None:
 
 def test_size_of_the_picture() -> None:
     assert camera_from_info(info(), (640, 480)).width == 640
-    with pytest.raises(CameraInfoError, match='is for pictures of 640x480, saw 320x240'):
-        camera_from_info(info(), (320, 240))
+    told: list[str] = []
+    assert camera_from_info(info(), (320, 240), told.append).fx == 300.0
+    assert len(told) == 1
+    assert 'for images of 640x480 pixels is scaled to 320x240' in told[0]
+    with pytest.raises(CameraInfoError, match='640x480 pixels, which have another shape than 320x'):
+        camera_from_info(info(), (320, 200))
     assert camera_from_info(info(binning_x=2, binning_y=2), (320, 240)).fx == 300.0
 
 
@@ -96,7 +112,7 @@ def test_size_of_the_picture() -> None:
         ({'d': [np.inf, 0, 0, 0, 0]}, r'values that are not finite'),
         ({'k': [-600.0, *K[1:]]}, r'focal lengths are -600.0 and 590.0, wanted positive'),
         ({'k': [*K[:4], 0.0, *K[5:]]}, r'focal lengths are 600.0 and 0.0'),
-        ({'k': [600.0, 0.5, *K[2:]]}, r'without skew'),
+        ({'k': [600.0, 6.0, *K[2:]]}, r'with a skew K\[1\] below 6; calibrate'),
         ({'k': [*K[:8], 0.0]}, r'wanted \[fx, 0, cx, 0, fy, cy, 0, 0, 1\]'),
         ({'width': 0}, r'size is 0x480'),
         ({'height': 0, 'width': 0}, r'size is 0x0'),

@@ -99,6 +99,7 @@ CASES: list[tuple[str, Any, Any]] = [
     ('uyvy', PAIRS, cv2.cvtColor(PAIRS, cv2.COLOR_YUV2BGR_UYVY)),
     ('yuv422_yuy2', PAIRS, cv2.cvtColor(PAIRS, cv2.COLOR_YUV2BGR_YUY2)),
     ('yuyv', PAIRS, cv2.cvtColor(PAIRS, cv2.COLOR_YUV2BGR_YUY2)),
+    ('yvyu', PAIRS, cv2.cvtColor(PAIRS, cv2.COLOR_YUV2BGR_YVYU)),
     ('nv12', PLANES, cv2.cvtColor(PLANES, cv2.COLOR_YUV2BGR_NV12)),
     ('nv21', PLANES, cv2.cvtColor(PLANES, cv2.COLOR_YUV2BGR_NV21)),
 ]
@@ -113,6 +114,26 @@ def test_every_encoding(encoding: str, pixels: Any, wanted: Any, padding: int) -
         assert picture.dtype == np.uint8
         assert picture.flags.c_contiguous
         assert picture.flags.writeable
+
+
+@pytest.mark.parametrize('padding', [0, 2, 6])
+@pytest.mark.parametrize('encoding', ['yuv420', 'i420', 'yv12'])
+def test_three_planes(encoding: str, padding: int) -> None:
+    """Rows of chroma are half as long, with half the padding, as libcamera writes them."""
+    wanted = cv2.cvtColor(PLANES, cv2.COLOR_YUV2BGR_I420)
+    luma, chroma = PLANES[:HEIGHT], PLANES[HEIGHT:].reshape(2, HEIGHT // 2, WIDTH // 2)
+    halves = chroma[::-1] if encoding == 'yv12' else chroma
+    data = np.pad(luma, ((0, 0), (0, padding))).tobytes()
+    data += np.pad(halves, ((0, 0), (0, 0), (0, padding // 2))).tobytes()
+    step = WIDTH + padding
+    message = raw(BGR, encoding, data=data, step=step)
+    np.testing.assert_array_equal(decode_image(message), wanted)
+    message = raw(BGR, encoding, data=data, step=step + 1)
+    with pytest.raises(ImageError, match=f'step is {step + 1}, wanted an even one'):
+        decode_image(message)
+    message = raw(BGR, encoding, data=data[:-2], step=step)
+    with pytest.raises(ImageError, match=f'image has {len(data) - 2} bytes, wanted {len(data)}'):
+        decode_image(message)
 
 
 @pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])

@@ -1,0 +1,65 @@
+"""How a video is shown: the display matrix in an MP4 or QuickTime file [ISO 14496-12, 8.3.2].
+
+OpenCV tells an angle only, which is wrong where the matrix mirrors.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_tools.files.mp4_boxes import boxes_at
+
+# Images as stored; after a turn to the right by 90 degrees; by 180; by 270.
+STORED = 1, 0, 0, 1
+TURNED = {0: STORED, 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
+
+Matrix = tuple[int, int, int, int]
+
+_MATRIX_AT = 40, 52  # bytes, in versions 0 and 1 of the box
+
+
+def display_matrix(path: Path) -> Matrix | None:
+    """The matrix (a, b, c, d) of the first track of images; None: not such a file, or damaged.
+
+    The stored pixel (u, v) is shown at (a u + c v, b u + d v), up to a shift and a scale.
+    """
+    with path.open('rb') as file:
+        if not path.stat().st_size:
+            return None
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            for start, end in boxes_at(data, 0, len(data), b'moov', b'trak'):
+                handlers = boxes_at(data, start, end, b'mdia', b'hdlr')
+                if b'vide' not in [data[at + 8 : at + 12] for at, _ in handlers]:
+                    continue
+                for at, last in boxes_at(data, start, end, b'tkhd'):
+                    at += _MATRIX_AT[data[at : at + 1] == b'\x01']
+                    if at + 20 <= last:
+                        a, b, _, c, d = struct.unpack_from('>5i', data, at)
+                        return (a, b, c, d) if a * d != b * c else None
+    return None
+
+
+def is_mirrored(matrix: Matrix) -> bool:
+    """Whether a matrix shows the mirror image."""
+    a, b, c, d = matrix
+    return a * d < b * c
+
+
+def is_turned(matrix: Matrix) -> bool:
+    """Whether rows of the stored image are shown as columns."""
+    return abs(matrix[0]) < abs(matrix[1])
+
+
+def shown(image: NDArray[Any], matrix: Matrix) -> NDArray[Any]:
+    """An image (H, W, C) as a matrix shows it, to the nearest quarter turn."""
+    across, down = matrix[0], matrix[3]
+    if is_turned(matrix):
+        across, down = matrix[2], matrix[1]
+        image = image.swapaxes(0, 1)
+    return np.ascontiguousarray(image[:: 1 if down > 0 else -1, :: 1 if across > 0 else -1])
