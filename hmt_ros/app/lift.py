@@ -138,7 +138,8 @@ def _lift(arguments: argparse.Namespace) -> int:
     camera = camera_of(arguments, size)
     times, seen = _chosen(found, arguments.person, arguments.fps)
     stamps = [arguments.first_stamp + time for time in times]
-    if not any(len(one.names) for one in seen):
+    nobody = not any(len(one.names) for one in seen)
+    if nobody and (not seen or any(found.persons())):
         raise ValueError(f'{arguments.keypoints}: no keypoints of the chosen person; see --person')
     gravity, body, ups = gravity_of(arguments), _body(camera, arguments), None
     if gravity is not None:
@@ -149,7 +150,7 @@ def _lift(arguments: argparse.Namespace) -> int:
             lengths_known=arguments.subject is not None, causal=arguments.causal,
             scheme=arguments.scheme,
         )  # fmt: skip
-    if all(one is None for one in mixtures):
+    if all(one is None for one in mixtures) and not nobody:
         raise ValueError(
             f'{arguments.keypoints}: no image shows five landmarks that are known; see --scheme'
         )

@@ -128,6 +128,16 @@ def test_bad_input_is_one_line(tmp_path, capsys, arguments, said):
     assert not (tmp_path / 'out' / 'lifted').exists()
 
 
+def test_nobody_in_the_whole_file(tmp_path, capsys):
+    path = arrays(tmp_path / 'walk.npz', detected=np.zeros(6, dtype=bool))
+    assert lift.main([str(path), '-o', str(tmp_path / 'out'), *USUAL[:-1]]) == 0
+    told = capsys.readouterr().out
+    assert 'lifted: 6 images, 0 with a pose' in told
+    assert 'nobody is seen at 6 of 6 times' in told
+    assert [len(one.weights) for one in mixtures(tmp_path / 'out')] == [0] * 6
+    assert (tmp_path / 'out' / 'report' / 'report.html').stat().st_size > 50_000
+
+
 def test_too_few_landmarks_are_told(tmp_path, capsys):
     sure = np.zeros((6, 17))
     sure[:, 5:8] = 1.0

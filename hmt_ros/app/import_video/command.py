@@ -18,7 +18,14 @@ import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Masks, Selection, open_source
-from hmt_ros.app.import_video.keypoint_files import Choice, Chooser, FoundPersons, read_keypoints
+from hmt_ros.app.import_video.keypoint_files import (
+    LARGEST,
+    NEAREST,
+    Choice,
+    Chooser,
+    FoundPersons,
+    read_keypoints,
+)
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.body import Camera
@@ -258,7 +265,7 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
             )
         _check_ends(options, source, found, masks, tell)
         if found is not None:
-            _check_keypoints(options, result)
+            _check_keypoints(options, result, found, tell)
         if masks is not None and not result.with_masks:
             raise ValueError(
                 f'{options.masks}: no mask belongs to one of the {result.images} imported frames; '
@@ -398,13 +405,18 @@ def _check_ends(
             )
 
 
-def _check_keypoints(options: ImportOptions, result: Imported) -> None:
+def _check_keypoints(
+    options: ImportOptions, result: Imported, found: FoundPersons, tell: Tell
+) -> None:
     """Raises ValueError where keypoints are not those of the images."""
-    if not result.with_keypoints:
-        raise ValueError(
+    if not result.with_keypoints and any(found.persons()):
+        text = (
             f'{options.keypoints}: none of the {result.images} imported frames has keypoints of '
             'the chosen person; see --person and --first-number'
         )
+        if options.person.kind not in (LARGEST, NEAREST):
+            raise ValueError(text)
+        tell(text)
     if result.inside < _INSIDE * (result.inside + result.outside):
         raise ValueError(
             f'{options.keypoints}: {result.outside} of {result.inside + result.outside} keypoints '

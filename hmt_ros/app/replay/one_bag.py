@@ -106,7 +106,10 @@ def replay_bag(
             ):
                 result = _play(options, bag, recorded, track, out, behind, bar, tell)
             if not result.tracked:
-                raise ValueError(f'{source}: {_why_nothing(result, subject)}')
+                why = f'{source}: {_why_nothing(result, subject)}'
+                if subject is not None or result.last_fault or not result.images:
+                    raise ValueError(why)
+                tell(why)
     return result
 
 

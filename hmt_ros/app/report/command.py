@@ -164,6 +164,8 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
     stamps = _shown(everything, options.times)
     mixtures = everything.at(stamps)
     notes = []
+    if everything.empty:
+        notes.append(f'nobody is seen at {len(everything.empty)} of {len(everything.stamps)} times')
     if len(stamps) < len(everything.stamps):
         notes.append(f'{len(stamps)} of {len(everything.stamps)} times are shown')
     notes += [
@@ -210,5 +212,5 @@ def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:
 def _shown(mixtures: RecordedMixtures, most: int) -> list[int]:
     """Times that are shown: all, or every n-th if the page would get too large."""
     stamps = mixtures.stamps
-    most = min(most, int(len(stamps) * min(DATA_BYTES / data_size(mixtures), 1.0)))
+    most = min(most, int(len(stamps) * min(DATA_BYTES / max(data_size(mixtures), 1), 1.0)))
     return stamps[:: -(-len(stamps) // max(most, 1))]
