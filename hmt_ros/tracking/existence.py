@@ -48,6 +48,8 @@ from hmt_ros.tracking.view import View
 
 # Rates at which somebody comes into an empty view, and leaves it, per second.
 BIRTH, LEAVING = 0.1, 0.2
+# Rate at which another person takes the place of one who is not seen, per second.
+EXCHANGE = 1.0 / 3600.0
 # Above the first probability somebody is there, and a new track may start; below the second nobody
 # is, if the image says so. Between them it is undecided.
 PRESENT, ABSENT = 0.85, 0.03
@@ -124,6 +126,7 @@ class Existence:
         seen: whether the last image shows a filter something to follow: a cue shows somebody, or
             none shows nobody and the image can be used.
         hidden: whether others hid most of the person in the last image.
+        met: stamp of the last image that showed the person, ns; None: nobody is known.
         elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
             of no use: the track has to search.
     """
@@ -132,6 +135,7 @@ class Existence:
         self.probability = probability
         self.llr = 0.0
         self.seen = self.hidden = self.elsewhere = False
+        self.met: int | None = None
         self._stamps: tuple[int, int] | None = None  # of the first and of the last image
         self._asked: dict[str, int] = {}  # when each cue spoke last
         self._appearance = Appearance()
@@ -147,12 +151,17 @@ class Existence:
         """Whether nobody is there, and the last image has said so."""
         return self.probability < ABSENT and self.llr < 0.0
 
+    def same(self, stamp: int) -> float:
+        """Probability that who is seen at a stamp, ns, is who was met last: exp(-q dt)."""
+        return 1.0 if self.met is None else math.exp(-EXCHANGE * seconds(stamp - self.met))
+
     def meet(self) -> None:
         """Forgets the usual appearance of the person: another one may come."""
         self._appearance = Appearance()
 
     def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
         """Learns the appearance from the last image, in which the person is at a pose (d,)."""
+        self.met = stamp
         self._appearance.learn(view, stamp, body, camera, pose)
 
     def look(self, view: View, stamp: int, body: Body, *, waiting: bool = False) -> None:

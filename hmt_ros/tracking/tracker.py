@@ -4,6 +4,7 @@
     TRACKING           -> (no image says where)            ->  LOST
     LOST               -> (found again)                    ->  TRACKING
     TRACKING or LOST   -> (an image says: nobody is there) ->  NOBODY
+    TRACKING or LOST   -> (not seen for an hour)           ->  WAITING, for anybody
 
 The tracker knows images, background, starts and existence; a `MixtureFilter` knows the person and
 carries the mixture.
@@ -225,7 +226,7 @@ class Tracker:
     @property
     def status(self) -> Status:
         """State of the tracker."""
-        if self._nobody:
+        if self._nobody and (self._existence.nobody or self._existence.met is not None):
             return Status.NOBODY
         if not self._track.begun:
             return Status.WAITING
@@ -417,9 +418,9 @@ class Tracker:
             body, self.camera, self.settings, self._seed, self._extra, self._ground
         )
 
-    def _drop_track(self) -> None:
-        """Keeps nothing but the body."""
-        self._track = self._new_track(self.body)
+    def _drop_track(self, body: Body | None = None) -> None:
+        """Keeps nothing but the body, or takes another one."""
+        self._track = self._new_track(body or self.body)
         self._point = PointEstimate()
         self._ground.reset()
         self._observer.last_image, self._followed = None, None
@@ -430,6 +431,10 @@ class Tracker:
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """See `step`."""
         masked, existence, self._foreseen = mask is not None, self._existence, False
+        if existence.same(stamp) < 0.5:
+            # Whoever comes now is somebody else, of whom nothing is known.
+            self._drop_track(self.model)
+            self._nobody, existence.met = True, None
         if self._track.begun:
             existence.look(view, stamp, self.body)
             if existence.nobody:
