@@ -32,10 +32,12 @@ from hmt_ros.experts.lifted_fit import lift_poses
 from hmt_ros.experts.lifter import SHIPPED, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.error_model import seconds
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.camera_session import CAMERA_INFO, FRAME_ID
 from hmt_ros.sessions.image_inputs import PREDICTION
 from hmt_ros.tracking import read_subject
+from hmt_ros.tracking.existence import same_person
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
@@ -157,10 +159,15 @@ def _lift(arguments: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     messages = RosbagsMessages()
     with BagWriter(folder / LIFTED, overwrite=arguments.overwrite) as bag:
+        track, met = 1, stamps[0]
         for stamp, mixture in zip(stamps, mixtures, strict=True):
+            track += same_person(seconds(stamp - met)) < 0.5
+            met = met if mixture is None else stamp
             info = camera_info_message(messages, camera, stamp, FRAME_ID)
             bag.write(CAMERA_INFO, stamp, info)
-            content = PoseMixture.of_body(body, mixture, MixtureKind.PREDICTION, stamp, FRAME_ID)
+            content = PoseMixture.of_body(
+                body, mixture, MixtureKind.PREDICTION, stamp, FRAME_ID, track_id=track
+            )
             bag.write(PREDICTION, stamp, pose_mixture_message(messages, content))
     options = ReportOptions(
         folder / LIFTED, folder / REPORT, overwrite=arguments.overwrite, quiet=quiet,

@@ -97,6 +97,11 @@ def moved_on(r: float, dt: float) -> float:
     return r - math.expm1(-total * dt) * (BIRTH / total - r)
 
 
+def same_person(dt: float) -> float:
+    """Probability exp(-q dt) that somebody is who was seen dt seconds before, and not since."""
+    return math.exp(-EXCHANGE * dt)
+
+
 def updated(r: float, llr: float) -> float:
     """The probability that somebody is in view, given a log likelihood ratio, nats."""
     if r in (0.0, 1.0):
@@ -152,8 +157,8 @@ class Existence:
         return self.probability < ABSENT and self.llr < 0.0
 
     def same(self, stamp: int) -> float:
-        """Probability that who is seen at a stamp, ns, is who was met last: exp(-q dt)."""
-        return 1.0 if self.met is None else math.exp(-EXCHANGE * seconds(stamp - self.met))
+        """Probability that who is seen at a stamp, ns, is who was met last; see `same_person`."""
+        return 1.0 if self.met is None else same_person(seconds(stamp - self.met))
 
     def meet(self) -> None:
         """Forgets the usual appearance of the person: another one may come."""

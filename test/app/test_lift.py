@@ -133,7 +133,7 @@ def test_nobody_in_the_whole_file(tmp_path, capsys):
     assert lift.main([str(path), '-o', str(tmp_path / 'out'), *USUAL[:-1]]) == 0
     told = capsys.readouterr().out
     assert 'lifted: 6 images, 0 with a pose' in told
-    assert 'nobody is seen at 6 of 6 times' in told
+    assert 'nobody is found at 6 of 6 times' in told
     assert [len(one.weights) for one in mixtures(tmp_path / 'out')] == [0] * 6
     assert (tmp_path / 'out' / 'report' / 'report.html').stat().st_size > 50_000
 

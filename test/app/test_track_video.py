@@ -102,9 +102,9 @@ def test_nobody_in_the_whole_video(tmp_path, capsys):
     assert track_video.main([*arguments, '--keypoints', str(tmp_path / 'nobody.json')]) == 0
     told = capsys.readouterr()
     assert 'tracked: 0 of 3 images tracked' in told.out
-    assert 'nobody is seen at 3 of 3 times' in told.out
+    assert 'nobody is found at 3 of 3 times' in told.out
     assert 'wanted 4 at least: --stature is not used' in told.err
-    assert 'nobody is seen in its 3 images' in told.err
+    assert 'nobody is found in its 3 images' in told.err
     data = data_of((out / 'report' / 'report.html').read_text('utf-8'))
     assert np.allclose(data['times'], [0.0, 0.1, 0.2])
     assert (data['layers'], len(data['images']['jpegs'])) == ([], 3)

@@ -379,7 +379,10 @@ def _check_ends(
     masks: Masks | None,
     tell: Tell,
 ) -> None:
-    """Whether frames, keypoints and masks are equally many, as far as the frames were read."""
+    """Whether frames, keypoints and masks are equally many, as far as the frames were read.
+
+    Those of frames that a truncated file has lost are left out.
+    """
     if not source.ended:
         return
     count, claimed = source.count, source.claimed
@@ -390,13 +393,13 @@ def _check_ends(
         )
     of_masks = -1 if masks is None else masks.last
     of_keypoints = -1 if found is None else found.last
-    if found is not None and found.rows is not None and found.rows != count:
+    if found is not None and found.rows not in (None, count, claimed):
         raise ValueError(
             f'{options.keypoints} has {found.rows} rows, but {source.path} has {count} frames; '
             'wanted one row for each frame'
         )
     for path, last in ((options.keypoints, of_keypoints), (options.masks, of_masks)):
-        if last >= count:
+        if last >= max(count, claimed):
             first = options.first_number
             raise ValueError(
                 f'{path} has frame {last + first}, but {source.path} has {count} frames, {first} '

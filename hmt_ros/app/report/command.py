@@ -165,7 +165,9 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
     mixtures = everything.at(stamps)
     notes = []
     if everything.empty:
-        notes.append(f'nobody is seen at {len(everything.empty)} of {len(everything.stamps)} times')
+        notes.append(
+            f'nobody is found at {len(everything.empty)} of {len(everything.stamps)} times'
+        )
     if len(stamps) < len(everything.stamps):
         notes.append(f'{len(stamps)} of {len(everything.stamps)} times are shown')
     notes += [

@@ -248,7 +248,7 @@ def test_nobody_is_seen_without_a_start(tmp_path, capsys):
     assert main([str(bag), '-o', str(out)]) == 0
     told, line = capsys.readouterr().err.splitlines()
     assert told == 'replay: no --subject: the track starts from a pose_prediction with components'
-    assert 'nobody is seen in its 1 images: give an image of the empty scene by' in line
+    assert 'nobody is found in its 1 images: give an image of the empty scene by' in line
     with BagReader(out) as written:
         (state,) = (stored.message.state for stored in written.messages(['keep_out']))
         assert state == KeepOutState.UNKNOWN

@@ -301,7 +301,7 @@ def test_mixtures_without_covariances_and_missing_frames(body, poses, tmp_path):
     found = data_of(make(tmp_path / 'predicted', tmp_path / 'second'))
     assert np.allclose(found['times'], [0.0, 0.1, 0.2])
     assert [len(weights) for weights in found['layers'][0]['weights']] == [1, 0, 1]
-    assert found['notes'] == ['nobody is seen at 1 of 3 times']
+    assert found['notes'] == ['nobody is found at 1 of 3 times']
 
 
 @pytest.mark.usefixtures('no_pictures')
@@ -320,7 +320,7 @@ def test_images_without_anybody(made, body, poses, tmp_path, capsys):
     found = data_of(make(nobody, tmp_path / 'first', '--images', images, '--truth', made.truth))
     assert np.allclose(found['times'], np.arange(FRAMES + 1) / 10)
     assert found['layers'] == []
-    assert found['notes'] == [f'nobody is seen at {FRAMES + 1} of {FRAMES + 1} times']
+    assert found['notes'] == [f'nobody is found at {FRAMES + 1} of {FRAMES + 1} times']
     assert all(found['images']['jpegs'])
     scores = found['scores']['topics']['/pose_mixture']
     assert (scores['frames'], scores['missing'], scores['heaviest_mm']) == (0, FRAMES, None)
@@ -330,7 +330,7 @@ def test_images_without_anybody(made, body, poses, tmp_path, capsys):
         for stamp in answered:
             bag.write('keep_out', stamp, keep_out(stamp))
     found = data_of(make(tmp_path / 'out', tmp_path / 'second', '--images', images))
-    assert found['notes'] == [f'nobody is seen at 1 of {FRAMES + 1} times']
+    assert found['notes'] == [f'nobody is found at 1 of {FRAMES + 1} times']
     assert [bool(weights) for weights in found['layers'][0]['weights']] == [False, *[True] * FRAMES]
 
 
