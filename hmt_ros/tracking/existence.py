@@ -156,10 +156,6 @@ class Existence:
         """Whether nobody is there, and the last image has said so."""
         return self.probability < ABSENT and self.llr < 0.0
 
-    def same(self, stamp: int) -> float:
-        """Probability that who is seen at a stamp, ns, is who was met last; see `same_person`."""
-        return 1.0 if self.met is None else same_person(seconds(stamp - self.met))
-
     def meet(self) -> None:
         """Forgets the usual appearance of the person: another one may come."""
         self._appearance = Appearance()

@@ -31,7 +31,7 @@ from hmt_ros.inference.error_model import ERRORS, TOGETHER, seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.beginning import FROM_JOINTS, Beginning, Source, Starts, poses_to_search
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
-from hmt_ros.tracking.existence import GIVEN, Existence, Status
+from hmt_ros.tracking.existence import GIVEN, Existence, Status, same_person
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.ground import Gravity, Ground, GroundEstimator, KnownGround, unit_vector
 from hmt_ros.tracking.hypotheses import LIKELY, Modes
@@ -368,8 +368,7 @@ class Tracker:
 
         They are unknown in the first image of a track, and where poses walk randomly.
         """
-        velocities = self.modes.velocities
-        return velocities if velocities.any() else None
+        return self.modes.velocities if self.modes.velocities.any() else None
 
     @property
     def posterior(self) -> GaussianMixture:
@@ -399,8 +398,7 @@ class Tracker:
         opinions = []
         if self._lifter is not None:
             self._seen.add(keypoints, seconds(stamp))
-            begun = self._track.begun
-            person = self._lifter.proportions(self.body) if begun else None
+            person = self._lifter.proportions(self.body) if self._track.begun else None
             opinions.append(self._seen.lift(self._lifter, self.vertical, person))
         if keypoints.positions is not None:
             opinions.append(lifted_positions(self.camera, keypoints))
@@ -431,7 +429,7 @@ class Tracker:
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """See `step`."""
         masked, existence, self._foreseen = mask is not None, self._existence, False
-        if existence.same(stamp) < 0.5:
+        if existence.met is not None and same_person(seconds(stamp - existence.met)) < 0.5:
             # Whoever comes now is somebody else, of whom nothing is known.
             self._drop_track(self.model)
             self._nobody, existence.met = True, None
