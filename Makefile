@@ -1,7 +1,7 @@
 # make demo   tracks the person of a bag in bags/      make lint   ruff and mypy
 # make test   all tests                                make bench  the benchmarks
-# make setup  the workspace alone                      make soak   nodes under load and faults
-# make clean  restores the state of a clone            make detector  MediaPipe Pose
+# make setup  the workspace, with MediaPipe Pose       make soak   nodes under load and faults
+# make clean  restores the state of a clone            make detector  MediaPipe Pose alone
 # make learn  learns everything again from DATA=...
 #
 # Each works as the first command after a clone: it installs its requirements into .venv and builds
@@ -17,6 +17,8 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
 WORKSPACE := tools/workspace.sh
+# Without network a line says so, with the exit code 78, and the rest goes on.
+WITH_DETECTOR := $(WORKSPACE) detector || [ $$? -eq 78 ]
 PYTHON_IN_VENV := .venv/bin/python
 SOURCED := source tools/environment.bash &&
 TEST_PROCESSES ?= 2
@@ -29,12 +31,14 @@ help:
 
 setup:
 	@$(WORKSPACE) ros test lint kernels
+	@$(WITH_DETECTOR)
 
 detector:
 	@$(WORKSPACE) ros detector
 
 demo:
 	@$(WORKSPACE) ros kernels
+	@$(WITH_DETECTOR)
 	@rm -rf build/demo && mkdir -p build/demo
 	@echo 'starting the demonstration'
 	@$(SOURCED) python -m hmt_ros.app.demo $(DEMO_BAG) -o build/demo --live

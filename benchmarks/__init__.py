@@ -10,6 +10,7 @@ from types import ModuleType
 BENCHMARKS = {
     'absence': 'whether a visible person is taken for nobody, an empty scene for somebody',
     'bags': 'reading, memory, and what replay adds to the estimate',
+    'blind': 'what is said of a person whom nothing explains, and of one whom something does',
     'contour_noise': 'how far contours of people lie from those of the model',
     'depth': 'what depth images bring to the tracker',
     'distance': 'how far away a person is taken to be, by what is known',

@@ -10,8 +10,10 @@ What else hmt.launch.py takes can be given, too, but for image and nodes.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
@@ -21,12 +23,16 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from hmt_ros.detectors.blazepose_models import has_networks, has_runtime
+from hmt_ros.detectors.blazepose_models import is_installed
+from hmt_ros.sessions.focal_length import USUAL_SIGMA
 
 PACKAGE = 'hmt_ros'
 CAMERA = 'camera'
 WITH_DETECTOR = 'filter_node smoother_node keypoints_node'
 WITHOUT_DETECTOR = 'filter_node smoother_node bme_node'
+# Arguments of hmt.launch.py that tell where the person is in place of the detector.
+FINDERS = ('background_file', 'keypoints', 'detections_source', 'mask', 'depth', 'subject_file')
+INSTALL = '"ros2 run hmt_ros install-detector" (in a clone: make detector)'
 
 # Name, default, description.
 ARGUMENTS = (
@@ -39,6 +45,8 @@ ARGUMENTS = (
         'calibration file of camera_calibration or of OpenCV; if empty, and fov too, a field of '
         'view of 60 degrees is assumed, with a warning',
     ),
+    ('loop', 'false', "'true': a video file begins again at its end"),
+    ('rate', '1.0', 'factor on the speed of a video file'),
     (
         'detector',
         'auto',
@@ -63,36 +71,75 @@ def generate_launch_description() -> LaunchDescription:
 
 def _actions(context: Any) -> list[Any]:
     given = {name: LaunchConfiguration(name).perform(context) for name, _, _ in ARGUMENTS}
-    return actions_of(given, Path(get_package_share_directory(PACKAGE)))
+    handed = getattr(context, 'launch_configurations', context)
+    missing = what_is_missing(given, handed)
+    if missing:
+        sys.stderr.write(f'camera.launch.py: {missing}\n')
+    return actions_of(given, Path(get_package_share_directory(PACKAGE)), handed)
 
 
-def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
+def what_is_missing(given: Mapping[str, str], handed: Mapping[str, str]) -> str:
+    """What the nodes lack to find a person, and what to do; '' if nothing.
+
+    Args:
+        given, handed: as for `actions_of`.
+    """
+    if given['detector'] != 'false' and is_installed():
+        return ''
+    unwanted = given['detector'] == 'false'
+    text = 'no detector is wanted' if unwanted else 'MediaPipe Pose is not installed'
+    if any(handed.get(name) for name in FINDERS):
+        return '' if unwanted else f'{text}: keypoints help most, run {INSTALL}'
+    return (
+        f'{text}, and no image of the empty scene is given: nothing tells where the person is. Run '
+        f'{INSTALL}, or give background_file:=FILE, or let the camera see the scene without '
+        'anybody first'
+    )
+
+
+def actions_of(
+    given: Mapping[str, str], share: Path, handed: Mapping[str, str] = MappingProxyType({})
+) -> list[Any]:
     """The camera, and what hmt.launch.py starts.
 
     Args:
         given: all arguments, by name.
         share: folder with launch/.
+        handed: the arguments that hmt.launch.py takes, as far as they are given, and maybe others.
 
     Raises:
         ValueError: an argument that can not be used.
     """
     if given['fov'] and given['calibration']:
         raise ValueError('fov and calibration: wanted one of them, saw both')
+    if given['loop'] not in ('true', 'false'):
+        raise ValueError(f"loop: wanted 'true' or 'false', saw {given['loop']!r}")
     options = [given['device'] or given['video']]
     for name in ('fov', 'calibration'):
         if given[name]:
             options += [f'--{name}', given[name]]
+    nodes = WITH_DETECTOR if _has_detector(given['detector']) else WITHOUT_DETECTOR
+    namespace = handed.get('namespace') or f'/humans/bodies/{handed.get("body_id") or "p1"}'
     camera = Node(
         package=PACKAGE,
         executable='camera_node',
         namespace=CAMERA,
         arguments=options,
+        parameters=[
+            {
+                'wait_for': ' '.join(f'{namespace}/{name}' for name in nodes.split()),
+                'loop': given['loop'] == 'true',
+                'rate': _speed(given['rate']),
+            }
+        ],
         output='both',
     )
-    nodes = WITH_DETECTOR if _has_detector(given['detector']) else WITHOUT_DETECTOR
+    arguments = {'image': f'/{CAMERA}/image_raw', 'nodes': nodes}
+    if not (given['fov'] or given['calibration'] or handed.get('focal_length_sigma')):
+        arguments['focal_length_sigma'] = str(USUAL_SIGMA)
     person = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(share / 'launch' / 'hmt.launch.py')),
-        launch_arguments={'image': f'/{CAMERA}/image_raw', 'nodes': nodes}.items(),
+        launch_arguments=arguments.items(),
     )
     return [camera, person]
 
@@ -100,6 +147,11 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
 def _has_detector(wanted: str) -> bool:
     if wanted not in ('auto', 'true', 'false'):
         raise ValueError(f"detector: wanted 'auto', 'true' or 'false', saw {wanted!r}")
-    if wanted != 'auto':
-        return wanted == 'true'
-    return has_runtime() and has_networks()
+    return wanted == 'true' or (wanted == 'auto' and is_installed())
+
+
+def _speed(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f'rate: wanted a number such as 0.5, saw {text!r}') from None

@@ -96,6 +96,12 @@ ARGUMENTS = (
     ('subject_file', '', 'file with the joints in one image; empty: a prediction starts the track'),
     ('background_file', '', 'image of the empty scene; empty: learned from the first images'),
     ('model_file', '', 'model written by train; empty: the one that comes with the package'),
+    (
+        'focal_length_sigma',
+        '',
+        'relative standard deviation of the focal length in camera_info, 0 to 1, where it was '
+        'guessed; empty: 0',
+    ),
     ('params_file', '', 'parameter file for one or several nodes, with precedence over all else'),
     ('bag', '', 'bag to play once the nodes run; empty: none'),
     ('use_sim_time', '', "'true' or 'false'; empty: true while a bag is played"),
@@ -178,15 +184,21 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         remappings.append(('depth', given['depth']))
 
     common = {'use_sim_time': sim_time, 'autostart': _truth(given, 'autostart')}
+    if sim_time:
+        # As nodes do where no file in config/ says otherwise.
+        common['reset_on_time_jump'] = True
     camera = {
         **common,
         'image_transport': transport,
         'use_mask': bool(mask),
         **_named(given, 'background_file'),
     }
+    sigma = given['focal_length_sigma']
+    lens = {'focal_length_sigma': _fraction(given, 'focal_length_sigma')} if sigma else {}
     values: dict[str, dict[str, Any]] = {
         'filter_node': {
             **camera,
+            **lens,
             **_named(given, 'subject_file'),
             **_named(given, 'gravity_frame'),
             **_named(given, 'fixed_frame'),
@@ -208,6 +220,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         DETECTOR: {**common, 'image_transport': transport},
         PEOPLE: {
             **camera,
+            **lens,
             **_named(given, 'gravity_frame'),
             **_named(given, 'fixed_frame'),
             'source': source or 'people',
@@ -380,6 +393,14 @@ def _frame(namespace: str) -> str:
 def _logger(namespace: str, name: str) -> str:
     """Name of a node's logger."""
     return f'{namespace}/{name}'.strip('/').replace('/', '.')
+
+
+def _fraction(given: Mapping[str, str], name: str) -> float:
+    text = given[name]
+    value = float(text) if re.fullmatch(r'\d*\.?\d+', text) else 2.0
+    if value > 1.0:
+        raise ValueError(f'{name}: wanted a number from 0 to 1, saw {text!r}')
+    return value
 
 
 def _truth(given: Mapping[str, str], name: str) -> bool:

@@ -7,7 +7,6 @@ what they are given take their place; what is given is then started as launch_ro
 from __future__ import annotations
 
 import importlib.util
-import itertools
 import re
 import runpy
 import subprocess
@@ -282,6 +281,7 @@ def test_arguments(actions, tmp_path):
     assert tracks['namespace'] == '/humans/bodies/anna'
     assert parameters(tracks) == {
         'use_sim_time': True,
+        'reset_on_time_jump': True,
         'autostart': False,
         'image_transport': 'compressed',
         'use_mask': True,
@@ -397,14 +397,20 @@ def test_views_are_upright(actions):
 )
 def test_one_line_from_a_webcam_to_a_person(given, options, nodes, monkeypatch):
     camera_file = with_stand_ins(CAMERA_FILE)
-    monkeypatch.setitem(camera_file['actions_of'].__globals__, 'has_runtime', lambda: False)
+    monkeypatch.setitem(camera_file['actions_of'].__globals__, 'is_installed', lambda: False)
     *declared, function = camera_file['generate_launch_description']().arguments[0]
     context = {one.arguments[0]: one.options['default_value'] for one in declared}
     assert given.keys() <= context.keys()
     camera, person = function.options['function']({**context, **given})
     assert (camera.options['executable'], camera.options['namespace']) == ('camera_node', 'camera')
     assert camera.options['arguments'] == options
+    # A file begins when all nodes of the person are active.
+    names = ' '.join(f'{NAMESPACE}/{name}' for name in nodes.split())
+    assert camera.options['parameters'] == [{'wait_for': names, 'loop': False, 'rate': 1.0}]
     handed = dict(person.options['launch_arguments'])
+    # An assumed field of view makes depths uncertain.
+    assumed = '0.2' if len(options) == 1 else None
+    assert handed.pop('focal_length_sigma', None) == assumed
     assert handed == {'image': '/camera/image_raw', 'nodes': nodes}
     (source,) = person.arguments
     assert source.arguments == (str(ROOT / 'hmt_ros' / 'launch' / 'hmt.launch.py'),)
@@ -418,19 +424,87 @@ def test_arguments_of_the_camera_that_can_not_be_used():
     for given, text in (
         ({'fov': '60', 'calibration': 'c.yaml'}, 'fov and calibration: wanted one of them'),
         ({'detector': 'yes'}, "detector: wanted 'auto', 'true' or 'false', saw 'yes'"),
+        ({'loop': 'yes'}, "loop: wanted 'true' or 'false', saw 'yes'"),
+        ({'rate': 'fast'}, "rate: wanted a number such as 0.5, saw 'fast'"),
     ):
         with pytest.raises(ValueError, match=text):
             actions_of({**usual, **given}, ROOT)
 
 
-def test_a_detector_is_used_where_there_is_one(monkeypatch):
+@pytest.mark.parametrize('installed', [False, True])
+def test_a_detector_is_used_where_there_is_one(installed, monkeypatch):
     has_detector = with_stand_ins(CAMERA_FILE)['_has_detector']
-    for runtime, networks in itertools.product((False, True), repeat=2):
-        monkeypatch.setitem(
-            has_detector.__globals__, 'has_runtime', lambda runtime=runtime: runtime
+    monkeypatch.setitem(has_detector.__globals__, 'is_installed', lambda: installed)
+    assert has_detector('auto') is installed
+    assert has_detector('true') is True
+    assert has_detector('false') is False
+
+
+@pytest.mark.parametrize(
+    ('installed', 'given', 'said'),
+    [
+        (True, {}, None),
+        (False, {}, 'not installed, and no image of the empty scene is given: nothing tells where'),
+        (False, {'detector': 'true'}, 'MediaPipe Pose is not installed, and no image of'),
+        (False, {'background_file': 'empty.png'}, 'not installed: keypoints help most, run "ros2'),
+        (False, {'detections_source': 'yolo'}, 'not installed: keypoints help most, run "ros2'),
+        (True, {'detector': 'false'}, 'no detector is wanted, and no image of the empty scene'),
+        (True, {'detector': 'false', 'background_file': 'empty.png'}, None),
+    ],
+)
+def test_what_nobody_can_be_found_without_is_said_before_anything_starts(
+    installed, given, said, monkeypatch, capsys
+):
+    camera_file = with_stand_ins(CAMERA_FILE)
+    patched = camera_file['actions_of'].__globals__
+    monkeypatch.setitem(patched, 'is_installed', lambda: installed)
+    monkeypatch.setitem(patched, 'actions_of', lambda *_: pytest.fail('too early') if said else [])
+    *declared, function = camera_file['generate_launch_description']().arguments[0]
+    context = {one.arguments[0]: one.options['default_value'] for one in declared}
+    if said is None:
+        function.options['function']({**context, **given})
+        assert capsys.readouterr().err == ''
+        return
+    with pytest.raises(pytest.fail.Exception):
+        function.options['function']({**context, **given})
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('camera.launch.py: ')
+    assert said in line
+    assert 'ros2 run hmt_ros install-detector' in line
+
+
+def test_the_camera_waits_for_the_nodes_of_the_person_that_is_named(monkeypatch):
+    camera_file = with_stand_ins(CAMERA_FILE)
+    usual = {name: default for name, default, _ in camera_file['ARGUMENTS']}
+    for handed, namespace in (
+        ({'body_id': 'anna', 'namespace': ''}, '/humans/bodies/anna'),
+        ({'namespace': '/lab/anna'}, '/lab/anna'),
+    ):
+        camera, person = camera_file['actions_of'](
+            {**usual, 'detector': 'false', 'loop': 'true', 'rate': '2'},
+            ROOT,
+            {**handed, 'focal_length_sigma': '0.1'},
         )
-        monkeypatch.setitem(has_detector.__globals__, 'has_networks', lambda found=networks: found)
-        assert has_detector('auto') == (runtime and networks)
+        (parameters,) = camera.options['parameters']
+        names = parameters.pop('wait_for').split()
+        assert names == [f'{namespace}/{x}_node' for x in ('filter', 'smoother', 'bme')]
+        assert parameters == {'loop': True, 'rate': 2.0}
+        # What a user says of the lens goes on as it is.
+        assert 'focal_length_sigma' not in dict(person.options['launch_arguments'])
+
+
+def test_an_uncertain_focal_length_and_a_jump_of_simulated_time(actions):
+    made = actions(focal_length_sigma='0.2', use_sim_time='true')
+    own = parameters(made['filter_node'])
+    assert own.pop('use_sim_time') is True
+    assert with_values(FilterParameters(), own).focal_length_sigma == 0.2
+    for options in made.values():
+        assert parameters(options)['reset_on_time_jump'] is True
+    people = actions(nodes='people_node', focal_length_sigma='.2')['people_node']
+    assert parameters(people)['focal_length_sigma'] == 0.2
+    for text in ('1.5', 'much', '-0.1'):
+        with pytest.raises(ValueError, match='focal_length_sigma: wanted a number from 0 to 1'):
+            actions(focal_length_sigma=text)
 
 
 def test_everything_is_installed(monkeypatch):

@@ -184,6 +184,48 @@ def test_packages_that_use_the_messages_run(workspace: Path) -> None:
     assert (ran.returncode, ran.stdout) == (0, 'listener.node\n'), ran.stderr
 
 
+# Asks for the support of a message, which loads the libraries of its package and of the middleware.
+CONSUMER = """
+#include <hmt_msgs/msg/pose_mixture.hpp>
+#include <rosidl_typesupport_cpp/message_type_support.hpp>
+int main() {
+  namespace support = rosidl_typesupport_cpp;
+  auto any = support::get_message_type_support_handle<hmt_msgs::msg::PoseMixture>();
+  return get_message_typesupport_handle(any, "rosidl_typesupport_fastrtps_cpp") == nullptr;
+}
+"""
+
+
+@pytest.mark.ros
+def test_a_program_in_cpp_starts_in_the_environment_of_a_clone(tmp_path: Path) -> None:
+    if not (ROOT / 'install' / 'local_setup.bash').is_file() or not (ROOT / '.venv').is_dir():
+        pytest.skip('no clone that "make setup" has set up')
+    source, program = tmp_path / 'consumer.cpp', tmp_path / 'consumer'
+    source.write_text(CONSUMER, 'utf-8')
+    built = (ROOT / 'install' / 'hmt_msgs', ROOT / '.venv')
+    names = 'hmt_msgs__rosidl_typesupport_cpp', 'rosidl_typesupport_cpp', 'rosidl_runtime_c'
+    subprocess.run(
+        [
+            *(os.environ.get('CXX', 'c++'), '-std=c++17', str(source), '-o', str(program)),
+            *(f'-I{folder}' for prefix in built for folder in prefix.glob('include/*')),
+            *(f'-L{prefix}/lib' for prefix in built),
+            *(f'-l{name}' for name in names),
+            '-Wl,--allow-shlib-undefined',
+        ],
+        check=True,
+    )
+    bare = {name: value for name, value in os.environ.items() if name != 'LD_LIBRARY_PATH'}
+    outside = subprocess.run([program], env=bare, capture_output=True, text=True, check=False)
+    assert 'error while loading shared libraries' in outside.stderr
+    inside = subprocess.run(
+        ['bash', '-c', f'source tools/environment.bash && {program} && echo $LD_LIBRARY_PATH'],
+        cwd=ROOT, env=bare, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert inside.returncode == 0, inside.stderr
+    # An empty element would be the working directory.
+    assert all(inside.stdout.strip().split(':'))
+
+
 @pytest.mark.ros
 def test_a_node_of_a_workspace_starts(workspace: Path) -> None:
     node = subprocess.Popen(
@@ -349,6 +391,96 @@ def test_kernels_are_compiled_where_the_package_is_installed(
     wanted = [(['-m', 'hmt_ros', 'compile', '--quiet'], str(tmp_path))]
     assert runs == ([] if variable else wanted)
     assert ('ros2 run hmt_ros compile' in capsys.readouterr().err) == bool(code)
+
+
+# ---- What tools/workspace.sh does about the detector, with a stand-in for Python ----
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """What the stage of the detector reads of a clone that is set up, without the packages."""
+    for name in (
+        'tools/workspace.sh',
+        'requirements/detector.txt',
+        'hmt_ros/detectors/blazepose_models.py',
+    ):
+        target = tmp_path / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, target)
+    stamps, python = tmp_path / '.venv' / 'stamps', tmp_path / '.venv' / 'bin' / 'python'
+    stamps.mkdir(parents=True)
+    (stamps / 'ros').write_text('as it is\n', 'utf-8')
+    python.parent.mkdir()
+    # Keeps its arguments, and fails at what the file "offline" names.
+    python.write_text(
+        f'#!/bin/bash\necho "$*" >>{tmp_path}/calls\n'
+        f'if [ -f {tmp_path}/offline ] && [[ "$*" == *"$(cat {tmp_path}/offline)"* ]]; then\n'
+        '  echo WARNING: connection broken >&2\n'
+        '  echo ERROR: no route to host >&2\n  exit 1\nfi\n',
+        'utf-8',
+    )
+    python.chmod(0o755)
+    return tmp_path
+
+
+def run_detector_stage(clone: Path) -> tuple[int, list[str], int]:
+    """Exit code, lines on stderr and number of calls of Python of one run."""
+    (clone / 'calls').unlink(missing_ok=True)
+    done = subprocess.run(
+        [clone / 'tools' / 'workspace.sh', 'detector'], capture_output=True, text=True, check=False
+    )
+    assert done.stdout == ''
+    calls = clone / 'calls'
+    count = len(calls.read_text('utf-8').splitlines()) if calls.exists() else 0
+    return done.returncode, done.stderr.splitlines(), count
+
+
+def test_the_detector_is_installed_once(clone: Path) -> None:
+    assert run_detector_stage(clone) == (0, ['hmt_ros: installing MediaPipe Pose'], 2)
+    pip, networks = (
+        ' -m pip -qq --disable-pip-version-check --no-input install --no-compile --retries 1 '
+        '-r requirements/detector.txt',
+        '-m hmt_ros install-detector --quiet',
+    )
+    run_detector_stage(clone)
+    (clone / '.venv' / 'stamps' / 'detector').unlink()
+    run_detector_stage(clone)
+    assert (clone / 'calls').read_text('utf-8').splitlines() == [pip.strip(), networks]
+    assert run_detector_stage(clone) == (0, [], 0)
+    # Another release of MediaPipe is fetched.
+    with (clone / 'hmt_ros' / 'detectors' / 'blazepose_models.py').open('a') as file:
+        file.write('# other networks\n')
+    assert run_detector_stage(clone)[2] == 2
+
+
+@pytest.mark.parametrize(('what', 'calls'), [('pip', 1), ('install-detector', 2)])
+def test_without_network_the_rest_goes_on(clone: Path, what: str, calls: int) -> None:
+    (clone / 'offline').write_text(what, 'utf-8')
+    code, (begun, told), count = run_detector_stage(clone)
+    assert (code, begun, count) == (78, 'hmt_ros: installing MediaPipe Pose', calls)
+    assert told == (
+        'hmt_ros: MediaPipe Pose could not be installed, all else works without: "make detector" '
+        'tries again (ERROR: no route to host)'
+    )
+    # Nothing that other stages look at has changed; the next call tries again.
+    assert sorted(x.name for x in (clone / '.venv' / 'stamps').iterdir()) == ['ros']
+    assert not (clone / '.venv' / 'unfinished').exists()
+    (clone / 'offline').unlink()
+    assert run_detector_stage(clone)[::2] == (0, 2)
+
+
+@pytest.mark.parametrize('target', ['setup', 'demo'])
+def test_setup_and_demo_install_the_detector_if_they_can(target: str) -> None:
+    makefile = (ROOT / 'Makefile').read_text('utf-8')
+    (recipe,) = re.findall(rf'^{target}:\n((?:\t.*\n)+)', makefile, re.M)
+    lines = [line.strip() for line in recipe.splitlines()]
+    place = lines.index('@$(WITH_DETECTOR)')
+    assert 'kernels' in lines[place - 1]
+    (command,) = re.findall(r'^WITH_DETECTOR := (.*)$', makefile, re.M)
+    for code, wanted in ((0, 0), (78, 0), (130, 1), (1, 1)):
+        shell = command.replace('$(WORKSPACE) detector', f'(exit {code})').replace('$$', '$')
+        done = subprocess.run(['bash', '-e', '-o', 'pipefail', '-c', shell], check=False)
+        assert done.returncode == wanted, code
 
 
 # ---- What colcon, rosdep and bloom read ----

@@ -4,7 +4,7 @@
 #
 #     tools/demonstration.sh MOTION SEED SECONDS BAG
 #
-# Needs `make setup`, `make detector` and a Python 3.11, which PYTHON=/path/to/python3.11 names.
+# Needs `make setup`, with the detector, and a Python 3.11, which PYTHON=/path/to/python3.11 names.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 [ $# = 4 ] || { printf 'usage: tools/demonstration.sh MOTION SEED SECONDS BAG\n' >&2; exit 1; }

@@ -12,8 +12,13 @@ export AMENT_PREFIX_PATH=$VIRTUAL_ENV CMAKE_PREFIX_PATH=$VIRTUAL_ENV
 export PATH=$VIRTUAL_ENV/bin:$PATH
 export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3
 source "$_root/install/local_setup.bash"
+# Where the wheels keep their libraries, and those of others that these need: a program in C++ does
+# not find them by itself.
+for _folder in "$VIRTUAL_ENV"/lib "$VIRTUAL_ENV"/lib/python3.*/site-packages/ros_*.libs; do
+  export LD_LIBRARY_PATH=${LD_LIBRARY_PATH:+${LD_LIBRARY_PATH%:}:}$_folder
+done
 # Nodes and commands run the sources, not the copy in install/.
 export PYTHONPATH=$_root:$PYTHONPATH
 # DDS communicates on this machine only, unless the variable is set already.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
-unset _root
+unset _root _folder

@@ -195,10 +195,25 @@ build_tf2_msgs() {
 stage_test() { stage_requirements test; }
 stage_lint() { stage_requirements lint; }
 
+# Optional: a failure leaves all other stages as they are.
 stage_detector() {
-  stage_requirements detector
-  saying_how_long 'fetching MediaPipe Pose' "$venv/bin/python" -m hmt_ros install-detector --quiet ||
-    fail 'MediaPipe Pose could not be installed'
+  local key log
+  key=$(printf '%s\n' requirements/detector.txt hmt_ros/detectors/blazepose_models.py |
+    checksum "$(cat "$stamps/ros")")
+  done_already detector "$key" && return
+  log=$(mktemp)
+  saying_how_long 'installing MediaPipe Pose' install_detector "$log" ||
+    fail 'MediaPipe Pose could not be installed, all else works without: "make detector" tries' \
+      "again ($(tail -n 1 "$log"))"
+  rm "$log"
+  echo "$key" >"$stamps/detector"
+}
+
+install_detector() {
+  {
+    install --retries 1 -r requirements/detector.txt &&
+      "$venv/bin/python" -m hmt_ros install-detector --quiet
+  } >"$1" 2>&1
 }
 
 stage_requirements() {

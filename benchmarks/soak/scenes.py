@@ -178,7 +178,7 @@ def _bme() -> Scene:
             {},
             {'image_transport': 'raw', 'reset_on_time_jump': True},
             {'propagation': 'dynamics', 'reset_on_time_jump': True},
-            {'background_file': '', 'background_images': 2},
+            {'background_file': ''},
         ),
     )
 

@@ -32,13 +32,15 @@ class CommandParser(argparse.ArgumentParser):
         """Raises ValueError."""
         raise ValueError(f'{message}; see --help')
 
-    def add_output(self, metavar: str, what: str, text: str) -> None:
+    def add_output(self, metavar: str, what: str, text: str, *, required: bool = True) -> None:
         """Adds --output, --overwrite and --quiet of a command that writes a folder.
 
         Args:
             what: kind of the folder, 'bag' for example.
         """
-        self.add_argument('-o', '--output', type=Path, required=True, metavar=metavar, help=text)
+        self.add_argument(
+            '-o', '--output', type=Path, required=required, metavar=metavar, help=text
+        )
         self.add_argument('--overwrite', action='store_true', help=f'replace an existing {what}')
         self.add_argument('--quiet', action='store_true', help='print only warnings and errors')
 

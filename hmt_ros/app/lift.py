@@ -37,7 +37,7 @@ from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.camera_session import CAMERA_INFO, FRAME_ID
 from hmt_ros.sessions.image_inputs import PREDICTION
 from hmt_ros.tracking import read_subject
-from hmt_ros.tracking.existence import same_person
+from hmt_ros.tracking.existence import SAME_PERSON
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
@@ -161,7 +161,7 @@ def _lift(arguments: argparse.Namespace) -> int:
     with BagWriter(folder / LIFTED, overwrite=arguments.overwrite) as bag:
         track, met = 1, stamps[0]
         for stamp, mixture in zip(stamps, mixtures, strict=True):
-            track += same_person(seconds(stamp - met)) < 0.5
+            track += SAME_PERSON.transition(seconds(stamp - met))[1, 1] < 0.5
             met = met if mixture is None else stamp
             info = camera_info_message(messages, camera, stamp, FRAME_ID)
             bag.write(CAMERA_INFO, stamp, info)

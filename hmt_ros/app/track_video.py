@@ -1,6 +1,10 @@
 """track-video: from a video to a report: import-video, replay and report in one command.
 
-track-video walk.mp4 -o walk --fov 60 --keypoints walk.json
+track-video walk.mp4
+
+What is not given is found or assumed: keypoints by the detector, where it is installed; the field
+of view by the metadata of the video, else that of common cameras, with an error that is in all
+depths; gravity by the lines of the scene; a folder of images is taken for a usual video.
 """
 
 from __future__ import annotations
@@ -10,15 +14,26 @@ from functools import partial
 from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, gravity_of, number, run_command
-from hmt_ros.app.import_video.command import ImportOptions, add_video_arguments, import_video
+from hmt_ros.app.import_video.command import (
+    MEDIAPIPE,
+    ImportOptions,
+    add_video_arguments,
+    import_video,
+)
+from hmt_ros.app.import_video.frames import Selection, open_source
+from hmt_ros.app.import_video.lens import TOLD_SIGMA, told_fov
 from hmt_ros.app.progress import tell_user
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.app.subject import find_start, subject_text
 from hmt_ros.body import load_body
+from hmt_ros.detectors.blazepose_models import is_installed
+from hmt_ros.sessions.focal_length import USUAL_FOV, USUAL_SIGMA
 
 VIDEO, SUBJECT, TRACKED, REPORT = 'video', 'subject.yaml', 'tracked', 'report'
+# Images a second of a folder of images.
+USUAL_RATE = 30.0
 
 EPILOG = """\
 DIR gets
@@ -27,15 +42,18 @@ DIR gets
   tracked/            the bag that replay writes, see replay --help
   report/report.html  the page that report writes, for a browser
 
-An unknown tilt of the camera is taken for a lean of the person: tell --level where the camera looks
-to the horizon and stands upright, or --gravity.
+Without --keypoints MediaPipe Pose finds them, where install-detector has been run. Without --fov or
+--camera the field of view is taken from the metadata of the video, or assumed; the error that this
+may make is in all published depths. Without --level or --gravity lines of the scene show the tilt
+of the camera where they can; an unknown tilt is taken for a lean of the person.
 
-The track starts from the keypoints that were imported, or without any from a prediction. --subject
-names a subject file instead, and --stature writes one from the keypoints of an image.
+The track starts from the keypoints, or without any from a prediction. --subject names a subject
+file instead, and --stature writes one from the keypoints of an image.
 
 examples:
+  track-video walk.mp4
   track-video walk.mp4 -o walk --fov 60 --keypoints walk.json
-  track-video walk.mp4 -o walk --fov 60 --detector mediapipe --stature 1.75 --level
+  track-video walk.mp4 -o walk --camera camera.yaml --stature 1.75 --level
 
 exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 """
@@ -50,8 +68,12 @@ def _parser() -> CommandParser:
     parser = CommandParser(
         'track-video', 'Imports a video, tracks the person in it, and writes a report.', EPILOG
     )
-    add_video_arguments(parser)
-    parser.add_output('DIR', 'result', 'folder for the bags and the report')
+    add_video_arguments(parser, camera_required=False)
+    parser.add_argument(
+        '--no-detector', action='store_true', help='find no keypoints where none are given'
+    )
+    what = 'folder for the bags and the report (default: the name of SOURCE and _tracked)'
+    parser.add_output('DIR', 'result', what, required=False)
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
         '--subject', type=Path, metavar='FILE', help='subject file to start from, see replay'
@@ -73,6 +95,7 @@ def _parser() -> CommandParser:
 
 def _track(arguments: argparse.Namespace) -> int:
     folder, quiet = arguments.output, arguments.quiet
+    folder = folder or Path(f'{arguments.source.absolute().stem}_tracked')
     tell = partial(tell_user, 'track-video')
     overwrite, stature = arguments.overwrite, arguments.stature
 
@@ -80,9 +103,14 @@ def _track(arguments: argparse.Namespace) -> int:
         if not quiet:
             print(text, flush=True)
 
+    finds = arguments.keypoints is None and not arguments.no_detector and is_installed()
+    arguments.detector = arguments.detector or (MEDIAPIPE if finds else None)
     with_keypoints = arguments.keypoints is not None or arguments.detector is not None
     if stature is not None and not with_keypoints:
-        raise ValueError('--stature goes with --keypoints or --detector')
+        raise ValueError(
+            '--stature goes with --keypoints, or with a detector: python -m hmt_ros '
+            'install-detector'
+        )
     for given in (arguments.subject, arguments.background):
         if given is not None and not given.is_file():
             raise ValueError(f'{given}: no such file')
@@ -90,6 +118,14 @@ def _track(arguments: argparse.Namespace) -> int:
     if taken and not overwrite:
         raise ValueError(f'{folder / taken[0]} exists; give another name, or --overwrite')
 
+    settings, notes = _assumed(arguments)
+    if not (with_keypoints or arguments.masks or arguments.subject or arguments.background):
+        notes.append(
+            'neither keypoints nor the empty scene are known: the person may not be found; run '
+            '"python -m hmt_ros install-detector", or give --keypoints or --background'
+        )
+    for note in notes:
+        tell(note)
     video, start = folder / VIDEO, folder / SUBJECT
     imported = import_video(ImportOptions.of(arguments, video), tell)
     say(f'{video}: {imported}')
@@ -106,17 +142,46 @@ def _track(arguments: argparse.Namespace) -> int:
     options = ReplayOptions(
         overwrite=overwrite, quiet=quiet, subject=subject,
         background=arguments.background, seed=arguments.seed,
-        settings=[*_of_gravity(arguments), *arguments.settings],
+        settings=[*settings, *_of_gravity(arguments), *arguments.settings],
     )  # fmt: skip
     replayed = replay_bag(video, folder / TRACKED, options, tell)
     say(f'{folder / TRACKED}: {replayed}')
     _, written = write_report(
         ReportOptions(
-            folder / TRACKED, folder / REPORT, overwrite=overwrite, quiet=quiet, images=video
+            folder / TRACKED,
+            folder / REPORT,
+            overwrite=overwrite,
+            quiet=quiet,
+            images=video,
+            notes=notes,
         )
     )
     say(written)
     return 0
+
+
+def _assumed(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
+    """Completes the arguments; settings of the tracker that follow, and what was assumed."""
+    source, settings, notes = arguments.source, [], []
+    if source.is_dir() and any(source.glob('*.mcap')):
+        raise ValueError(f'{source} is a bag: replay {source} tracks the person in it')
+    if source.is_dir() and arguments.fps is None:
+        arguments.fps = USUAL_RATE
+        notes.append(f'{source} is a folder: {USUAL_RATE:g} images a second, unless --fps says so')
+    if (arguments.camera, arguments.fov, arguments.vertical_fov) == (None, None, None):
+        first = next(iter(open_source(source, arguments.fps).frames(Selection())), None)
+        told = None if source.is_dir() else told_fov(source)
+        fov, sigma = (USUAL_FOV, USUAL_SIGMA) if told is None else (told, TOLD_SIGMA)
+        height, width = (0, 1) if first is None else first.image.shape[:2]
+        arguments.fov, arguments.vertical_fov = (fov, None) if width >= height else (None, fov)
+        settings.append(f'focal_length_sigma={sigma}')
+        notes.append(
+            f'the field of view is {"assumed to be" if told is None else "by the metadata"} '
+            f'{fov:.0f} degrees along the longer side; focal length and distances may err by '
+            f'{sigma:.0%} (one standard deviation, which is in the results): --fov or --camera '
+            'if you know better'
+        )
+    return settings, notes
 
 
 def _of_gravity(arguments: argparse.Namespace) -> list[str]:

@@ -60,6 +60,11 @@ def has_runtime() -> bool:
     return importlib.util.find_spec(RUNTIME_MODULE) is not None
 
 
+def is_installed() -> bool:
+    """Whether the detector can run."""
+    return has_runtime() and has_networks()
+
+
 def require_network(name: str) -> bytes:
     """Content of a network's file.
 

@@ -413,9 +413,9 @@ class SceneWatch:
             return
         if self._seen != (background, background.frames):
             self._seen = background, background.frames
-            self._edges, self._usual, self._signs = _edges(background.empty), 0.0, 0
+            self._edges, self._usual, self._signs = edges_of(background.empty), 0.0, 0
         assert self._edges is not None
-        shift, best, here = _correlation(self._edges, _edges(image))
+        shift, best, here = _correlation(self._edges, edges_of(image))
         self._usual = self._usual or here
         elsewhere = best >= LEAST and best - here >= MARGIN
         another = self._usual >= LEAST and here < LEFT * self._usual
@@ -424,7 +424,7 @@ class SceneWatch:
         self.shift = shift * image.shape[1] / WIDTH if elsewhere else np.nan if another else 0.0
 
 
-def _edges(image: Image) -> Array:
+def edges_of(image: Image) -> Array:
     """Lengths (h, w) of the gradients of an image (H, W, 3), at `WIDTH`."""
     height = max(round(image.shape[0] * WIDTH / image.shape[1]), 2 * REACH + 8)
     small = cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA)

@@ -2,11 +2,12 @@
 
     ros2 run hmt_ros camera_node /dev/video0 --fov 60
     ros2 run hmt_ros camera_node walk.mp4 --calibration camera.yaml --ros-args -r __ns:=/camera
+    ros2 run hmt_ros camera_node walk.mp4 --ros-args -p loop:=true -p rate:=0.5
 
-It publishes `image_raw` and `camera_info`, as sensor data. A file is shown at its own rate once
-somebody subscribes to its images; the node ends with it. The stamp of an image is the time at which
-it was read, or is due in the file. Where nothing tells the field of view it is taken to be that of
-a common webcam.
+It publishes `image_raw` and `camera_info`, as sensor data. The stamp of an image is the time at
+which it was read, or is due in the file. Where nothing tells the field of view it is taken to be
+that of a common camera. A file begins once the nodes of the parameter `wait_for` are active or,
+without names, once somebody subscribes to its images; the node ends with it.
 """
 
 from __future__ import annotations
@@ -17,19 +18,30 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import rclpy
+from rclpy.exceptions import ParameterException
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Image
+from hmt_ros.nodes.node_parameters import descriptor
+from hmt_ros.nodes.run_node import described
 from hmt_ros.nodes.signals import on_signals
 from hmt_ros.sessions.camera_file import camera_of_view, read_camera
+from hmt_ros.sessions.declared_parameters import (
+    AT_LAUNCH,
+    declared_parameters,
+    parameter_field,
+    with_values,
+)
+from hmt_ros.sessions.focal_length import USUAL_FOV, usual_camera
 from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.camera_info import camera_info_message
@@ -39,13 +51,30 @@ from msg_tools.messages.images import image_message
 
 NAME = 'camera_node'
 FRAME_ID = 'camera_optical_frame'
-# Field of view of a common webcam from left to right, degrees.
-USUAL_FOV = 60.0
 # Images a second of a file that does not give its rate.
 _USUAL_RATE = 30.0
 # Time without an image after which a device counts as gone, s.
 _PATIENCE = 5.0
 _GLANCE, _CONNECTING = 0.05, 0.5
+# Time after which a node that is not active yet is asked, and named, again, s.
+_AGAIN = 10.0
+
+
+@dataclass(frozen=True)
+class CameraNodeParameters:
+    """Parameters of the node.
+
+    Attributes:
+        wait_for: Names of the lifecycle nodes that must be active before a file begins, separated
+            by blanks; if empty, it begins with the first subscriber.
+        loop: If true, a file begins again at its end; its stamps go on.
+        rate: Factor on the speed at which a file is shown; its stamps stay as far apart as in the
+            file.
+    """
+
+    wait_for: str = parameter_field('', AT_LAUNCH)
+    loop: bool = parameter_field(False, AT_LAUNCH)
+    rate: float = parameter_field(1.0, AT_LAUNCH, (0.01, 100.0))
 
 
 class CameraError(ValueError):
@@ -57,6 +86,7 @@ class Video:
 
     Args:
         source: '/dev/video0', the number of a device, or the path of a file.
+        loop, speed: of a file, see `CameraNodeParameters`.
 
     Attributes:
         is_file: whether it is a file, which has an end.
@@ -65,10 +95,10 @@ class Video:
         CameraError: it can not be opened.
     """
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source: str, *, loop: bool = False, speed: float = 1.0) -> None:
         number = source.removeprefix('/dev/video')
         self.is_file = not number.isdecimal()
-        self._source = source
+        self._source, self._loop, self._speed = source, loop, speed
         if self.is_file and not Path(source).is_file():
             raise CameraError(f'{source}: no such file; wanted a video, or /dev/video0')
         self._capture = cv2.VideoCapture(source if self.is_file else int(number))
@@ -84,15 +114,19 @@ class Video:
         Raises:
             CameraError: a device gives none any more.
         """
-        start, number, seen = time.monotonic(), 0, time.monotonic()
+        start, number, seen, again = time.monotonic(), 0, time.monotonic(), 0
         while not stopped.is_set():
             read, image = self._capture.read()
             if read:
                 if self.is_file:
-                    stopped.wait(max(start + number / self._rate - time.monotonic(), 0.0))
+                    at = start + number / (self._rate * self._speed)
+                    stopped.wait(max(at - time.monotonic(), 0.0))
                 due = round(number * SECOND_NS / self._rate) if self.is_file else None
                 number, seen = number + 1, time.monotonic()
                 yield image, due  # type: ignore[misc]
+            elif self.is_file and self._loop and number > again:
+                again = number
+                self._capture.open(self._source)
             elif self.is_file:
                 return
             elif time.monotonic() - seen > _PATIENCE:
@@ -114,12 +148,13 @@ def main(args: list[str] | None = None) -> int:
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(NAME)
     try:
-        video = Video(given.video)
+        p = _parameters(node)
+        video = Video(given.video, loop=p.loop, speed=p.rate)
         try:
-            _show(node, video, given, stopped)
+            _show(node, video, given, p.wait_for.split(), stopped)
         finally:
             video.close()
-    except ValueError as error:
+    except (ParameterException, ValueError) as error:
         sys.stderr.write(f'{NAME}: {error_line(error)}\n')
         return 1
     finally:
@@ -132,6 +167,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=f'ros2 run hmt_ros {NAME}',
         description=__doc__,
+        epilog='\n'.join(['parameters:', *described(CameraNodeParameters())]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument('video', help='/dev/video0, the number of a device, or a video file')
@@ -154,16 +190,54 @@ def _angle(text: str) -> float:
     return angle
 
 
-def _show(node: Any, video: Video, given: argparse.Namespace, stopped: threading.Event) -> None:
+def _parameters(node: Any) -> CameraNodeParameters:
+    """The parameters, once they are declared."""
+    declared = declared_parameters(CameraNodeParameters())
+    node.declare_parameters('', [(p.name, p.default, descriptor(p)) for p in declared])
+    values = {p.name: node.get_parameter(p.name).value for p in declared}
+    return with_values(CameraNodeParameters(), values)
+
+
+def _await_active(node: Any, names: list[str], stopped: threading.Event) -> None:
+    """Returns when lifecycle nodes of these names are active, or when stopped."""
+    from lifecycle_msgs.msg import State
+    from lifecycle_msgs.srv import GetState
+
+    clients = {name: node.create_client(GetState, f'{name}/get_state') for name in names}
+    told = time.monotonic()
+    while clients and not stopped.is_set():
+        for name, client in [*clients.items()]:
+            if not client.service_is_ready():
+                continue
+            answer = client.call_async(GetState.Request())
+            rclpy.spin_until_future_complete(node, answer, timeout_sec=_CONNECTING)
+            if answer.done() and answer.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
+                node.destroy_client(clients.pop(name))
+        if time.monotonic() - told > _AGAIN:
+            told = time.monotonic()
+            node.get_logger().info(f'not active yet: {", ".join(clients)}; see "ros2 node list"')
+        stopped.wait(_GLANCE)
+
+
+def _show(
+    node: Any,
+    video: Video,
+    given: argparse.Namespace,
+    wait_for: list[str],
+    stopped: threading.Event,
+) -> None:
     from sensor_msgs.msg import CameraInfo
     from sensor_msgs.msg import Image as ImageMessage
 
     images = node.create_publisher(ImageMessage, 'image_raw', qos_profile_sensor_data)
     infos = node.create_publisher(CameraInfo, 'camera_info', qos_profile_sensor_data)
-    if video.is_file and not images.get_subscription_count():
+    if video.is_file and wait_for:
+        node.get_logger().info(f'{given.video} starts when active: {", ".join(wait_for)}')
+        _await_active(node, wait_for, stopped)
+    elif video.is_file and not images.get_subscription_count():
         node.get_logger().info(f'{given.video} starts when somebody subscribes to {images.topic}')
-    while video.is_file and not images.get_subscription_count() and not stopped.is_set():
-        stopped.wait(_GLANCE)
+        while not images.get_subscription_count() and not stopped.is_set():
+            stopped.wait(_GLANCE)
     if video.is_file:
         # The other side may not know yet that it is connected.
         stopped.wait(_CONNECTING)
@@ -179,7 +253,8 @@ def _show(node: Any, video: Video, given: argparse.Namespace, stopped: threading
         if images.get_subscription_count():
             images.publish(serialise(image_message(messages, image, stamp, given.frame_id)))
         count += 1
-    node.get_logger().info(f'{given.video}: {count} images shown')
+    over = '' if stopped.is_set() or not video.is_file else '; the file is over'
+    node.get_logger().info(f'{given.video}: {count} images shown{over}')
 
 
 def _camera(node: Any, given: argparse.Namespace, size: tuple[int, int]) -> Camera:
@@ -189,9 +264,11 @@ def _camera(node: Any, given: argparse.Namespace, size: tuple[int, int]) -> Came
     if given.fov is None:
         node.get_logger().warn(
             f'neither --calibration nor --fov is given: the field of view is taken to be '
-            f'{USUAL_FOV:g} degrees; distances are wrong by as much as that is'
+            f'{USUAL_FOV:g} degrees along the longer side; distances are wrong by as much as '
+            'that is, see focal_length_sigma of filter_node'
         )
-    return camera_of_view(size, horizontal=given.fov or USUAL_FOV)
+        return usual_camera(size)
+    return camera_of_view(size, horizontal=given.fov)
 
 
 if __name__ == '__main__':

@@ -164,8 +164,12 @@ def usage(kind: type[SessionNode[Any, Any]]) -> str:
         '',
         'parameters, all optional, with type, range, default, and when a new value takes effect:',
     ]
-    lines = [line for each in declared_parameters(kind.DEFAULTS) for line in _described(each)]
-    return '\n'.join([*head, *lines]) + '\n'
+    return '\n'.join([*head, *described(kind.DEFAULTS)]) + '\n'
+
+
+def described(settings: Any) -> list[str]:
+    """Lines that describe the parameters of a settings dataclass."""
+    return [line for each in declared_parameters(settings) for line in _described(each)]
 
 
 def _described(parameter: DeclaredParameter) -> list[str]:

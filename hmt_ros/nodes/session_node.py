@@ -14,6 +14,7 @@ import time
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -91,6 +92,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     ) -> None:
         super().__init__(self.NAME, **options)
         defaults = self._in_namespace(self.DEFAULTS if defaults is None else defaults)
+        if self.get_parameter('use_sim_time').value:
+            # A bag that is played again.
+            defaults = replace(defaults, reset_on_time_jump=True)
         declared = declared_parameters(defaults)
         self.declare_parameters(
             '', [(p.name, as_in_ros(p.default), descriptor(p)) for p in declared]

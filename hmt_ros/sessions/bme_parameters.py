@@ -29,10 +29,8 @@ class BmeParameters(CameraNodeParameters):
     Attributes:
         model_file: Trained model, as `train` writes it; if empty, the small one that comes with the
             package.
-        background_file: Image of the empty scene as the camera sees it; if empty, the background is
-            learned from the first images.
-        background_images: Number of images of the empty scene from which the background is learned
-            where there is no background_file.
+        background_file: Image of the empty scene as the camera sees it; if empty, it is learned
+            once nothing has moved for two seconds.
         stature: Height of the person, m; 0 selects that of the model.
         least_height: Minimum height of a silhouette that counts as a person, px.
         predict_from: Cue of the predictions: 'silhouettes', 'keypoints' of a detector (no image is
@@ -53,7 +51,6 @@ class BmeParameters(CameraNodeParameters):
 
     model_file: str = parameter_field('', NEXT_CONFIGURE)
     background_file: str = parameter_field('', NEXT_CONFIGURE)
-    background_images: int = parameter_field(30, AT_ONCE, (1, 10_000))
     stature: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3.0))
     least_height: int = parameter_field(40, AT_ONCE, (1, 10_000))
     predict_from: str = parameter_field(FROM_SILHOUETTES, NEXT_CONFIGURE)

@@ -3,7 +3,8 @@
 The rules, besides those of `CameraSession`:
 
 - Every image that can be used gets one prediction. One without components says that nobody was
-  seen: the background is still being learned, or no silhouette has the height of a person.
+  seen, as no silhouette has the height of a person, or gives the `reason` why it can not say: the
+  scene has not been seen empty.
 - With `use_mask` the mask of an image is its silhouette; an image whose mask shows somebody teaches
   no background.
 - With `tracked_interval` the track of the filter (`pose_mixture`) is heard. While it says that the
@@ -46,6 +47,7 @@ from hmt_ros.experts.pose_predictor import (
 )
 from hmt_ros.experts.root_placement import SIZE_SPREAD
 from hmt_ros.image.background import BackgroundModel, one_person
+from hmt_ros.image.empty_scene import EmptyScene
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.bme_parameters import (
@@ -155,18 +157,18 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         super()._set_up()
         p = self.parameters
         self._predictor, self._size_spread = _predictor_of(p)
-        self._background = BackgroundModel(p.background)
-        self._given: NDArray[np.uint8] | None = None
+        background = BackgroundModel(p.background)
         if p.background_file:
-            self._given = read_picture(p.background_file)
-            self._background = BackgroundModel.from_image(self._given, p.background)
+            given = read_picture(p.background_file)
+            background = BackgroundModel.from_image(given, p.background)
+        self._scene = EmptyScene(background)
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
         self._previous: _Previous | None = None
         # Stamps of the last image that was looked at, and of the last one with a track.
         self._looked: int | None = None
         self._tracked: int | None = None
-        self._height, self._support = 0, math.nan
+        self._height, self._support, self._reason = 0, math.nan, ''
         # Whether the last prediction needed no background.
         self._without_background = p.predict_from == FROM_KEYPOINTS
         self._lifter = None
@@ -315,7 +317,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._show_silhouette(waiting)
             self._leave_to_track(waiting.stamp_ns, waiting.frame_id)
             return
-        self._looked = waiting.stamp_ns
+        self._looked, self._reason = waiting.stamp_ns, ''
         try:
             mixture = self._mixture_of(waiting, camera)
         except (ValueError, ArithmeticError) as error:
@@ -346,18 +348,16 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 self._show_silhouette(waiting)
                 return lifted
         self._without_background = given is not None
-        if self._images_to_learn() and (given is None or not given.any()):
-            with self._background_in_use:
-                self._background.learn(waiting.image)
-            if given is None:
-                self._publish_silhouette(np.zeros(waiting.image.shape[:2], np.bool_), waiting)
-            return None
         if given is None:
-            self._watch_scene(waiting)
-            mask = self._silhouette(waiting.image)
+            mask = self._judged_silhouette(waiting)
             self._publish_silhouette(mask, waiting)
+            if not self._scene.known:
+                self._reason = self._scene.wants
+                return None
         else:
             mask = one_person(given, p.background)
+            with self._background_in_use:
+                self._scene.learn(waiting.image, waiting.stamp_ns, bool(given.any()))
         self._height = _height(mask)
         if self._height < p.least_height:
             return None
@@ -370,9 +370,20 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._log.note(Fault.SILHOUETTE, f'image of {waiting.stamp_ns} ns: {text}')
         return found.mixture
 
-    def _watch_scene(self, waiting: WaitingImage) -> None:
+    def _judged_silhouette(self, waiting: WaitingImage) -> Mask:
+        """The silhouette of an image, empty as long as the scene was not seen empty."""
+        scene, stamp = self._scene, waiting.stamp_ns
         with self._background_in_use:
-            self._look_at_scene(waiting, self._background, 'configure the node anew')
+            if scene.known:
+                self._look_at_scene(waiting, scene.background, 'configure the node anew')
+                mask = scene.background.silhouette(waiting.image)
+                scene.judge(waiting.image, mask, stamp)
+                if scene.known:
+                    return mask
+            if scene.is_of_somebody:
+                self._scene = scene = EmptyScene(BackgroundModel(self.parameters.background))
+            scene.learn(waiting.image, stamp)
+        return np.zeros(waiting.image.shape[:2], np.bool_)
 
     def _known_before(self, stamp_ns: int) -> tuple[GaussianMixture | None, float]:
         """The poses predicted before an image, if they still count, and the time since then, s."""
@@ -398,8 +409,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _show_silhouette(self, waiting: WaitingImage) -> None:
         """Publishes the silhouette of an image that is not predicted from."""
-        known = waiting.mask is None and not self._images_to_learn()
-        if known and self._wanted(SILHOUETTE):
+        if waiting.mask is None and self._scene.known and self._wanted(SILHOUETTE):
             self._publish_silhouette(self._silhouette(waiting.image), waiting)
 
     def _publish_silhouette(self, mask: Mask, of: WaitingImage) -> None:
@@ -410,7 +420,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _silhouette(self, image: NDArray[np.uint8]) -> Mask:
         with self._background_in_use:
-            return self._background.silhouette(image)
+            return self._scene.background.silhouette(image)
 
     def _message(
         self,
@@ -420,7 +430,13 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         state: TrackState = TrackState.UNKNOWN,
     ) -> Any:
         content = PoseMixture.of_body(
-            self._predictor.body, mixture, MixtureKind.PREDICTION, stamp, frame_id, state=state
+            self._predictor.body,
+            mixture,
+            MixtureKind.PREDICTION,
+            stamp,
+            frame_id,
+            state=state,
+            reason=self._reason if mixture is None else '',
         )
         return pose_mixture_message(self._messages, content)
 
@@ -443,11 +459,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if camera is None:
             raise ValueError('no calibrated camera_info has come yet')
         p = self.parameters
-        if self._images_to_learn():
-            raise ValueError(
-                f'the background is being learned, from {self._background.frames} of '
-                f'{p.background_images} images so far: set background_file, or wait'
-            )
+        if not self._scene.known:
+            raise ValueError(f'no silhouette: {self._scene.wants}')
         image = self.decode_image(message)
         check_size(image, camera)
         mask = self._silhouette(image)
@@ -458,12 +471,6 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             )
         mixture = self._seen(mask, camera).mixture
         return self._message(mixture, time_ns(message.header.stamp), str(message.header.frame_id))
-
-    def _images_to_learn(self) -> int:
-        """How many more images of the empty scene are needed."""
-        if self._given is not None:
-            return 0
-        return max(self.parameters.background_images - self._background.frames, 0)
 
     def _present_state(self) -> BmeState:
         return BmeState(
@@ -476,9 +483,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         )
 
     def _status(self) -> tuple[str, str]:
-        missing = self._images_to_learn()
-        if missing and not self._without_background:
-            return 'learning', f'{missing} more images of the empty scene'
+        if not self._scene.known and not self._without_background:
+            return 'learning', self._scene.wants
         return 'predicting' if len(self._weights) else 'nobody', ''
 
 

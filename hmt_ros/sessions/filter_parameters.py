@@ -9,6 +9,7 @@ from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
+    FRACTION,
     NEXT_CONFIGURE,
     NEXT_TRACK,
     NOT_NEGATIVE,
@@ -57,6 +58,8 @@ class FilterParameters(CameraNodeParameters):
         gravity: Direction of gravity in the camera optical frame, three numbers of any length,
             [0.0, 1.0, 0.0] for a level camera; if empty, lines of the scene show it where they can.
         camera_height: Height of the camera above the floor, m; 0 if unknown.
+        focal_length_sigma: Relative standard deviation of the focal length in camera_info, which
+            makes the published depths uncertain; 0 for a calibrated camera, 0.2 for a guess.
         gravity_frame: Frame with z up, such as odom or map; gravity from /tf then overrides the
             parameter gravity at every image. Empty: off.
         floor_in_gravity_frame: If true, the plane z = 0 of gravity_frame is the floor, and
@@ -94,6 +97,7 @@ class FilterParameters(CameraNodeParameters):
     use_predictions: bool = parameter_field(False, AT_ONCE)
     gravity: tuple[float, ...] = parameter_field((), NEXT_TRACK)
     camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))
+    focal_length_sigma: float = parameter_field(0.0, AT_ONCE, FRACTION)
     gravity_frame: str = parameter_field('', NEXT_CONFIGURE)
     floor_in_gravity_frame: bool = parameter_field(False, NEXT_CONFIGURE)
     fixed_frame: str = parameter_field('', NEXT_CONFIGURE)

@@ -29,6 +29,7 @@ from hmt_ros.sessions.camera_session import (
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.fixed_frame import FixedFrame
+from hmt_ros.sessions.focal_length import with_depth_error
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.image_inputs import (
     INPUTS,
@@ -194,7 +195,8 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         """
         if len(message.components) == 0:
             # A predictor that leaves the image to the track has seen neither somebody nor nobody.
-            return None if message.state == TrackState.TRACKING else Status.NOBODY
+            left = message.state == TrackState.TRACKING or getattr(message, 'reason', '')
+            return None if left else Status.NOBODY
         try:
             content = pose_mixture_of(message)
             return PosePrediction(content.mixture, body_of(content, self.start.body))
@@ -272,10 +274,14 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                     'to the colour camera',
                 )
             if posterior is not None and likelihood is not None:
+                posterior = with_depth_error(posterior, self.parameters.focal_length_sigma)
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
                 self._publish_nobody(self._tracker, waiting)
             answered = True
+            if not starts and self._tracker.status is Status.WAITING:
+                # The track was of nobody.
+                self.robot.forget()
             self._tell_robot(waiting, self._tracker, posterior)
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
@@ -348,14 +354,18 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             if placed and posterior is not None and not tracker.foreseen:
                 seen = LastSeen(
                     waiting.stamp_ns, waiting.frame_id, tracker.body, posterior, tracker.forecaster,
-                    fixed, p.keep_out_probability,
+                    fixed, p.keep_out_probability, p.focal_length_sigma,
                 )  # fmt: skip
             else:
                 state = KeepOutState.LOST
-        number = self._tracks if tracker is None else tracker.track_id
-        existence = math.nan if tracker is None else tracker.existence_probability
+        number, existence, reason = self._tracks, math.nan, 'the image can not be tracked'
+        if tracker is not None:
+            number, existence = tracker.track_id, tracker.existence_probability
+            reason = tracker.reason
+            if tracker.status is Status.WAITING and self.start.initial is not None:
+                reason = f'waiting for {self.start.wants(())}'
         with self._telling:
-            self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen)
+            self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen, reason)
             for made in robot_messages(self.robot, p, self._wanted):
                 self._publish(*made)
             self.answered += 1
@@ -388,7 +398,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             misfit=math.nan if tracker is None else tracker.misfit,
             evaluations=0 if tracker is None else tracker.evaluations,
             background='unknown' if silhouettes is None else silhouettes.known,
-            doubted=silhouettes is not None and silhouettes.doubted,
+            doubted=TrackCondition.of(self._tracker).doubted,
             moved=silhouettes is not None and silhouettes.watch.moved,
             track_id=self._tracks if self._tracker is None else self._tracker.track_id,
             existence=math.nan if self._tracker is None else self._tracker.existence_probability,

@@ -188,12 +188,14 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
                 detected, self.start.body, p.keypoint_scheme, use_keypoints=p.use_keypoints
             )
         own, left = self._matched(found, stamp)
-        self._begin(left, own, camera, self._scene.background, stamp)
+        known = self._scene.scene.known
+        background = self._scene.background if known else BackgroundModel(p.background)
+        self._begin(left, own, camera, background, stamp)
         if detected is not None:
             self._detected = len(detected)
             if not detected and not self._people:
-                self._scene.learn(waiting.image, None)
-        if self._scene.background.frames:
+                self._scene.learn(waiting.image, stamp, detected=False)
+        if self._scene.scene.known:
             self._look_at_scene(waiting, self._scene.background, 'call ~/reset')
         skipped, tracked = self._log.counts['skipped'], self._log.counts['tracked']
         self._follow_all(waiting, camera, own, left, answered=detected is not None)

@@ -18,6 +18,7 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.fixed_frame import FixedFrame
+from hmt_ros.sessions.focal_length import with_depth_error
 from hmt_ros.tracking.keep_out import Capsules, keep_out_capsules, reach_after
 from hmt_ros.tracking.prediction import Forecaster
 from msg_tools.messages.headers import SECOND_NS
@@ -41,6 +42,7 @@ class LastSeen:
         forecaster: of the track.
         fixed: frame that is published in; None: the frame of the camera.
         probability: of the capsules.
+        focal_length_sigma: relative standard deviation of the focal length; `posterior` has it.
     """
 
     stamp_ns: int
@@ -50,6 +52,7 @@ class LastSeen:
     forecaster: Forecaster
     fixed: FixedFrame | None
     probability: float
+    focal_length_sigma: float = 0.0
 
     @cached_property
     def capsules(self) -> Capsules:
@@ -73,6 +76,7 @@ class _Told:
     track_id: int = 0
     existence: float = math.nan
     seen: LastSeen | None = None
+    reason: str = ''
 
 
 class RobotOutputs:
@@ -97,6 +101,7 @@ class RobotOutputs:
         track_id: int,
         existence: float,
         seen: LastSeen | None = None,
+        reason: str = '',
     ) -> None:
         """Takes the result of an image.
 
@@ -104,6 +109,7 @@ class RobotOutputs:
             stamp_ns, frame_id: of the image; the frame is the one that is published in.
             existence: probability that a person is in view; NaN: unknown.
             seen: the track, in an image that shows the person; None: as in the image before.
+            reason: what is missing, see `KeepOut`.
         """
         before = self._told.seen
         if state is KeepOutState.NOBODY:
@@ -111,7 +117,7 @@ class RobotOutputs:
         elif state is KeepOutState.UNKNOWN and before is not None:
             # A track was dropped; the person whom it followed may have moved on.
             state = KeepOutState.LOST
-        self._told = _Told(state, stamp_ns, frame_id, track_id, existence, seen or before)
+        self._told = _Told(state, stamp_ns, frame_id, track_id, existence, seen or before, reason)
 
     def keep_out(self, probability: float, silence: float | None = None) -> KeepOut:
         """The space to keep out of.
@@ -121,9 +127,9 @@ class RobotOutputs:
             silence: time since the newest image was answered, s; None: it is being answered.
         """
         told = self._told
-        seen, state, stamp = told.seen, told.state, told.stamp_ns
+        seen, state, stamp, reason = told.seen, told.state, told.stamp_ns, told.reason
         if silence is not None:
-            state = KeepOutState.STALE
+            state, reason = KeepOutState.STALE, f'no image was answered for {silence:.1f} s'
             stamp += round(silence * SECOND_NS) if told.stamp_ns else 0
         none = Capsules(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
         held, unseen = none, math.nan
@@ -133,7 +139,7 @@ class RobotOutputs:
             probability = seen.probability
         return KeepOut(
             stamp, told.frame_id, state, held.starts, held.ends, held.radii, told.track_id,
-            told.existence, unseen, probability,
+            told.existence, unseen, probability, reason,
         )  # fmt: skip
 
     def forecast(self, stamp_ns: int) -> PoseMixture:
@@ -151,7 +157,8 @@ class RobotOutputs:
                 f'the newest image is of {told.stamp_ns} ns; wanted a time from then to '
                 f'{LONGEST_FORECAST:g} s later, saw {stamp_ns} ns'
             )
-        mixture, frame = seen.forecaster.at(stamp_ns), seen.frame_id
+        mixture = with_depth_error(seen.forecaster.at(stamp_ns), seen.focal_length_sigma)
+        frame = seen.frame_id
         if seen.fixed is not None:
             mixture, _ = seen.fixed.placed(seen.body, mixture)
             frame = seen.fixed.optical

@@ -20,6 +20,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
+from hmt_ros.sessions.focal_length import depth_covariances
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.robot_outputs import RobotOutputs
 from hmt_ros.sessions.session import PublishedTopic
@@ -161,18 +162,19 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
 def nobody_messages(
     tracker: Tracker, waiting: WaitingImage, p: FilterParameters, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Any]]:
-    """Topics and messages of an image that ends a track: nobody is in view any more.
+    """Topics and messages of an image that ends a track: nobody is in view, or it was of nobody.
 
     The overlay shows the image without modes; markers of all ranks are removed.
     """
     body, stamp = tracker.body, waiting.stamp_ns
     frame = f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id
+    state = TrackState.NOBODY if tracker.status is Status.NOBODY else TrackState.UNKNOWN
     kinds = {'pose_mixture': MixtureKind.POSTERIOR, 'likelihood_mixture': MixtureKind.LIKELIHOOD}
     for topic, kind in kinds.items():
         if wanted(topic):
             content = PoseMixture.of_body(
-                body, None, kind, stamp, frame, state=TrackState.NOBODY, track_id=tracker.track_id,
-                existence_probability=tracker.existence_probability,
+                body, None, kind, stamp, frame, state=state, track_id=tracker.track_id,
+                existence_probability=tracker.existence_probability, reason=tracker.reason,
             )  # fmt: skip
             yield topic, pose_mixture_message(MESSAGES, content)
     if wanted('markers'):
@@ -229,6 +231,7 @@ def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
         track_id=tracker.track_id,
         existence_probability=tracker.existence_probability,
         cue_probabilities=_in_range(tracker.validity.shown),
+        reason=tracker.reason,
         identities=tracker.modes.identities,
         velocities=velocities,
     )
@@ -237,7 +240,9 @@ def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
 def _likelihood(track: TrackedImage) -> PoseMixture:
     """The likelihood, which is undiscounted, with the duration of its errors."""
     tracker, likelihood, frame = track.tracker, track.likelihood, track.waiting.frame_id
-    shape, errors = tracker.shape_covariance, tracker.likelihood_errors
+    # The focal length errs alike in all images, as the shape does.
+    focal = depth_covariances(track.posterior.means[:1], track.parameters.focal_length_sigma)[0]
+    shape, errors = tracker.shape_covariance + focal, tracker.likelihood_errors
     if (fixed := track.fixed) is not None:
         likelihood, _ = fixed.placed(tracker.body, likelihood)
         at_best = GaussianMixture(np.ones(1), track.posterior.means[:1], shape[None])
@@ -255,6 +260,7 @@ def _likelihood(track: TrackedImage) -> PoseMixture:
         error_share=errors.independent,
         error_time=errors.time,
         shape_covariance=shape,
+        reason=tracker.reason,
     )
 
 

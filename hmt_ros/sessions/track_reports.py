@@ -10,7 +10,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import IN_BACKGROUND, camera_moved_fault
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.tracking import Status, Subject, Tracker
-from hmt_ros.tracking.existence import PRESENT
+from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import CONTRARY
 from msg_tools.messages.headers import SECOND_NS
 
@@ -23,7 +23,8 @@ class TrackCondition(NamedTuple):
 
     Attributes:
         status: of the tracker.
-        doubted: whether the background was learned with the person in it.
+        doubted: whether the background was learned with the person in it, and silhouettes are
+            wanted: keypoints track the person without.
         moved: whether the camera has moved since the background was taken.
         contradicted: whether the lines of the scene contradict the gravity that is given.
         track_id: number of the track.
@@ -43,7 +44,9 @@ class TrackCondition(NamedTuple):
         silhouettes = tracker.silhouettes
         return cls(
             tracker.status,
-            silhouettes.doubted,
+            silhouettes.doubted
+            and tracker.settings.likelihood.coverage.weight > 0.0
+            and tracker.started_from is not Source.KEYPOINTS,
             silhouettes.watch.moved,
             tracker.gravity_contradicted,
             tracker.track_id,
@@ -66,9 +69,9 @@ def report_change(
     if now.doubted and not before.doubted:
         log.note(
             Fault.BACKGROUND,
-            f'{IN_BACKGROUND}, of whom only {tracker.silhouettes.share:.0%} are foreground in the '
-            f'image of {stamp_ns} ns: silhouettes are not used until the scene has been seen where '
-            'the person is now; give background_file, or begin with the empty scene',
+            f'{IN_BACKGROUND}, as the image of {stamp_ns} ns shows: silhouettes are not used until '
+            'the scene has been seen where the person is now; give background_file, or begin with '
+            'the empty scene',
         )
     if now.moved and not before.moved:
         remedy = 'call ~/reset; a camera that is to move needs fixed_frame or use_mask'
@@ -109,14 +112,9 @@ def _report_status(
         if isinstance(initial, Subject) and before.status is Status.WAITING:
             _report_age(log, stamp_ns - initial.stamp_ns)
     if now is Status.LOST:
-        text = f'{track} is lost {at}: no mode explains {tracker.misfit:.0%} of what is seen'
-        if tracker.existence_probability < PRESENT:
-            probability = f'{tracker.existence_probability:.0%}'
-            text = (
-                f'{track} is lost {at}: no image says where the person is, who is in view with a '
-                f'probability of {probability}'
-            )
-        log.note(Fault.LOST, f'{text}; it is searched for', warn=True)
+        log.note(
+            Fault.LOST, f'{track} is lost {at}: {tracker.reason}; it is searched for', warn=True
+        )
 
 
 def _report_age(log: HandlingLog, age_ns: int) -> None:

@@ -67,9 +67,24 @@ MEMORY = 2.0
 LEAST_CONTRAST = 0.15
 # Bins of a colour channel.
 BINS = 8
+# Shares of the pixels of a model that change where it moves, and at most where nothing does; how
+# many times denser changes are there than elsewhere. Least contrast of a model, grey levels.
+MOVED, UNMOVED, APART, CONTRAST = 0.03, 0.005, 4.0, 4.0
 # A pixel that differs by more than this in a channel shows something else, grey levels; the means
 # of 3 x 3 pixels of the raster do not differ by that much from noise.
 OTHER = 24
+
+
+class Motion(NamedTuple):
+    """What has moved since the image that was learned last.
+
+    Attributes:
+        moved: whether the person has, where the model was, and the rest of the image has not.
+        still: whether nothing has: whoever was there still is.
+    """
+
+    moved: bool
+    still: bool
 
 
 class Colours:
@@ -86,9 +101,9 @@ class Colours:
         self.here = self.elsewhere = math.nan
         self._inside: Array | None = None
         self._around = self._scene = np.zeros(BINS**3)
-        # The last image that was learned, and the pixels well beyond the model in it.
+        # The last image that was learned, the pixels of the model in it, and those well beyond it.
         self._image: Image | None = None
-        self._beyond: Mask | None = None
+        self._model = self._beyond = np.empty((0, 0), np.bool_)
 
     def score(self, image: Image, *, unseen: float = 0.0) -> float | None:
         """Score of the person's colours in an image (h, w, 3) BGR; None: undecided.
@@ -107,13 +122,27 @@ class Colours:
 
     def stillness(self, image: Image) -> float:
         """Likeness, from 0 to 1, of an image (h, w, 3) to the scene that was learned last."""
-        if self._image is None or self._beyond is None:
+        if self._image is None:
             return 0.0
-        changed = cv2.absdiff(cv2.blur(image, (3, 3)), self._image).max(axis=2) > OTHER
-        outside = counted(self._beyond)
+        changed, outside = self._changed(image), counted(self._beyond)
         least = min(self._beyond.size - outside, outside)
         share = counted(changed & self._beyond) / max(least, 1)
         return max(1.0 - share / UNDECIDED, 0.0)
+
+    def motion(self, image: Image) -> Motion:
+        """What has moved since the image that was learned last."""
+        model, other = counted(self._model), counted(self._beyond)
+        if self._image is None or not model or image[self._model].std() < CONTRAST:
+            return Motion(moved=False, still=False)
+        changed = self._changed(image)
+        here, there = (counted(changed & part) for part in (self._model, self._beyond))
+        moved = here > MOVED * model and here * other > APART * there * model
+        return Motion(moved, counted(changed) < UNMOVED * model)
+
+    def _changed(self, image: Image) -> Mask:
+        """Pixels (h, w) that differ from the image that was learned last."""
+        assert self._image is not None
+        return np.asarray(cv2.absdiff(cv2.blur(image, (3, 3)), self._image).max(axis=2) > OTHER)
 
     def learn(self, image: Image, model: Mask, dt: float) -> None:
         """Takes in an image (h, w, 3) with the person on the pixels (h, w) of the model.
@@ -140,7 +169,8 @@ class Colours:
         self._scene = self._scene + gain * (scene - self._scene)
         x, y, width, height = cv2.boundingRect(model.view(np.uint8))
         self.size = width, height
-        self._image, self._beyond = np.asarray(cv2.blur(image, (3, 3)), np.uint8), beyond(model)
+        self._image, self._model = np.asarray(cv2.blur(image, (3, 3)), np.uint8), model
+        self._beyond = beyond(model)
         means = self._means(bins)
         row, column = y + height // 2, x + width // 2
         here = float(means[row, column])
@@ -294,6 +324,10 @@ class Appearance:
             return None
         against = float(np.clip(1.0 - 2.0 * most, 0.0, 1.0))
         return False, against * self.colours.stillness(image)
+
+    def motion(self, view: View) -> Motion:
+        """What has moved since the image that was learned last; see `Colours.motion`."""
+        return self.colours.motion(_coarse(view))
 
     def is_apart(self, view: View, stamp: int) -> bool:
         """Whether most keypoints lie beside the box around the model, where a person may have gone.

@@ -69,8 +69,9 @@ class Source(Enum):
     ARRIVAL = 'who has come into view'
 
 
-# Starts whose best pose is near that of the person.
+# Starts whose best pose is near that of the person; those that silhouettes alone may have led to.
 FROM_JOINTS = (Source.SUBJECT, Source.KEYPOINTS)
+FROM_SILHOUETTES = (Source.PREDICTION, Source.ARRIVAL)
 
 
 @dataclass(frozen=True, eq=False)

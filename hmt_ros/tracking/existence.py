@@ -2,7 +2,7 @@
 
     r = p(somebody is in view | images so far)
 
-    predict   r <- s(dt) r + b(dt) (1 - r)                     [exp(Q dt)], a two-state chain
+    predict   r <- s(dt) r + b(dt) (1 - r)                     a chain of two states (`MarkovChain`)
     update    logit r <- logit r + sum_g a_g(dt) llr_g         a_g(dt) = tanh(dt / (2 tau_g))
 
 This is the existence of integrated probabilistic data association (Musicki, Evans and Stankovic,
@@ -15,11 +15,14 @@ nobody by cue g, and a_g the share that is left to it because its errors last (`
                  the shape of a person / usual area), asked in the whole image
     detector     sum of the confidences of the keypoints
     predictor    whether it expects somebody; a yes counts only where there is no silhouette
+    motion       whether the model moved, and nothing else; only where no other cue tells
     colours      whether the person's are anywhere; only where nothing else shows somebody, and
                  against somebody only where the scene is the one they were learned in
 
 Before a track, keypoints count once for a picture: a detector that takes the foot of a table for a
 person does so in every image that shows the same. People move, if only a little.
+
+Who was there still is if nothing at all has moved: time does not count then.
 
 An image that has changed for the most part is no evidence: a covered lens, a flash, noise. The
 colours of a track are no evidence against somebody when the camera has moved: they may have been
@@ -42,14 +45,16 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds, share_of_time
-from hmt_ros.tracking.appearance import MOST, Appearance
+from hmt_ros.inference.markov_chain import MarkovChain, of_log_odds, update
+from hmt_ros.tracking.appearance import MOST, Appearance, Motion
 from hmt_ros.tracking.keypoint_evidence import keypoint_evidence, suffices
 from hmt_ros.tracking.view import View
 
 # Rates at which somebody comes into an empty view, and leaves it, per second.
 BIRTH, LEAVING = 0.1, 0.2
-# Rate at which another person takes the place of one who is not seen, per second.
-EXCHANGE = 1.0 / 3600.0
+CHAIN = MarkovChain.of_two(BIRTH, LEAVING)
+# Whether who comes is who was seen last: another takes the place once in so many seconds, unseen.
+SAME_PERSON = MarkovChain.of_two(0.0, 1.0 / 3600.0)
 # Above the first probability somebody is there, and a new track may start; below the second nobody
 # is, if the image says so. Between them it is undecided.
 PRESENT, ABSENT = 0.85, 0.03
@@ -58,6 +63,7 @@ PRESENT, ABSENT = 0.85, 0.03
 PART = 0.6
 
 
+NO_MOTION = Motion(moved=False, still=False)
 # Blur of images that are compared, px; least change of a pixel that noise does not make, grey
 # levels; share of the pixels around keypoints that change when a person breathes or sways within
 # tenths of a second (0.003 and more on ten clips of people, 0 on a table); least contrast.
@@ -91,32 +97,9 @@ CLEAR = Cue(8.0, 0.2)
 DOUBTFUL = Cue(5.0, 0.25)
 
 
-def moved_on(r: float, dt: float) -> float:
-    """The probability that somebody is in view after dt seconds without an image."""
-    total = BIRTH + LEAVING
-    return r - math.expm1(-total * dt) * (BIRTH / total - r)
-
-
-def same_person(dt: float) -> float:
-    """Probability exp(-q dt) that somebody is who was seen dt seconds before, and not since."""
-    return math.exp(-EXCHANGE * dt)
-
-
-def updated(r: float, llr: float) -> float:
-    """The probability that somebody is in view, given a log likelihood ratio, nats."""
-    if r in (0.0, 1.0):
-        return r
-    return probability_of(math.log(r) - math.log1p(-r) + llr)
-
-
-def probability_of(log_odds: float) -> float:
-    """The probability that has these log odds, nats."""
-    return 0.5 * (1.0 + math.tanh(0.5 * log_odds))
-
-
 # Probability before the first image, as after one clear image of nobody; a given start counts like
 # one clear image of somebody.
-NOBODY_YET, GIVEN = probability_of(-CLEAR.nats), probability_of(CLEAR.nats)
+NOBODY_YET, GIVEN = of_log_odds([-CLEAR.nats, CLEAR.nats])[:, 1].tolist()
 
 
 class Existence:
@@ -126,8 +109,7 @@ class Existence:
         probability: before the first image.
 
     Attributes:
-        probability: r, given all images so far.
-        llr: sum of the cues of the last image, nats; positive: it shows somebody.
+        said: log likelihood ratios of the last image by cue, nats; positive: somebody.
         seen: whether the last image shows a filter something to follow: a cue shows somebody, or
             none shows nobody and the image can be used.
         hidden: whether others hid most of the person in the last image.
@@ -137,14 +119,29 @@ class Existence:
     """
 
     def __init__(self, probability: float = NOBODY_YET) -> None:
-        self.probability = probability
-        self.llr = 0.0
+        self._p = np.array([1.0 - probability, probability])
+        self.said: dict[str, float] = {}
         self.seen = self.hidden = self.elsewhere = False
         self.met: int | None = None
         self._stamps: tuple[int, int] | None = None  # of the first and of the last image
         self._asked: dict[str, int] = {}  # when each cue spoke last
         self._appearance = Appearance()
         self._counted: NDArray[np.float32] | None = None  # the picture in which keypoints counted
+
+    @property
+    def probability(self) -> float:
+        """R, given all images so far."""
+        return float(self._p[1])
+
+    @property
+    def llr(self) -> float:
+        """Sum of the cues of the last image, nats; positive: it shows somebody."""
+        return sum(self.said.values())
+
+    @property
+    def told(self) -> bool:
+        """Whether any cue has spoken."""
+        return bool(self._asked)
 
     @property
     def somebody(self) -> bool:
@@ -174,21 +171,26 @@ class Existence:
             body: of the person.
             waiting: whether a track has still to start.
         """
-        if self._stamps is not None:
-            self.probability = moved_on(self.probability, seconds(stamp - self._stamps[1]))
+        # Nothing but the image tells, so that its changes are worth a look.
+        alone = view.anywhere is None and view.keypoints is None and not waiting
+        motion = self._appearance.motion(view) if alone else NO_MOTION
+        if self._stamps is not None and not motion.still:
+            self._p = CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
         # After so long a time the person who was seen last may have gone.
-        forgotten = moved_on(1.0, self._appearance.unseen(stamp)) < MOST
+        forgotten = CHAIN.transition(self._appearance.unseen(stamp))[1, 1] < MOST
         self.hidden = self._appearance.open_to_view(view.others) < 1.0 - MOST
         cues, usable, apart = self._cues(view, stamp, body)
+        if motion.moved:
+            cues['motion'] = 1.0, DOUBTFUL
         if waiting and cues.get('detector', (0.0, CLEAR))[0] > 0.0 and self._is_counted(view):
             del cues['detector']
         if self.hidden:
             cues = {name: cue for name, cue in cues.items() if cue[0] > 0.0}
-        self.llr = sum(
-            value * cue.nats * share_of_time(self._time_since(name, stamp), cue.tau)
+        self.said = {
+            name: value * cue.nats * share_of_time(self._time_since(name, stamp), cue.tau)
             for name, (value, cue) in cues.items()
-        )
-        self.probability = updated(self.probability, self.llr)
+        }
+        self._p = update(self._p, [0.0, self.llr])
         values = [value for value, _ in cues.values()]
         shown = any(value > 0.0 for value in values)
         self.seen = shown or (usable and not any(value < 0.0 for value in values))

@@ -64,6 +64,7 @@ class Observer:
     def view(
         self,
         image: Image,
+        stamp: int,
         keypoints: Keypoints | None,
         mask: Mask | None,
         body: Body,
@@ -78,6 +79,7 @@ class Observer:
 
         Args:
             image: (H, W, 3) BGR uint8.
+            stamp: of the image, ns.
             keypoints: of a detector, if any.
             mask: (H, W) of a segmenter, if any.
             body: of the person.
@@ -92,7 +94,7 @@ class Observer:
         found, anywhere, changed = None, None, 0.0
         if s.likelihood.coverage.weight > 0:
             region = None if poses is None else region_of(body, self._camera, poses, dt=dt)
-            found = silhouettes.silhouette(image, mask, region, others)
+            found = silhouettes.silhouette(image, stamp, mask, region, others)
         if found is not None:
             anywhere = silhouettes.anywhere(image, mask, others, raster_step(self._camera.height))
             changed = silhouettes.background.changed if mask is None else 0.0
@@ -101,9 +103,9 @@ class Observer:
             image, foreground, anywhere, changed, keypoints, predicted, unsure, others, depth
         )
 
-    def seen_anywhere(self, view: View, mask: Mask | None) -> View:
+    def seen_anywhere(self, view: View, stamp: int, mask: Mask | None) -> View:
         """The same view, with the silhouette of somebody who may be anywhere in it."""
-        found = self._silhouettes.silhouette(view.image, mask, None, view.others)
+        found = self._silhouettes.silhouette(view.image, stamp, mask, None, view.others)
         if found is None:
             return view
         return view._replace(silhouette=found.foreground, unsure=found.unsure)

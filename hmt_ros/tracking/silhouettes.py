@@ -1,15 +1,15 @@
 """Source of the silhouette of an image, and whether the background is to be trusted.
 
-A mask of a segmenter is taken as it is, else the background is subtracted. A background learned
-while the person stood in it is worse than none: the person is missing in the silhouettes, and where
-the person stood a ghost is left. When a track starts, the pose is known, and
+A mask of a segmenter is taken as it is, else the background is subtracted, once the scene is known
+to be empty (`EmptyScene`). When a track starts from joints, the pose is known, and
 
     f = |foreground and area of the body| / |area of the body|
 
 is near 1 before an empty scene, and less in clothes of the colours of the room. Below
-`LEAST_FOREGROUND` the background is forgotten and put together anew, pixel by pixel, from the
-images that follow: where no mode of the posterior has the person. Until it is known around the
-person, images are tracked without silhouettes.
+`LEAST_FOREGROUND` a background that was learned is forgotten and put together anew, pixel by pixel,
+from the images that follow: where no mode of the posterior has the person, as far as something else
+than silhouettes says where that is. Until it is known around the person, images are tracked without
+silhouettes.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.image.background import BackgroundModel, SceneWatch, Silhouette, one_person
+from hmt_ros.image.empty_scene import EmptyScene
 from hmt_ros.image.observation import Box
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.rendering.renderer import render_silhouettes
@@ -27,6 +28,8 @@ from hmt_ros.tracking.camera_motion import SHIFTED, CameraPose
 
 # Least share of the person that is foreground before a background without the person.
 LEAST_FOREGROUND = 0.35
+# Log odds of somebody in a scene that was put together where nobody was, nats.
+COMPLETED = -6.0
 # Margins of the area of a body, as a fraction of its height: for the sure area of the person, and
 # for the possible one.
 INSIDE, AROUND = 0.01, 0.06
@@ -46,14 +49,14 @@ class Silhouettes:
         shared: whether other people share the background; it is then learned elsewhere.
 
     Attributes:
-        background: as far as it is known.
+        scene: the empty scene, as far as it is known.
         share: f, the share of the person that was foreground when it was last asked; NaN: never.
         watch: tells whether the camera has moved since the background was taken.
         doubted: whether the background was learned with the person in it, and is not known again.
     """
 
     def __init__(self, background: BackgroundModel, *, shared: bool = False) -> None:
-        self.background = background
+        self.scene = EmptyScene(background, trusted=shared)
         self.share = np.nan
         self.doubted = False
         self.watch = SceneWatch()
@@ -62,16 +65,23 @@ class Silhouettes:
         self._seen_from: CameraPose | None = None
 
     @property
+    def background(self) -> BackgroundModel:
+        """The empty scene, as far as it is known."""
+        return self.scene.background
+
+    @property
     def known(self) -> str:
         """State of the background, in a few words."""
         unknown = self.background.unknown
         if unknown is not None:
             return f'forgotten, {1 - unknown.mean():.0%} known again'
-        return 'known' if self.background.frames else 'unknown'
+        if self.scene.known:
+            return 'known'
+        return 'not yet seen empty' if self.background.frames else 'unknown'
 
     def forget(self) -> None:
         """Begins anew without a background: the camera sees another scene."""
-        self.background = BackgroundModel(self.background.settings)
+        self.scene = EmptyScene(BackgroundModel(self.background.settings), trusted=self._shared)
         self.share, self.doubted, self._learning = np.nan, False, not self._shared
         self.watch = SceneWatch()
 
@@ -83,14 +93,17 @@ class Silhouettes:
             self.forget()
             self._seen_from = pose
 
-    def learn(self, image: Image, mask: Mask | None) -> None:
-        """Learns the background from an image before the track, unless a mask shows somebody."""
-        if self._learning and not self.doubted and (mask is None or not mask.any()):
-            self.background.learn(image)
+    def learn(self, image: Image, stamp: int, detected: bool | None = None) -> None:
+        """Learns the scene from an image before the track; see `EmptyScene.learn`."""
+        if self._learning:
+            if self.doubted:
+                self.forget()
+            self.scene.learn(image, stamp, detected)
 
     def silhouette(
         self,
         image: Image,
+        stamp: int,
         mask: Mask | None,
         region: Box | None,
         others: Mask | None = None,
@@ -99,6 +112,7 @@ class Silhouettes:
 
         Args:
             image: (H, W, 3).
+            stamp: of the image, ns.
             mask: (H, W) of a segmenter, if any.
             region: where the person can be; None: anywhere.
             others: (H, W) pixels that somebody else covers; None: none.
@@ -106,11 +120,16 @@ class Silhouettes:
         if mask is not None:
             mask = mask if others is None else mask & ~others
             return Silhouette(one_person(mask, self.background.settings, region))
-        if self.doubted or not self.background.frames:
+        scene = self.scene
+        if self.doubted or not scene.known:
             return None
         if not self._shared:
             self.watch.look(image, self.background)
-        return self.background.split(image, region, others)
+        found = self.background.split(image, region, others)
+        scene.judge(image, found.foreground, stamp)
+        if scene.is_of_somebody:
+            self._doubt()
+        return found if scene.known else None
 
     def anywhere(self, image: Image, mask: Mask | None, others: Mask | None, step: int) -> Mask:
         """All foreground of an image, at every step-th pixel (H / step, W / step).
@@ -139,8 +158,12 @@ class Silhouettes:
             return
         self.share = float(self.background.foreground(image)[inside].mean())
         if self.share < LEAST_FOREGROUND:
-            self.doubted = True
-            self.background.forget()
+            self._doubt()
+
+    def _doubt(self) -> None:
+        """Forgets a background that shows the person."""
+        self.doubted = True
+        self.background.forget()
 
     def complete(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
         """Puts a forgotten background together, where the person in poses (K, d) is not."""
@@ -153,6 +176,7 @@ class Silhouettes:
         known = unknown is None or (unknown & around).sum() <= MOST_UNKNOWN * area.sum()
         trusted, self.doubted = not self.doubted, not known
         if known and not trusted:
+            self.scene.log_odds = COMPLETED
             self.check(image, body, camera, poses[:1])
 
 

@@ -12,6 +12,7 @@ carries the mixture.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -29,14 +30,21 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.error_model import ERRORS, TOGETHER, seconds
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.beginning import FROM_JOINTS, Beginning, Source, Starts, poses_to_search
+from hmt_ros.tracking.beginning import (
+    FROM_JOINTS,
+    FROM_SILHOUETTES,
+    Beginning,
+    Source,
+    Starts,
+    poses_to_search,
+)
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
-from hmt_ros.tracking.existence import GIVEN, Existence, Status, same_person
+from hmt_ros.tracking.existence import GIVEN, SAME_PERSON, Existence, Status
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.ground import Gravity, Ground, GroundEstimator, KnownGround, unit_vector
 from hmt_ros.tracking.hypotheses import LIKELY, Modes
 from hmt_ros.tracking.initialisation import check_box
-from hmt_ros.tracking.misfit import SILHOUETTE
+from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE
 from hmt_ros.tracking.observer import Observer
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.prediction import Forecaster
@@ -45,7 +53,7 @@ from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.start_depth import depths_of
 from hmt_ros.tracking.subject import Subject
-from hmt_ros.tracking.validity import Validity
+from hmt_ros.tracking.validity import DEPTH, Validity
 from hmt_ros.tracking.view import View
 
 # Share of the time for which somebody stands on both feet, where contact is unknown.
@@ -203,17 +211,24 @@ class Tracker:
         self._move_camera(stamp)
         if self.settings.ground.on:
             self._ground.look(image, self.camera, stamp)
-        known = self.background.frames > 0 and not self.silhouettes.doubted
+        known = self.silhouettes.scene.known and not self.silhouettes.doubted
         self._ground.still = self._camera_path.known or (known and not self._ground.turning)
         keypoints = self._lifted(keypoints, stamp)
         near, dt = None, 0.0
         if self._followed is not None and not self._track.lost:
             near, dt = self.modes.poses, seconds(stamp - self._followed)
+        doubted = self.silhouettes.doubted
         view = self._observer.view(
-            image, keypoints, mask, self.body, near, dt,
+            image, stamp, keypoints, mask, self.body, near, dt,
             predicted=False if nobody_predicted else True if prediction is not None else None,
             others=others, depth=depth,
         )  # fmt: skip
+        if self.silhouettes.doubted > doubted and (
+            not self._track.begun or self.started_from in FROM_SILHOUETTES
+        ):
+            # What was seen was a ghost, as far as anybody knows.
+            self._drop_track()
+            self._existence, self._nobody = Existence(), False
         found = self._take(view, stamp, prediction, mask)
         self._last_stamp = stamp
         return found
@@ -235,8 +250,12 @@ class Tracker:
 
     @property
     def existence_probability(self) -> float:
-        """Probability that a person is in view, given all images so far; see `Existence`."""
-        return self._existence.probability
+        """Probability that a person is in view, given all images so far; see `Existence`.
+
+        NaN: nothing has said anything of that.
+        """
+        existence = self._existence
+        return existence.probability if existence.told or self._track.begun else math.nan
 
     @property
     def body(self) -> Body:
@@ -340,6 +359,23 @@ class Tracker:
         return self._nobody and self._existence.nobody
 
     @property
+    def reason(self) -> str:
+        """What is missing where the state is neither tracking nor nobody; '' where nothing is."""
+        status, existence = self.status, self._existence
+        if status is Status.WAITING:
+            return 'nobody has been seen so far' if existence.told else self.silhouettes.scene.wants
+        if status is Status.NOBODY and not self.nobody_shown:
+            return 'the image shows neither somebody nor that nobody is there'
+        if status is not Status.LOST:
+            return ''
+        if not existence.somebody:
+            return (
+                'no image says where the person is, who is in view with a probability of '
+                f'{existence.probability:.0%}'
+            )
+        return f'no mode explains {self.misfit:.0%} of what is seen'
+
+    @property
     def forecaster(self) -> Forecaster:
         """Predicts the track from the last image that it followed.
 
@@ -429,7 +465,8 @@ class Tracker:
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """See `step`."""
         masked, existence, self._foreseen = mask is not None, self._existence, False
-        if existence.met is not None and same_person(seconds(stamp - existence.met)) < 0.5:
+        unseen = 0.0 if existence.met is None else seconds(stamp - existence.met)
+        if SAME_PERSON.transition(unseen)[1, 1] < 0.5:
             # Whoever comes now is somebody else, of whom nothing is known.
             self._drop_track(self.model)
             self._nobody, existence.met = True, None
@@ -444,7 +481,7 @@ class Tracker:
                 self._foreseen = True
                 return self._expected(stamp), self._likelihood(Observation())
             if existence.elsewhere:
-                view = self._observer.seen_anywhere(view, mask)
+                view = self._observer.seen_anywhere(view, stamp, mask)
             observation = self._observe(view, self.modes.poses[0])
             self._follow(observation, stamp, prediction)
         else:
@@ -452,7 +489,7 @@ class Tracker:
             if begun is None:
                 return None, None
             observation = begun
-        if not masked:
+        if not masked and self._is_told_by_others(view):
             likely = self.modes.log_weights > -LIKELY
             poses = self.modes.poses[likely]
             self.silhouettes.complete(view.image, self.body, self.camera, poses)
@@ -469,6 +506,12 @@ class Tracker:
             self._existence.learn(view, stamp, self.body, self.camera, self.modes.poses[0])
         self.evaluations = self._track.evaluations
         return self.posterior, self._likelihood(observation)
+
+    def _is_told_by_others(self, view: View) -> bool:
+        """Whether something else than silhouettes says where the person of the track is."""
+        shown = {KEYPOINTS: view.keypoints is not None, DEPTH: view.depth is not None}
+        believed = (shown[cue] and self.validity.believes(cue) for cue in shown)
+        return not self._track.lost and any(believed)
 
     def _likelihood(self, observation: Observation) -> GaussianMixture:
         found = self._track.likelihood(observation)
@@ -506,7 +549,10 @@ class Tracker:
             )  # fmt: skip
             if beginning is None:
                 if self._starts.given is not None or self._existence.llr <= 0.0:
-                    self.silhouettes.learn(view.image, view.silhouette if masked else None)
+                    said = self._existence.said.get('detector', 0.0)
+                    if masked and view.silhouette is not None:
+                        said = 1.0 if view.silhouette.any() else -1.0
+                    self.silhouettes.learn(view.image, stamp, said > 0.0 if said else None)
                 return None
             if not masked:
                 self.silhouettes.check(view.image, beginning.body, self.camera, beginning.best)

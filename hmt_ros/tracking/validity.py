@@ -34,7 +34,6 @@ detection. The p_g of groups of keypoints are those of a detector that sees the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -44,13 +43,14 @@ from hmt_ros.image.observation import Beliefs
 from hmt_ros.image.terms.keypoints import EXCHANGED
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.inference.markov_chain import MarkovChain, update
 from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SILHOUETTE, Misfit
 
 # Rates at which a cue ceases to show the person, or a track to follow, and the rates back, 1/s.
 FAILS, RECOVERS = 0.05, 1.0
-USUAL = RECOVERS / (FAILS + RECOVERS)
+CHAIN = MarkovChain.of_two(RECOVERS, FAILS)
 # The same of a detector as a whole, which sees somebody else, 1/s.
-DETECTOR_FAILS = 0.02
+DETECTOR_CHAIN = MarkovChain.of_two(RECOVERS, 0.02)
 # Evidence of a cue that is wholly explained or not at all, N u and N (1 - u), nats in all, and the
 # number of its measurements that give it: neighbours err together.
 NATS, ENOUGH = 16.0, 4
@@ -72,6 +72,8 @@ AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
 CHAINS = AXES[KEYPOINTS].stop
 # States (2^n, n) of the chains, and validity v in each: groups of a failed detector are invalid.
 STATES = np.array(np.unravel_index(np.arange(2**CHAINS), (2,) * CHAINS)).T
+AXIS_CHAINS = [CHAIN] * CHAINS
+AXIS_CHAINS[DETECTOR] = DETECTOR_CHAIN
 VALID = STATES.copy()
 VALID[:, AXES[KEYPOINTS]] *= STATES[:, [DETECTOR]]
 WITHOUT_SILHOUETTE = (VALID[:, AXES[SILHOUETTE]] == 0).all(1)
@@ -95,13 +97,13 @@ class Validity:
 
     Attributes:
         joint: (2, .., 2) probability of the track, of the detector and of the cues of `AXES`.
-        depth: (1,) probability that depths are valid.
     """
 
     def __init__(self) -> None:
-        usual = RECOVERS / (_fails() + RECOVERS)
-        self.joint = np.where(STATES == 1, usual, 1.0 - usual).prod(1).reshape((2,) * CHAINS)
-        self.depth: Array = np.full(1, USUAL)
+        usual = np.array([chain.usual for chain in AXIS_CHAINS])
+        of_states = usual[np.arange(CHAINS), STATES]
+        self.joint = of_states.prod(1).reshape((2,) * CHAINS)
+        self._depth = CHAIN.usual
 
     @property
     def track(self) -> float:
@@ -114,7 +116,7 @@ class Validity:
 
         Shapes: silhouette (1,), keypoints by group (3,), depths (1,).
         """
-        return {name: self._chains[axes] for name, axes in AXES.items()} | {DEPTH: self.depth}
+        return {name: self._chains[axes] for name, axes in AXES.items()} | {DEPTH: self._depth[1:]}
 
     def believes(self, cue: str) -> bool:
         """Whether a cue more likely than not shows the person; a lost track uses all cues."""
@@ -151,17 +153,14 @@ class Validity:
 
     def predict(self, dt: float) -> None:
         """Goes on by dt seconds, equation (1)."""
-        self.depth = moved_on(self.depth, dt)
-        for axis, fails in enumerate(_fails()):
-            valid = moved_on(np.array([0.0, 1.0]), dt, fails)
-            transition = np.stack([1.0 - valid, valid])
-            moved = np.tensordot(transition, self.joint, axes=(1, axis))
-            self.joint = np.moveaxis(moved, 0, axis)
+        self._depth = CHAIN.predict(self._depth, dt)
+        for axis, chain in enumerate(AXIS_CHAINS):
+            self.joint = np.moveaxis(chain.predict(np.moveaxis(self.joint, axis, -1), dt), -1, axis)
 
     def search(self) -> None:
         """The track begins anew: nothing is known of its modes."""
         of_cues = self.joint.sum(TRACK)
-        self.joint = np.stack([(1.0 - USUAL) * of_cues, USUAL * of_cues], TRACK)
+        self.joint = np.multiply.outer(CHAIN.usual, of_cues)
 
     def update(
         self, misfits: Mapping[str, Misfit], dt: float, alone: ByKeypoints | None = None
@@ -179,7 +178,8 @@ class Validity:
             for name, x in misfits.items()
         }
         if DEPTH in says:
-            self.depth = _updated(self.depth, _mixed(self.track, says[DEPTH]))
+            (evidence,) = _mixed(self.track, says[DEPTH])
+            self._depth = update(self._depth, [0.0, evidence])
         of_track = np.zeros(CHAINS)
         of_track[TRACK] = says.get(OUTLINE, np.zeros(1))[0]
         for name in AXES.keys() & says.keys():
@@ -188,9 +188,7 @@ class Validity:
         if alone is not None:
             log_ratios = _divided(of_track, share, alone)
         log_ratios = np.where(VALID[:, TRACK] == 1, log_ratios, 0.0)
-        log_joint = np.log(self.joint.ravel()) + log_ratios
-        joint = np.exp(log_joint - log_joint.max())
-        self.joint = (joint / joint.sum()).reshape(self.joint.shape)
+        self.joint = update(self.joint.ravel(), log_ratios).reshape(self.joint.shape)
 
     @property
     def _chains(self) -> Array:
@@ -227,25 +225,6 @@ def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
     return _mixed(PLACED, e) - _mixed(1.0 - PLACED, e) if cue == KEYPOINTS and begun else e
 
 
-def _fails() -> Array:
-    """Rates (n,) at which the chains fail, 1/s."""
-    result = np.full(CHAINS, FAILS)
-    result[DETECTOR] = DETECTOR_FAILS
-    return result
-
-
-def moved_on(p: Array, dt: float, fails: float = FAILS) -> Array:
-    """Probabilities of being valid, dt seconds later, equation (1)."""
-    total = fails + RECOVERS
-    return np.asarray(p - math.expm1(-total * dt) * (RECOVERS / total - p))
-
-
 def _mixed(p: Array | float, evidence: Array) -> Array:
     """log(p exp(e) + 1 - p)."""
     return np.asarray(np.logaddexp(np.log(p) + evidence, np.log1p(-p)))
-
-
-def _updated(p: Array, evidence: Array) -> Array:
-    """Probabilities after log likelihood ratios."""
-    log_odds = np.log(p) - np.log1p(-p) + evidence
-    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * log_odds)))

@@ -51,6 +51,7 @@ class KeepOut:
         existence_probability: that a person is in view; NaN: not known.
         unseen: time since the last image that showed the person, s; NaN: none did.
         probability: that was asked for.
+        reason: what is missing where the state is not known; '' where nothing is.
 
     Raises:
         MessageError: values that contradict each other or are out of range.
@@ -66,6 +67,7 @@ class KeepOut:
     existence_probability: float = math.nan
     unseen: float = math.nan
     probability: float = math.nan
+    reason: str = ''
 
     def __post_init__(self) -> None:
         n = len(self.radii)
@@ -94,6 +96,7 @@ def keep_out_message(messages: MessageFactory, content: KeepOut) -> Any:
         starts=content.starts.ravel(),
         ends=content.ends.ravel(),
         radii=np.array(content.radii),
+        reason=content.reason,
     )
 
 
@@ -121,6 +124,7 @@ def keep_out_of(message: Any) -> KeepOut:
         float(message.existence_probability),
         float(message.unseen),
         float(message.probability),
+        str(getattr(message, 'reason', '')),
     )
 
 

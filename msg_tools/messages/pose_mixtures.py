@@ -105,6 +105,7 @@ class PoseMixture:
         shape_covariance: (d, d) of the errors shared by poses of all images, as the lengths and
             the flesh of the person are not known exactly, beside a likelihood; None: unknown, as in
             bags older than this field.
+        reason: what is missing where the pose is not known; '' where nothing is.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -134,6 +135,7 @@ class PoseMixture:
     error_time: float = math.nan
     cue_probabilities: Mapping[str, float] = field(default_factory=dict)
     shape_covariance: Array | None = None
+    reason: str = ''
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
@@ -210,6 +212,7 @@ class PoseMixture:
         error_time: float = math.nan,
         cue_probabilities: Mapping[str, float] | None = None,
         shape_covariance: Array | None = None,
+        reason: str = '',
     ) -> PoseMixture:
         """A mixture over the poses of a body at its present lengths.
 
@@ -223,7 +226,7 @@ class PoseMixture:
             mixture: K Gaussians over its poses; None: nobody was seen.
             joint_positions: (K, J, 3) m, of the means; None: computed here.
             kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
-                existence_probability, error_share, error_time, shape_covariance: see the
+                existence_probability, error_share, error_time, shape_covariance, reason: see the
                 attributes.
             velocities: (K, d) of the poses, per second; None: unknown.
             cue_probabilities: see the attributes; None: unknown.
@@ -266,6 +269,7 @@ class PoseMixture:
             error_time=error_time,
             cue_probabilities=cue_probabilities or {},
             shape_covariance=shape_covariance,
+            reason=reason,
         )
 
     @cached_property
@@ -336,6 +340,7 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
         components=components,
         segment_names=list(content.segment_lengths),
         segment_lengths=np.array(list(content.segment_lengths.values()), dtype=np.float64),
+        reason=content.reason,
     )
 
 
@@ -409,6 +414,7 @@ def pose_mixture_of(
         ),
         cue_probabilities=named_numbers(message, 'cue_names', 'cue_probabilities', 'mixture'),
         shape_covariance=_shape_covariance(message, d),
+        reason=str(getattr(message, 'reason', '')),
         **_errors(message),
     )
 

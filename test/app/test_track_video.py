@@ -1,5 +1,8 @@
 """track-video: a video in, bags and a report out."""
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +14,34 @@ from hmt_ros.body import load_body
 from hmt_ros.tracking import read_subject
 from test.app.conftest import data_of
 from test.test_docs import ROOT, commands
+
+
+@pytest.fixture(autouse=True)
+def installed(monkeypatch):
+    """Whether the detector is installed; not so, wherever tests run, unless one says so."""
+    answers = [False]
+    monkeypatch.setattr(track_video, 'is_installed', lambda: answers[-1])
+    return answers
+
+
+@pytest.fixture
+def begun(monkeypatch):
+    """Options of imports, settings of replays and notes of reports, none of which are made."""
+    seen = SimpleNamespace(imports=[], settings=[], notes=[])
+    monkeypatch.setattr(
+        track_video, 'import_video', lambda options, tell: seen.imports.append(options)
+    )
+    monkeypatch.setattr(
+        track_video, 'replay_bag',
+        lambda source, target, options, tell: seen.settings.append(options.settings),
+    )  # fmt: skip
+
+    def write_report(options):
+        seen.notes.append(options.notes)
+        return None, ''
+
+    monkeypatch.setattr(track_video, 'write_report', write_report)
+    return seen
 
 
 def run(folder, *options):
@@ -28,7 +59,11 @@ def test_from_video_to_report(walk_video, tmp_path, monkeypatch, capsys):
     for name in ('walk.mp4', 'walk.json'):
         (tmp_path / name).symlink_to(walk_video / name)
     monkeypatch.chdir(tmp_path)
-    (words,) = (words for words, _ in commands(ROOT / 'README.md') if 'track-video' in words)
+    (words,) = (
+        words
+        for words, _ in commands(ROOT / 'README.md')
+        if 'track-video' in words and '--keypoints' in words
+    )
     assert main(words[3:]) == 0, capsys.readouterr().err
     told = capsys.readouterr().out.splitlines()
     assert told[0] == 'walk/video: 8 images, 8 with keypoints'
@@ -111,10 +146,70 @@ def test_nobody_in_the_whole_video(tmp_path, capsys):
     assert not (out / 'subject.yaml').exists()
 
 
+def test_without_options_the_detector_and_the_usual_lens_are_used(
+    walk_video, begun, installed, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    installed.append(True)
+    assert track_video.main([str(walk_video / 'walk.mp4'), '--quiet']) == 0
+    (options,) = begun.imports
+    assert options.output == Path('walk_tracked/video')
+    assert (options.detector, options.fov, options.vertical_fov) == ('mediapipe', 60.0, None)
+    # Its error is in the results, its words on stderr and on the page.
+    assert begun.settings == [['focal_length_sigma=0.2']]
+    (note,) = begun.notes[0]
+    assert note.startswith('the field of view is assumed to be 60 degrees along the longer side')
+    assert capsys.readouterr().err == f'track-video: {note}\n'
+
+
+def test_what_is_given_is_not_assumed(walk_video, begun, installed, tmp_path, capsys):
+    installed.append(True)
+    out = ['-o', str(tmp_path / 'out'), '--overwrite']
+    assert run(walk_video, *out, *keypoints(walk_video)) == 0
+    assert run(walk_video, *out, '--no-detector', '--background', str(ROOT / 'README.md')) == 0
+    assert [options.detector for options in begun.imports] == [None, None]
+    assert begun.settings == [[], []]
+    assert capsys.readouterr().err == ''
+    # What a user sets comes last.
+    given = ['--set', 'focal_length_sigma=0.05']
+    assert track_video.main([str(walk_video / 'walk.mp4'), '--quiet', *out, *given]) == 0
+    assert begun.settings[-1] == ['focal_length_sigma=0.2', 'focal_length_sigma=0.05']
+
+
+def test_metadata_tell_the_lens(walk_video, begun, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(track_video, 'told_fov', lambda path: 69.4)
+    out = ['-o', str(tmp_path / 'out'), '--no-detector']
+    assert track_video.main([str(walk_video / 'walk.mp4'), '--quiet', *out]) == 0
+    assert begun.imports[0].fov == 69.4
+    assert begun.settings == [['focal_length_sigma=0.1']]
+    assert 'by the metadata 69 degrees' in capsys.readouterr().err
+
+
+def test_a_folder_of_upright_images(begun, tmp_path, capsys):
+    folder = tmp_path / 'frames'
+    folder.mkdir()
+    cv2.imwrite(str(folder / '1.png'), np.zeros((64, 48, 3), np.uint8))
+    assert track_video.main([str(folder), '-o', str(tmp_path / 'out'), '--quiet']) == 0
+    (options,) = begun.imports
+    assert (options.fps, options.fov, options.vertical_fov) == (30.0, None, 60.0)
+    rate, lens, found = capsys.readouterr().err.splitlines()
+    assert 'frames is a folder: 30 images a second, unless --fps says so' in rate
+    assert 'assumed' in lens
+    # Without detector and background the command does not pretend.
+    assert 'the person may not be found; run "python -m hmt_ros install-detector"' in found
+    assert begun.notes[0] == [x.partition(': ')[2] for x in (rate, lens, found)]
+
+
+def test_a_bag_is_for_replay(tmp_path, capsys):
+    (tmp_path / 'x.mcap').touch()
+    assert track_video.main([str(tmp_path)]) == 1
+    assert f'{tmp_path} is a bag: replay {tmp_path} tracks' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ('options', 'message'),
     [
-        (['--stature', '1.7'], '--stature goes with --keypoints or --detector'),
+        (['--stature', '1.7'], '--stature goes with --keypoints, or with a detector'),
         (['--subject', 'nothing.yaml'], 'nothing.yaml: no such file'),
         (['--subject', 'a.yaml', '--stature', '1.7'], '--stature: not allowed with argument'),
         (['--keypoints', 'nothing.json'], 'nothing.json: no such file'),

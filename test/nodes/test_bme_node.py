@@ -100,15 +100,20 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, somebody):
 
 
 def test_diagnostics(world, somebody):
-    one = world(background_file='', background_images=1).start()
+    from hmt_msgs.msg import PoseMixture
+
+    one = world(background_file='').start()
     assert one.diagnosis()[:2] == (1, 'waits for a calibrated camera_info')
     one.send('camera_info', somebody.info())
-    one.send('image', somebody.empty(0))
-    one.send('image', somebody.image(1))
+    found = one.hear({'pose_prediction': PoseMixture})['pose_prediction']
+    for index in range(16):
+        one.send('image', somebody.empty(index))
+        one.spin_until(lambda count=index: len(found) > count)
+    one.send('image', somebody.image(16))
     one.spin_until(lambda: 'predicting' in one.diagnostics[-1].status[0].message)
     _, _, values = one.diagnosis()
     assert one.diagnostics[-1].status[0].name == 'bme_node: prediction'
-    assert values['images without a person'] == '1'
+    assert values['images without a person'] == '16'
     assert values['height of the silhouette, px'] == '24'
 
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hmt_ros.nodes import camera_node
+from hmt_ros.sessions.declared_parameters import declared_parameters
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import time_ns
@@ -105,3 +109,86 @@ def test_a_camera_that_can_not_be_used(arguments, code, text, ended, monkeypatch
     found, _, errors = ended('camera_node', *arguments)
     assert found == code
     assert text in errors
+
+
+def test_the_end_of_a_file_is_told(shown):
+    _, said = shown('--fov', '60')
+    assert 'walk.mp4: 8 images shown; the file is over' in said
+
+
+# A lifecycle node that activates itself late, in a process of its own.
+LATE = """
+import sys, time, rclpy
+from rclpy.lifecycle import LifecycleNode
+rclpy.init()
+node = LifecycleNode('late', namespace='/lab')
+node.trigger_configure()
+end = time.monotonic() + 2.0
+while time.monotonic() < end:
+    rclpy.spin_once(node, timeout_sec=0.1)
+print(time.time(), flush=True)
+node.trigger_activate()
+rclpy.spin(node)
+"""
+
+
+def test_a_file_waits_for_nodes_that_are_named(shown):
+    """Although a listener is there from the beginning."""
+    late = subprocess.Popen([sys.executable, '-c', LATE], stdout=subprocess.PIPE, text=True)
+    try:
+        read, said = shown('--fov', '60', '--ros-args', '-p', 'wait_for:=late', '--')
+        active = float(late.stdout.readline())
+    finally:
+        late.kill()
+        late.communicate()
+    assert 'walk.mp4 starts when active: late' in said
+    first, last = (time_ns(read['image_raw'][i].header.stamp) * 1e-9 for i in (0, -1))
+    assert active < first < last < time.time()
+    assert len(read['image_raw']) >= 6
+
+
+@pytest.fixture
+def clip(walk_video, monkeypatch):
+    """Images of a file and the times at which they are due, s, with the waits that it asked for."""
+
+    def play(count, **options):
+        waits = []
+        stopped = SimpleNamespace(is_set=lambda: False, wait=waits.append)
+        monkeypatch.setattr(camera_node.time, 'monotonic', lambda: 0.0)
+        video = camera_node.Video(str(walk_video / 'walk.mp4'), **options)
+        shown = list(itertools.islice(video.images(stopped), count))
+        video.close()
+        return [image for image, _ in shown], [due * 1e-9 for _, due in shown], waits
+
+    return play
+
+
+def test_a_file_begins_again_and_its_stamps_go_on(clip):
+    images, due, _ = clip(20, loop=True)
+    assert np.allclose(due, 0.1 * np.arange(20))
+    for i in range(8, 20):
+        assert np.array_equal(images[i], images[i - 8])
+    assert not np.array_equal(images[0], images[7])
+    assert len(clip(20)[0]) == 8
+
+
+def test_a_file_shown_slowly_keeps_its_times(clip):
+    _, due, waits = clip(8, speed=0.5)
+    assert np.allclose(due, 0.1 * np.arange(8))
+    assert np.allclose(waits, 0.2 * np.arange(8))
+
+
+def test_parameters_are_described_and_checked(ended):
+    code, output, _ = ended('camera_node', '--help')
+    assert code == 0
+    for name in ('wait_for (string', 'loop (bool', 'rate (float; 0.01 to 100; default 1.0'):
+        assert f'  {name}' in output
+    page = (ROOT / 'docs' / 'views.md').read_text('utf-8')
+    for parameter in declared_parameters(camera_node.CameraNodeParameters()):
+        assert f'| `{parameter.name}` |' in page
+    for value, text in (('0.0', 'rate'), ("'fast'", 'rate')):
+        code, _, errors = ended('camera_node', 'a.mp4', '--ros-args', '-p', f'rate:={value}')
+        assert code == 1
+        (line,) = errors.splitlines()
+        assert line.startswith('camera_node: ')
+        assert text in line

@@ -99,3 +99,20 @@ def test_unknown_names_and_a_file_for_another_namespace_are_told_by_the_node(exe
     first, second = (line.partition('[filter_node]: ')[2] for line in lines if '[WARN]' in line)
     assert first.startswith("unknown parameter 'max_hypothesis'")
     assert second.strip().endswith("none is used; name the section '/**/filter_node'")
+
+
+@pytest.mark.parametrize(
+    ('values', 'resets'),
+    [
+        ({}, False),
+        ({'use_sim_time': True}, True),
+        ({'use_sim_time': True, 'reset_on_time_jump': False}, False),
+        ({'reset_on_time_jump': True}, True),
+    ],
+)
+def test_a_jump_of_simulated_time_resets_unless_told_otherwise(world_of, values, resets):
+    from hmt_ros.nodes.smoother_node import SmootherNode
+
+    one = world_of(SmootherNode, 'smoother_node', {}, **values)
+    assert one.node.get_parameter('reset_on_time_jump').value is resets
+    assert one.node._settings.reset_on_time_jump is resets

@@ -53,7 +53,7 @@ class StubTracker:
         )
         self.validity = Validity()
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
-        self.foreseen, self.nobody_shown = False, True
+        self.foreseen, self.nobody_shown, self.reason = False, True, ''
         self.track_id, self.started_from = 0, None
         self.existence_probability = 0.875
         self.log_likelihoods = np.array([-1.5, -2.5])

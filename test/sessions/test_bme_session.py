@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
+from hmt_ros.image.empty_scene import UNSEEN
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import SILHOUETTE, TOPICS, TRACK, BmeSession
@@ -21,6 +22,8 @@ from msg_tools.messages.keypoints import keypoints_message
 from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 
 FRAME_NS = 100_000_000
+# Images of a scene in which nothing moves that suffice.
+STILL = 16
 
 
 @pytest.fixture
@@ -92,20 +95,27 @@ def test_low_silhouettes_are_nobody(session, outputs, somebody):
     assert one.state.height == 24
 
 
-def test_background_is_learned_from_the_first_images(session, outputs, somebody):
-    one = session(background_file='', background_images=2)
+def test_background_is_learned_from_an_empty_scene(session, outputs, somebody):
+    """Somebody who is in view from the first image on is not taken for it."""
+    one = session(background_file='')
     one.take(CAMERA_INFO, somebody.info())
-    assert one.state.wants == '2 more images of the empty scene'
-    for index in range(2):
+    for index in range(STILL):
+        one.take(IMAGE, somebody.image(index))
+        assert (one.state.status, one.state.wants) == ('learning', UNSEEN)
+    for index in range(STILL, 2 * STILL):
         one.take(IMAGE, somebody.empty(index))
     assert one.state.status == 'nobody'
-    one.take(IMAGE, somebody.image(2))
-    assert [len(message.components) for message in predictions(outputs)] == [0, 0, 2]
+    one.take(IMAGE, somebody.image(2 * STILL))
+    found = predictions(outputs)
+    assert [len(message.components) for message in found] == [0] * (2 * STILL) + [2]
+    reasons = [message.reason for message in found]
+    assert set(reasons[:STILL]) == {UNSEEN}
+    assert set(reasons[-2:]) == {''}
 
 
 def test_masks_are_the_silhouettes(session, outputs, somebody, stub_predictor):
     """Without a background; what is far from the person is somebody else."""
-    one = session(background_file='', background_images=2, use_mask=True)
+    one = session(background_file='', use_mask=True)
     one.take(CAMERA_INFO, somebody.info())
     mask = somebody.mask(0)
     mask.data.reshape(48, 64)[20:26, 50:54] = 1
@@ -116,14 +126,14 @@ def test_masks_are_the_silhouettes(session, outputs, somebody, stub_predictor):
     ]
     assert (one.state.status, one.state.height, one.state.wants) == ('predicting', 24, '')
     # Images without a person are those that the background is learned from.
-    for index in (1, 2):
+    for index in range(1, 8):
         one.take(MASK, somebody.nobody(index))
         one.take(IMAGE, somebody.empty(index))
     assert one.state.status == 'nobody'
-    one.take(IMAGE, somebody.image(3))
-    one.take(MASK, somebody.mask(4))
+    one.take(IMAGE, somebody.image(8))
+    one.take(MASK, somebody.mask(9))
     assert stub_predictor.asked[1][0].sum() == pytest.approx(240, rel=0.1)
-    assert [len(message.components) for message in predictions(outputs)] == [2, 0, 0, 2]
+    assert [len(message.components) for message in predictions(outputs)] == [2, *[0] * 7, 2]
 
 
 def test_predictions_take_those_before_into_account(session, somebody, stub_predictor):
@@ -268,7 +278,7 @@ def test_one_image_is_predicted_on_demand(session, somebody, stub_predictor, mad
         one.predict_once(somebody.image(8, size=(32, 24)))
     learning = session(background_file='')
     learning.take(CAMERA_INFO, somebody.info())
-    with pytest.raises(ValueError, match='from 0 of 30 images so far'):
+    with pytest.raises(ValueError, match='has not been seen empty'):
         learning.predict_once(message)
 
 
@@ -301,7 +311,7 @@ def test_a_moved_camera_is_told_once(session, somebody):
     wall = np.full((48, 64, 3), 90, np.uint8)
     wall[:, 40:] = 160
     wall[30:, :] = 40
-    one = session(background_file='', background_images=3)
+    one = session(background_file='')
     one.take(CAMERA_INFO, somebody.info())
     told = []
     for index in range(60):
@@ -415,7 +425,7 @@ def test_every_image_has_a_silhouette_that_is_a_mask(
 
 
 def test_silhouettes_are_empty_while_the_background_is_learned(session, outputs, somebody):
-    one = session(lambda topic: topic == SILHOUETTE, background_file='', background_images=2)
+    one = session(lambda topic: topic == SILHOUETTE, background_file='')
     one.take(CAMERA_INFO, somebody.info())
     for index in range(2):
         one.take(IMAGE, somebody.empty(index))
@@ -566,18 +576,18 @@ def test_keypoints_that_come_late_are_left(both, outputs, somebody):
 
 def test_the_background_is_learned_where_keypoints_show_nobody(both, outputs, somebody):
     make, keypoints = both
-    one = make(background_file='', background_images=2)
+    one = make(background_file='')
     one.take(IMAGE, somebody.image(0))
     one.take('keypoints', keypoints(0))
     assert one.state.status == 'predicting'
-    for index in (1, 2):
+    for index in range(1, STILL + 1):
         one.take(IMAGE, somebody.empty(index))
         one.take('keypoints', keypoints(index, 0))
-        wanted = ('learning', '1 more images of the empty scene') if index == 1 else ('nobody', '')
+        wanted = ('learning', UNSEEN) if index < STILL else ('nobody', '')
         assert (one.state.status, one.state.wants) == wanted
-    one.take(IMAGE, somebody.image(3))
-    one.take('keypoints', keypoints(3, 0))
-    assert [len(x.components) for x in predictions(outputs)][1:] == [0, 0, 2]
+    one.take(IMAGE, somebody.image(STILL + 1))
+    one.take('keypoints', keypoints(STILL + 1, 0))
+    assert [len(x.components) for x in predictions(outputs)][1:] == [0] * STILL + [2]
 
 
 def test_keypoints_that_can_not_be_used_are_told_and_count_as_none(both, outputs, somebody):

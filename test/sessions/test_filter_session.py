@@ -15,6 +15,7 @@ from hmt_ros.sessions.image_inputs import COMPRESSED_MASK, KEYPOINTS, MASK, PRED
 from hmt_ros.sessions.track_messages import TOPICS, TOPICS_OF_NODE
 from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.tracking import Status
+from hmt_ros.tracking.beginning import Source
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.keep_out import KeepOutState, keep_out_of
@@ -655,13 +656,35 @@ def test_a_person_in_the_background_is_told(session, small_camera, stub_tracker)
         (warning,) = one.take(IMAGE, small_camera.image(1)).warnings
         assert one.take(IMAGE, small_camera.image(2)).warnings == ()
     assert warning.startswith(
-        'the background was learned with the person in it, of whom only 12% are foreground in the '
-        f'image of {small_camera.stamp(1)} ns'
+        'the background was learned with the person in it, as the image of '
+        f'{small_camera.stamp(1)} ns shows'
     )
     assert 'give background_file' in warning
     assert one.state.faults == {'background': 1}
     assert one.state.trouble() == 'the background was learned with the person in it; forgotten'
     assert dict(one.state.values())['background'] == 'forgotten'
+
+
+@pytest.mark.parametrize(
+    ('values', 'source'),
+    [({}, Source.KEYPOINTS), ({'likelihood.coverage.weight': 0.0}, Source.SUBJECT)],
+)
+def test_a_person_in_the_background_is_not_told_where_silhouettes_are_not_used(
+    session, small_camera, stub_tracker, monkeypatch, values, source
+):
+    one = session(**values)
+    one.take(CAMERA_INFO, small_camera.info())
+    step = stub_tracker.step
+
+    def doubts(self, *arguments, **named):
+        self.silhouettes.doubted, self.started_from = True, source
+        return step(self, *arguments, **named)
+
+    monkeypatch.setattr(stub_tracker, 'step', doubts)
+    assert one.take(IMAGE, small_camera.image(0)).warnings == ()
+    assert one.take(IMAGE, small_camera.image(1)).warnings == ()
+    assert one.state.trouble() == ''
+    assert one.state.faults == {}
 
 
 # Starts.

@@ -1,86 +1,38 @@
-"""Existence as a probability: the chain, the cues one by one at known poses, and an oracle."""
+"""Existence as a probability: the cues one by one at known poses, and an oracle."""
 
 from __future__ import annotations
 
-import itertools
 import math
 from datetime import datetime, timedelta, timezone
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.linalg import expm
 
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.inference.markov_chain import update
 from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.existence import (
     ABSENT,
-    BIRTH,
+    CHAIN,
     CLEAR,
     GIVEN,
-    LEAVING,
     PRESENT,
     Existence,
-    moved_on,
-    updated,
 )
 from hmt_ros.tracking.view import View
 
 SECOND = 1_000_000_000
 NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
-PROBABILITIES = st.floats(0.0, 1.0)
-TIMES = st.floats(0.0, 1e4)
 
 
 # The recursion.
 
 
-@given(PROBABILITIES, TIMES, TIMES)
-def test_where_nothing_is_said_time_can_be_divided_at_will(r, first, second):
-    """Chapman-Kolmogorov."""
-    assert moved_on(moved_on(r, first), second) == pytest.approx(
-        moved_on(r, first + second), abs=1e-12
-    )
-
-
-@pytest.mark.parametrize('dt', [0.03, 1.0, 20.0])
-def test_the_chain_is_the_exponential_of_its_rates(dt):
-    rates = np.array([[-LEAVING, LEAVING], [BIRTH, -BIRTH]])  # somebody, nobody
-    for r in (0.0, 0.3, 1.0):
-        assert moved_on(r, dt) == pytest.approx(([r, 1 - r] @ expm(rates * dt))[0], abs=1e-13)
-
-
-@given(PROBABILITIES, st.lists(st.tuples(TIMES, st.floats(-1e3, 1e3)), max_size=8))
-def test_it_is_always_a_probability(r, steps):
-    for dt, llr in steps:
-        r = updated(moved_on(r, dt), llr)
-        assert 0.0 <= r <= 1.0
-
-
 def test_without_an_image_nobody_is_not_said():
     """However long it lasts: r stays far above the limit."""
     for dt in (1.0, 1e3, 1e9):
-        assert moved_on(GIVEN, dt) > 5 * ABSENT
-
-
-def test_against_all_sequences_of_states():
-    """p(somebody | y_1:T) by enumerating 2^T sequences of the hidden Markov chain."""
-    rng = np.random.default_rng(0)
-    steps, start = 8, 0.2
-    times, llrs = rng.uniform(0.05, 3.0, steps), rng.normal(0.0, 2.0, steps)
-    r = start
-    for dt, llr in zip(times, llrs, strict=True):
-        r = updated(moved_on(r, dt), llr)
-    total = dict.fromkeys((False, True), 0.0)
-    for states in itertools.product((False, True), repeat=steps + 1):
-        p = start if states[0] else 1 - start
-        for before, after, dt, llr in zip(states, states[1:], times, llrs, strict=False):
-            there = moved_on(float(before), dt)
-            p *= (there if after else 1 - there) * (math.exp(llr) if after else 1.0)
-        total[states[-1]] += p
-    assert r == pytest.approx(total[True] / (total[True] + total[False]), rel=1e-12)
+        assert CHAIN.predict([1 - GIVEN, GIVEN], dt)[1] > 5 * ABSENT
 
 
 def test_against_the_bernoulli_filter_of_stone_soup():
@@ -98,16 +50,16 @@ def test_against_the_bernoulli_filter_of_stone_soup():
     dt, detected, clutter = 0.2, 0.9, 0.05
     predictor = BernoulliParticlePredictor(
         transition_model=None,
-        birth_probability=moved_on(0.0, dt),
-        survival_probability=moved_on(1.0, dt),
+        birth_probability=CHAIN.transition(dt)[0, 1],
+        survival_probability=CHAIN.transition(dt)[1, 1],
     )
     model = LinearGaussian(1, [0], np.array([[1.0]]))
     updater = BernoulliParticleUpdater(
         model, clutter_rate=1, clutter_distribution=clutter, detection_probability=detected
     )
-    ours = theirs = 0.3
+    theirs, ours = 0.3, np.array([0.7, 0.3])
     for step, at in enumerate([0.1, 0.0, 5.0, 50.0, 50.0, -0.3, 1.0, 50.0]):
-        ours = moved_on(ours, dt)
+        ours = CHAIN.predict(ours, dt)
         theirs = predictor.estimate_existence(theirs)
         time = datetime(2020, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=step * dt)
         # The particles lie where the person is.
@@ -119,9 +71,9 @@ def test_against_the_bernoulli_filter_of_stone_soup():
         found = updater.update(MultipleHypothesis([SingleHypothesis(state, detection)]))
         theirs = float(found.existence_probability)
         density = math.exp(-0.5 * at**2) / math.sqrt(2 * math.pi)
-        ours = updated(ours, math.log(1 - detected + detected * density / clutter))
-        assert ours == pytest.approx(theirs, rel=1e-9)
-        assert 0.01 < ours < 0.999
+        ours = update(ours, [0.0, math.log(1 - detected + detected * density / clutter)])
+        assert ours[1] == pytest.approx(theirs, rel=1e-9)
+        assert 0.01 < ours[1] < 0.999
 
 
 # The cues.
@@ -258,7 +210,7 @@ def test_images_that_show_nothing_say_nothing(film, watched, kind, background):
     r = watching.probability
     found, *_ = watched([view] * 3, watching=watching, first=6)
     assert watching.llr == 0.0
-    assert found[-1] == pytest.approx(moved_on(r, 0.3), abs=1e-9)
+    assert found[-1] == pytest.approx(CHAIN.predict([1 - r, r], 0.3)[1], abs=1e-9)
 
 
 def test_colours_are_asked_where_the_background_is_of_no_use(film, watched):

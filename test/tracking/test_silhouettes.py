@@ -77,6 +77,7 @@ def test_no_background_is_learned_from_what_a_mask_shows_a_person_in(film, human
     mask[50:60, 50:60] = True
     tracker.step(images[1], 1, mask=mask)
     assert tracker.background.frames == 1
+    assert not tracker.silhouettes.scene.known
     with pytest.raises(ValueError, match=r'images of \(240, 320\), saw a mask of \(120, 320\)'):
         tracker.step(images[1], 2, mask=mask[::2])
 
@@ -97,13 +98,13 @@ def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, huma
     """As the person leaves the place where the background was learned."""
     poses, images, empty = crossing
     silhouettes = Silhouettes(BackgroundModel())
-    for image in images[:4]:
-        silhouettes.learn(image, None)
+    for i in range(21):
+        silhouettes.learn(images[i % 4], i * FRAME)
     assert silhouettes.known == 'known'
     silhouettes.check(images[4], human32, camera, poses[4:5])
     assert silhouettes.share < 0.05
     assert silhouettes.doubted
-    assert silhouettes.silhouette(images[4], None, None) is None
+    assert silhouettes.silhouette(images[4], 21 * FRAME, None, None) is None
     assert silhouettes.known == 'forgotten, 0% known again'
     doubted = []
     for image, pose in zip(images[4:], poses[4:], strict=True):
@@ -114,7 +115,7 @@ def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, huma
     assert 10 < doubted.index(False) < 31
     assert silhouettes.share > 0.9
     mask = render_silhouettes(human32, poses[-1:], camera)[0]
-    found = silhouettes.silhouette(images[-1], None, None).foreground
+    found = silhouettes.silhouette(images[-1], 60 * FRAME, None, None).foreground
     wanted = BackgroundModel.from_image(empty).silhouette(images[-1])
     for one in (found, wanted):
         assert (one & mask).sum() / (one | mask).sum() > 0.8
@@ -124,16 +125,17 @@ def test_backgrounds_that_are_not_doubted(crossing, human32, camera):
     """An empty scene; nothing learned; nobody in view."""
     poses, images, empty = crossing
     given = Silhouettes(BackgroundModel.from_image(empty))
-    given.learn(images[0], None)
+    given.learn(images[0], 0)
     assert given.background.frames == 1
     # Nobody is before an empty scene that was given.
     given.check(empty, human32, camera, poses[:1])
     assert not given.doubted
     known = Silhouettes(BackgroundModel())
-    known.learn(empty, None)
+    for i in range(21):
+        known.learn(empty, i * FRAME)
     known.check(images[0], human32, camera, poses[:1])
     assert known.share > 0.9
-    assert known.silhouette(images[0], None, None).foreground.any()
+    assert known.silhouette(images[0], 21 * FRAME, None, None).foreground.any()
     far = poses[:1].copy()
     far[:, 2] = -3.0
     known.check(empty, human32, camera, far)
@@ -142,7 +144,7 @@ def test_backgrounds_that_are_not_doubted(crossing, human32, camera):
     nothing.check(images[0], human32, camera, poses[:1])
     nothing.complete(images[0], human32, camera, poses[:1])
     assert (nothing.doubted, nothing.known) == (False, 'unknown')
-    assert nothing.silhouette(images[0], None, None) is None
+    assert nothing.silhouette(images[0], 0, None, None) is None
 
 
 def test_tracking_where_the_background_was_learned_with_the_person_in_it(
@@ -153,6 +155,8 @@ def test_tracking_where_the_background_was_learned_with_the_person_in_it(
     tracker = Tracker(human32, camera, SETTINGS)
     seen = keypoints_of(human32, poses[4])
     tracker.reset(Subject(4 * FRAME, seen, dict(human32.segment_lengths)))
+    for i in range(20):
+        tracker.step(images[i % 4], (i - 20) * FRAME)
     errors, doubted = [], []
     for i, image in enumerate(images):
         alone = bool(doubted) and not doubted[-1]

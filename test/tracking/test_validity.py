@@ -13,9 +13,10 @@ from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SILHOUETTE, Misfit, of_points
 from hmt_ros.tracking.validity import (
+    CHAIN,
     DEPTH,
     DETECTOR,
-    DETECTOR_FAILS,
+    DETECTOR_CHAIN,
     ENOUGH,
     FAILS,
     MOST,
@@ -24,14 +25,12 @@ from hmt_ros.tracking.validity import (
     RECOVERS,
     TAU,
     UNDECIDED,
-    USUAL,
     ByKeypoints,
     Validity,
     evidence_of,
-    moved_on,
 )
 
-RATE = 30.0
+RATE, USUAL = 30.0, CHAIN.usual[1]
 
 
 def whole(share, groups=1):
@@ -49,21 +48,11 @@ def seconds(validity, misfits, until, rate=RATE, longest=5.0):
     return np.nan
 
 
-def test_between_images_it_is_the_chain_of_the_rates():
-    rates = np.array([[-FAILS, FAILS], [RECOVERS, -RECOVERS]])
-    for dt in (0.0, 1 / 30, 0.5, 1000.0):
-        wanted = np.array([0.8, 0.2]) @ expm(rates * dt)
-        assert moved_on(np.array([0.8]), dt) == pytest.approx(wanted[0])
-    assert moved_on(moved_on(np.array([0.1]), 0.2), 0.3) == pytest.approx(
-        moved_on(np.array([0.1]), 0.5)
-    )
-
-
 def test_images_are_those_of_a_hidden_markov_model():
     """The joint states of track, detector, silhouette and groups of keypoints, written out."""
     rng = np.random.default_rng(0)
     fails = np.full(6, FAILS)
-    fails[DETECTOR] = DETECTOR_FAILS
+    fails[DETECTOR] = DETECTOR_CHAIN.rates[1, 0]
     rates = [np.array([[-RECOVERS, RECOVERS], [x, -x]]) for x in fails]
     states = np.array(list(itertools.product((0, 1), repeat=6)))
     usual = RECOVERS / (fails + RECOVERS)

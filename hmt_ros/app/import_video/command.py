@@ -143,10 +143,10 @@ def _parser() -> CommandParser:
     return parser
 
 
-def add_camera_arguments(parser: CommandParser) -> None:
+def add_camera_arguments(parser: CommandParser, *, required: bool = True) -> None:
     """Adds the arguments that describe the camera, for `camera_of`."""
     camera = parser.add_argument_group('camera, one of these')
-    camera = camera.add_mutually_exclusive_group(required=True)
+    camera = camera.add_mutually_exclusive_group(required=required)
     angle = number(1, 150, what='an angle', unit=' degrees')
     camera.add_argument(
         '--fov', type=angle, metavar='DEGREES',
@@ -161,12 +161,12 @@ def add_camera_arguments(parser: CommandParser) -> None:
     )  # fmt: skip
 
 
-def add_video_arguments(parser: CommandParser) -> None:
+def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) -> None:
     """Adds the arguments that select the input."""
     parser.add_argument(
         'source', type=Path, metavar='SOURCE', help='video file, or folder of images'
     )
-    add_camera_arguments(parser)
+    add_camera_arguments(parser, required=camera_required)
     frames = parser.add_argument_group('frames')
     frames.add_argument(
         '--fps', type=number(0.01, 1000),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +55,7 @@ exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Arguments of the command, see its help."""
+    """Arguments of the command, see its help; `notes` are lines that the page shows, too."""
 
     bag: Path
     output: Path
@@ -67,6 +68,7 @@ class ReportOptions:
     image_topic: str | None = None
     camera_info_topic: str | None = None
     body: str | None = None
+    notes: Sequence[str] = ()
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -163,11 +165,11 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
         )
     stamps = _shown(everything, options.times)
     mixtures = everything.at(stamps)
-    notes = []
+    notes = [*options.notes]
     if everything.empty:
-        notes.append(
-            f'nobody is found at {len(everything.empty)} of {len(everything.stamps)} times'
-        )
+        told = f'nobody is found at {len(everything.empty)} of {len(everything.stamps)} times'
+        why = Counter(everything.answered[stamp] for stamp in everything.empty).most_common(1)[0][0]
+        notes.append(f'{told}: {why}' if why else told)
     if len(stamps) < len(everything.stamps):
         notes.append(f'{len(stamps)} of {len(everything.stamps)} times are shown')
     notes += [

@@ -207,12 +207,12 @@ class RecordedMixtures:
     Attributes:
         layers: mixtures over poses, those of the posterior first.
         trajectories: mixtures over trajectories.
-        answered: stamps of images, ns, those without anybody among them.
+        answered: by stamp of an image, ns, what is missing where no pose is known; '': nothing.
     """
 
     layers: list[Layer[Moment]]
     trajectories: list[Layer[Window]]
-    answered: frozenset[int] = frozenset()
+    answered: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def stamps(self) -> list[int]:
@@ -232,7 +232,7 @@ class RecordedMixtures:
 
     def at(self, stamps: Iterable[int]) -> RecordedMixtures:
         """The mixtures at some times only; the windows that end then, or else the last."""
-        wanted = frozenset(stamps)
+        wanted = set(stamps)
         layers = [layer.at(wanted) for layer in self.layers]
         return RecordedMixtures(
             [layer for layer in layers if layer.mixtures],
@@ -240,7 +240,7 @@ class RecordedMixtures:
                 layer.at(wanted if wanted & layer.mixtures.keys() else {max(layer.mixtures)})
                 for layer in self.trajectories
             ],
-            self.answered & wanted,
+            {stamp: text for stamp, text in self.answered.items() if stamp in wanted},
         )
 
 
@@ -269,7 +269,7 @@ def read_mixtures(
         names = chosen_topics(bag, topics)
         every = bag.messages(filter(None, [topic_beside(bag, KEEP_OUT, names[0])]))
         told = (x.message for x in every if x.message.state != KeepOutState.STALE)
-        answered = {time_ns(message.header.stamp) for message in told}
+        answered = {time_ns(x.header.stamp): str(getattr(x, 'reason', '')) for x in told}
         bodies = RecordedBodies(body_model)
         for stored in bag.messages([*body_topics(bag), *names]):
             if stored.msgtype == BODY:
@@ -277,7 +277,7 @@ def read_mixtures(
             else:
                 _take(found, stored, bodies, grounds or {})
                 if stored.msgtype == POSE_MIXTURE:
-                    answered.add(time_ns(stored.message.header.stamp))
+                    answered.setdefault(time_ns(stored.message.header.stamp), '')
             if progress is not None:
                 progress(1)
     for name, layer in found.items():
@@ -285,7 +285,7 @@ def read_mixtures(
     layers = [found[name] for name in names if name in found]
     layers.sort(key=lambda layer: _ORDER.index(layer.kind))
     poses = [layer for layer in layers if layer.kind != _TRAJECTORIES]
-    result = RecordedMixtures(poses, layers[len(poses) :], frozenset(answered))
+    result = RecordedMixtures(poses, layers[len(poses) :], answered)
     if not result.stamps:
         raise ValueError(f'{path}: nobody is seen in any mixture on {", ".join(names)}')
     for first, layer in pairwise(layers):

@@ -246,6 +246,16 @@ def test_chosen_topics_and_fewer_times(made, tmp_path):
 
 
 @pytest.mark.usefixtures('no_pictures')
+def test_notes_of_who_asks_for_the_report_are_on_the_page(made, tmp_path):
+    place, notes = tmp_path / 'report', ['the lens is assumed']
+    options = report.ReportOptions(made.out, place, quiet=True, notes=notes)
+    _, summary = report.write_report(options)
+    found = data_of((place / 'report.html').read_text('utf-8'))
+    assert found['notes'][0] == 'the lens is assumed'
+    assert 'the lens is assumed' in summary.splitlines()
+
+
+@pytest.mark.usefixtures('no_pictures')
 def test_bag_in_a_namespace(body, poses, tmp_path):
     """The topics of a person are found in the person's namespace; a relative name is enough."""
     place = '/humans/bodies/anna'

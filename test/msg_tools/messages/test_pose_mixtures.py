@@ -92,20 +92,22 @@ def test_messages_older_than_the_lengths(
     """A bag carries its own definition, which has no such fields."""
     store = typestore()
     definition, _ = store.generate_msgdef(POSE_MIXTURE, ros_version=2)
-    fields = ('string[] segment_names\n', 'float64[] segment_lengths\n')
+    fields = ('string[] segment_names\n', 'float64[] segment_lengths\n', 'string reason\n')
     assert all(field in definition for field in fields)
     for field in fields:
         definition = definition.replace(field, '', 1)
     old = typestore_of_definition(POSE_MIXTURE, 'ros2msg', definition)
     message = pose_mixture_message(messages, replace(pose_mixture, segment_lengths={}))
-    # The fields are the last of the message: two counts of zero.
+    # The fields are the last of the message: two counts of zero, and an empty string.
     data = serialise(message)
-    assert data[-8:] == bytes(8)
-    back = pose_mixture_of(deserialise(data[:-8], POSE_MIXTURE, old))
-    assert back.segment_lengths == {}
+    empty = bytes(8) + b'\x01\0\0\0\0'
+    assert data.endswith(empty)
+    old_data = data[: -len(empty)]
+    back = pose_mixture_of(deserialise(old_data, POSE_MIXTURE, old))
+    assert (back.segment_lengths, back.reason) == ({}, '')
     np.testing.assert_array_equal(back.weights, [0.5, 0.3, 0.2])
     # Written again it is of the present definition.
-    assert serialise(deserialise(data[:-8], POSE_MIXTURE, old)) == data
+    assert serialise(deserialise(old_data, POSE_MIXTURE, old)) == data
 
 
 def test_bags_from_before_error_model_and_relative_covariances(

@@ -1,0 +1,75 @@
+"""The lens as a video file tells of it: phones of Apple write the focal length that they use.
+
+The key stands in the metadata of the movie or of its track (QuickTime File Format, Metadata): a box
+`keys` with names, and a box `ilst` with values by the number of their name.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+KEY = b'com.apple.quicktime.camera.focal_length.35mm_equivalent'
+# Width of a picture on 35 mm film, mm; focal lengths that lenses have, in its terms, mm.
+FILM, FOCAL_LENGTHS = 36.0, (6.0, 1200.0)
+# Relative standard deviation of a focal length that is told so: videos are cropped to be steady,
+# and to be wide, which the number does not say.
+TOLD_SIGMA = 0.1
+# Types of values that are not whole numbers.
+_TEXT, _FLOATS = 1, {23: '>f', 24: '>d'}
+
+
+def told_fov(path: Path) -> float | None:
+    """The field of view, degrees, along the longer side of the images; None: it is not told."""
+    with path.open('rb') as file:
+        if not path.stat().st_size:
+            return None
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            try:
+                focal = next(_focal_lengths(data, 0, len(data)), math.nan)
+            except (ValueError, struct.error, RecursionError):
+                return None
+    low, high = FOCAL_LENGTHS
+    return math.degrees(2.0 * math.atan(0.5 * FILM / focal)) if low <= focal <= high else None
+
+
+def _focal_lengths(data: mmap.mmap, start: int, end: int) -> Iterator[float]:
+    """Values of the key in the boxes of a part of a file."""
+    for kind, first, last in _boxes(data, start, end):
+        if kind in (b'moov', b'trak'):
+            yield from _focal_lengths(data, first, last)
+        elif kind == b'meta':
+            # In MP4 files a version stands before the boxes.
+            first += 0 if data[first + 4 : first + 8] == b'hdlr' else 4
+            inner = {name: (a, b) for name, a, b in _boxes(data, first, last)}
+            first, last = inner.get(b'keys', (0, 0))
+            names = [data[a:b] for _, a, b in _boxes(data, first + 8, last)]
+            for number, a, b in _boxes(data, *inner.get(b'ilst', (0, 0))):
+                if names[int.from_bytes(number, 'big') - 1 :][:1] == [KEY]:
+                    yield from (_number(data[c:d]) for _, c, d in _boxes(data, a, b))
+
+
+def _number(value: bytes) -> float:
+    """The number in a value: its type, its language, and the number itself."""
+    kind, content = int.from_bytes(value[:4], 'big'), value[8:24]
+    if kind in _FLOATS:
+        return float(struct.unpack(_FLOATS[kind], content)[0])
+    return float(content) if kind == _TEXT else float(int.from_bytes(content, 'big'))
+
+
+def _boxes(data: mmap.mmap, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """Kinds of the boxes in a part of a file, and where their contents begin and end."""
+    while start + 8 <= end:
+        size, kind = struct.unpack_from('>I4s', data, start)
+        head = 8
+        if size == 1 and start + 16 <= end:
+            size, head = struct.unpack_from('>Q', data, start + 8)[0], 16
+        elif size == 0:
+            size = end - start
+        if size < head:
+            return
+        yield kind, start + head, min(start + size, end)
+        start += size

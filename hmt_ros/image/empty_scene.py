@@ -1,0 +1,135 @@
+"""The empty scene before a camera that stands still, and whether somebody was in it.
+
+A background that was given is the empty scene. One that is learned from images is not, if somebody
+stood in them: the person is missing in the silhouettes, and where the person stood a ghost is left.
+Both look like silhouettes, so what follows from them can not tell. Two other things can:
+
+    still     log odds -= dt / STILL          people move; a scene in which nothing does is empty
+    moved     log odds = 0, learned anew      a piece as large as a part of a person has changed
+    outline   log odds -= a(dt) N (u - m)     u: share of the outline of a silhouette at which the
+                                              image has the stronger edges, not the background
+
+of somebody in the scene as it was learned. Whoever is before a scene covers it, edges and all; a
+ghost has its edges in the background. Where a detector sees nobody either, it takes less time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from hmt_ros.image.background import WIDTH, BackgroundModel, edges_of
+from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.error_model import seconds, share_of_time
+
+UNSEEN = (
+    'the scene has not been seen empty and still for two seconds; wanted that, or background_file, '
+    'or a detector (use_keypoints, or "install-detector")'
+)
+# Time for which somebody in view keeps still, and is unseen by a detector beside, s; what one image
+# says of it at most, nats.
+STILL, UNDETECTED, MOST = 0.4, 0.1, 3.5
+# Log odds of somebody in the scene below which silhouettes are used, least ones without any
+# silhouette (somebody may sleep, or be a picture), and those below which none is judged, nats.
+KNOWN, STILLEST, SURE = -3.5, -5.0, -14.0
+# Blur of images that are compared, px; time that they are compared over, s; least change of a pixel
+# that noise does not make, grey levels; least size of a piece that is part of a person, a share of
+# the image (in empty scenes up to 6e-5; of people who stand 2e-4 to 3e-3 in half a second).
+BLUR, MEMORY, CHANGED, PIECE = 1.5, 1.0, 10.0, 2e-4
+# N, m and the time for which errors of the outline last, s. On 10 clips u is 0.85 to 1 before the
+# empty scene, and 0.25 to 0.66 before one with the person in it. Least length of the outline, px.
+NATS, UNDECIDED, TAU, OUTLINE = 16.0, 0.75, 0.2, 40
+
+
+class EmptyScene:
+    """Learns the empty scene, and judges it.
+
+    Args:
+        background: that was given, or a model that has learned nothing.
+        trusted: whether somebody else answers for it, and learns it.
+
+    Attributes:
+        background: the scene as it is known.
+        log_odds: of somebody in it, nats.
+    """
+
+    def __init__(self, background: BackgroundModel, *, trusted: bool = False) -> None:
+        self.background = background
+        self.log_odds = -math.inf if background.frames or trusted else 0.0
+        self._recent: Array | None = None
+        self._learned = self._judged = 0
+        self._edges: Array | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether it was seen without anybody."""
+        return self.background.frames > 0 and self.log_odds < KNOWN
+
+    @property
+    def wants(self) -> str:
+        """What is missing until silhouettes are used, in words."""
+        return '' if self.known else UNSEEN
+
+    @property
+    def is_of_somebody(self) -> bool:
+        """Whether more likely than not somebody was in it."""
+        return self.background.frames > 0 and self.log_odds > 0.0
+
+    def learn(self, image: Image, stamp: int, detected: bool | None = None) -> None:
+        """Takes an image (H, W, 3), unless a detector sees somebody in it.
+
+        Args:
+            image: of the scene.
+            stamp: of the image, ns; later than the one before.
+            detected: whether a detector, or a segmenter, sees somebody; None: it does not say.
+        """
+        if self.log_odds == -math.inf or detected:
+            return
+        dt = seconds(stamp - self._learned) if self._recent is not None else 0.0
+        if self._has_moved(image, dt):
+            if self.known:
+                return
+            self.background, self.log_odds = BackgroundModel(self.background.settings), 0.0
+        elif self.log_odds > STILLEST:
+            still = min(dt / (STILL if detected is None else UNDETECTED), MOST)
+            self.log_odds = max(self.log_odds - still, STILLEST)
+        self._learned, self._edges = stamp, None
+        self.background.learn(image)
+
+    def judge(self, image: Image, silhouette: Mask, stamp: int) -> None:
+        """Takes the silhouette (H, W) of an image before the scene that was learned."""
+        if self.log_odds <= SURE:
+            return
+        now, size = edges_of(image), image.shape[1::-1]
+        if self._edges is None:
+            empty = cv2.resize(self.background.empty, size)
+            self._edges = edges_of(np.asarray(empty, dtype=np.uint8))
+        pixels = cv2.resize(silhouette.view(np.uint8), now.shape[::-1])
+        square = np.ones((3, 3), np.uint8)
+        outline = cv2.morphologyEx(pixels, cv2.MORPH_GRADIENT, square) > 0
+        if np.count_nonzero(outline) < OUTLINE * now.shape[1] / WIDTH:
+            return
+        stronger = cv2.dilate(now, square) > cv2.dilate(self._edges, square)
+        share = share_of_time(seconds(stamp - self._judged) if self._judged else math.inf, TAU)
+        evidence = share * NATS * (float(stronger[outline].mean()) - UNDECIDED)
+        self.log_odds -= float(np.clip(evidence, -MOST, MOST))
+        self._judged = stamp
+
+    def _has_moved(self, image: Image, dt: float) -> bool:
+        """Whether a part of a person has moved since the images before."""
+        width = min(WIDTH, image.shape[1])
+        height = max(round(image.shape[0] * width / image.shape[1]), 1)
+        resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        small = np.asarray(cv2.GaussianBlur(resized, (0, 0), BLUR), dtype=np.float64)
+        before = self._recent
+        if before is None or before.shape != small.shape:
+            self._recent = small
+            return False
+        changed = (np.abs(small - before).max(axis=2) > CHANGED).view(np.uint8)
+        _, _, pieces, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
+        moved = pieces[1:, cv2.CC_STAT_AREA].max(initial=0) > PIECE * changed.size
+        gain = 1.0 if moved else -math.expm1(-dt / MEMORY)
+        self._recent = before + gain * (small - before)
+        return bool(moved)

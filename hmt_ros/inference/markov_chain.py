@@ -1,0 +1,78 @@
+"""A hidden Markov chain in continuous time: n states, rates per second between them.
+
+    predict   p <- p exp(Q dt)                      Q_ij: rate from state i to state j, 1/s
+    update    log p_i <- log p_i + l_i - const      l_i: log likelihood of an observation in state i
+
+Two states have the closed form  p_1 <- u + (p_1 - u) exp(-(q_01 + q_10) dt),  u = q_01 / (q_01 +
+q_10). Time can be divided at will, so that no result counts images.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import expm, null_space
+
+from hmt_ros.inference.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class MarkovChain:
+    """The states of a chain and the rates between them.
+
+    Attributes:
+        rates: (n, n) from state i to state j, 1/s; the diagonal does not count.
+    """
+
+    rates: Array
+
+    @classmethod
+    def of_two(cls, begins: float, ends: float) -> MarkovChain:
+        """A chain of the states 'not' and 'is', by the rates at which it begins and ends, 1/s."""
+        return cls(np.array([[0.0, begins], [ends, 0.0]]))
+
+    @cached_property
+    def generator(self) -> Array:
+        """Q (n, n), whose rows sum to 0, 1/s."""
+        off = self.rates * (1.0 - np.eye(len(self.rates)))
+        return np.asarray(off - np.diag(off.sum(1)))
+
+    @cached_property
+    def usual(self) -> Array:
+        """Probabilities (n,) after a long time in which nothing was observed."""
+        if len(self.rates) == 2:
+            return np.asarray(self.rates[[1, 0], [0, 1]] / -np.trace(self.generator))
+        found = null_space(self.generator.T)[:, 0]
+        return np.asarray(found / found.sum())
+
+    def transition(self, dt: float) -> Array:
+        """Probabilities (n, n) of state j a time dt, s, after state i."""
+        if len(self.rates) == 2:
+            share = -math.expm1(np.trace(self.generator) * dt)
+            return np.asarray((1.0 - share) * np.eye(2) + share * self.usual)
+        return np.asarray(expm(self.generator * dt))
+
+    def predict(self, p: ArrayLike, dt: float) -> Array:
+        """Probabilities (..., n) a time dt, s, after p (..., n)."""
+        return np.asarray(np.asarray(p) @ self.transition(dt))
+
+
+def update(p: ArrayLike, log_likelihoods: ArrayLike) -> Array:
+    """Probabilities (..., n) after p (..., n), given an observation.
+
+    Args:
+        log_likelihoods: (..., n) of the observation in each state, nats, up to a constant.
+    """
+    with np.errstate(divide='ignore'):
+        log_p = np.log(p) + log_likelihoods
+    return np.asarray(np.exp(log_p - np.logaddexp.reduce(log_p, axis=-1, keepdims=True)))
+
+
+def of_log_odds(log_odds: ArrayLike) -> Array:
+    """Probabilities (..., 2) of a chain of two states, by the log odds of the second one, nats."""
+    is_so = 0.5 * (1.0 + np.tanh(0.5 * np.asarray(log_odds, dtype=np.float64)))
+    return np.stack([1.0 - is_so, is_so], axis=-1)
