@@ -87,7 +87,8 @@ def report_change(
             'camera is mounted',
             warn=True,
         )
-    if (now.status, now.track_id) != (before.status, before.track_id):
+    newer = now.track_id != before.track_id and now.status is Status.TRACKING
+    if newer or now.status is not before.status:
         _report_status(log, before, tracker, initial, stamp_ns)
 
 
@@ -103,7 +104,7 @@ def _report_status(
     if now is Status.NOBODY:
         log.tell(f'nobody in view {at}: {track} ends, another starts when somebody comes')
     elif now is Status.WAITING:
-        log.tell(f'{track} ends {at}: who comes after so long may be somebody else')
+        log.tell(f'{track} ends {at}: whoever is there may be somebody else')
     elif tracker.track_id == before.track_id and before.status is Status.LOST:
         log.tell(f'{track} is found again {at}')
     elif tracker.track_id != before.track_id:

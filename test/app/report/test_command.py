@@ -323,14 +323,14 @@ def test_images_without_anybody(made, body, poses, tmp_path, capsys):
     with BagWriter(nobody) as bag:
         bag.add_topic('pose_mixture', POSE_MIXTURE)
         for stamp in answered:
-            bag.write('keep_out', stamp, keep_out(stamp))
+            bag.write('keep_out', stamp, keep_out(stamp, reason='no scene'))
         # Of a time without an image.
         bag.write('keep_out', STAMPS[-1] + 1, keep_out(STAMPS[-1] + 1, KeepOutState.STALE))
     images = write_images(tmp_path / 'images', answered)
     found = data_of(make(nobody, tmp_path / 'first', '--images', images, '--truth', made.truth))
     assert np.allclose(found['times'], np.arange(FRAMES + 1) / 10)
     assert found['layers'] == []
-    assert found['notes'] == [f'nobody is found at {FRAMES + 1} of {FRAMES + 1} times']
+    assert found['notes'] == [f'nobody is found at {FRAMES + 1} of {FRAMES + 1} times: no scene']
     assert all(found['images']['jpegs'])
     scores = found['scores']['topics']['/pose_mixture']
     assert (scores['frames'], scores['missing'], scores['heaviest_mm']) == (0, FRAMES, None)
@@ -344,9 +344,9 @@ def test_images_without_anybody(made, body, poses, tmp_path, capsys):
     assert [bool(weights) for weights in found['layers'][0]['weights']] == [False, *[True] * FRAMES]
 
 
-def keep_out(stamp, state=KeepOutState.NOBODY):
+def keep_out(stamp, state=KeepOutState.UNKNOWN, reason=''):
     nothing = np.empty((0, 3))
-    content = KeepOut(stamp, FRAME_ID, state, nothing, nothing, np.empty(0))
+    content = KeepOut(stamp, FRAME_ID, state, nothing, nothing, np.empty(0), reason=reason)
     return keep_out_message(MESSAGES, content)
 
 
