@@ -44,10 +44,11 @@ class MarkovChain:
     @cached_property
     def usual(self) -> Array:
         """Probabilities (n,) after a long time in which nothing was observed."""
-        if len(self.rates) == 2:
-            return np.asarray(self.rates[[1, 0], [0, 1]] / -np.trace(self.generator))
-        found = null_space(self.generator.T)[:, 0]
-        return np.asarray(found / found.sum())
+        two = len(self.rates) == 2
+        found = self.rates[[1, 0], [0, 1]] if two else null_space(self.generator.T)[:, 0]
+        found = found / found.sum()
+        found.flags.writeable = False
+        return np.asarray(found)
 
     def transition(self, dt: float) -> Array:
         """Probabilities (n, n) of state j a time dt, s, after state i."""

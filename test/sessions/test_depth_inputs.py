@@ -120,7 +120,7 @@ def test_depth_of_something_else_is_told_once(session, small_camera, stub_tracke
         one.take(DEPTH, small_camera.depth(index))
         warnings = one.take(IMAGE, small_camera.image(index)).warnings
         assert len(warnings) == (index == 2)
-        stub_tracker.made[0].validity.cues['depth'][:] = index == 0
+        stub_tracker.made[0].validity._depth = np.array([index != 0, index == 0], float)
     assert one.state.faults == {'depth of something else': 2}
 
 
