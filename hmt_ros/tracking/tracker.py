@@ -465,8 +465,10 @@ class Tracker:
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """See `step`."""
         masked, existence, self._foreseen = mask is not None, self._existence, False
-        unseen = 0.0 if existence.met is None else seconds(stamp - existence.met)
-        if SAME_PERSON.transition(unseen)[1, 1] < 0.5:
+        if (
+            existence.met is not None
+            and SAME_PERSON.transition(seconds(stamp - existence.met))[1, 1] < 0.5
+        ):
             # Whoever comes now is somebody else, of whom nothing is known.
             self._drop_track(self.model)
             self._nobody, existence.met = True, None
