@@ -43,8 +43,8 @@ class FilterParameters(CameraNodeParameters):
     Attributes:
         subject_file: YAML file with the joints of the person in one image, which starts the track;
             if empty, other inputs or ~/reset start it.
-        background_file: Image of the empty scene; if empty, the background is learned before the
-            track starts.
+        background_file: Image of the empty scene; if empty, it is learned before the track starts,
+            once nothing has moved for two seconds.
         body_model: Body model, 'human37', 'human34', 'human32' or a YAML file.
         random_seed: Seed of all random numbers; the same images give the same results.
         use_keypoints: If true, keypoints are a measurement and start a track without subject_file.

@@ -1,17 +1,21 @@
-"""The start of a track: from which input, and at which image.
+"""The start of a track: a table of what may start one, in order; the first that is there decides.
 
-    subject      at the image that its joints were seen in
-    mixture      at the next image
-    box          at the next image; keypoints or a prediction of that image come before it
-    nothing      once somebody is in view with the probability `PRESENT` (`existence`), and is shown
-                 by one of these:
+    source        needs                                             sure (nats, beside existence)
+    subject       a subject file, and an image at or after it       given
+    mixture       a mixture that was given                          given
+    keypoints     most of the trunk, and 6 joints in all            -
+    prediction    poses that a regression expects by the image      AT_ONCE
+    keypoints     of a part: a person, both shoulders or hips       -
+    box           a box around the person                           given
+    mask          one that has the shape of a person                -
 
-        keypoints that suffice     most of the trunk, and 6 joints in all, with confidence
-        keypoints of a part        a person, with both shoulders or both hips; takes longer
-        mask                       takes longer where a side of the image may cut it
-        prediction                 at once
+A track starts once
 
-After a track has ended the next one starts in the same way; then a silhouette suffices.
+    log odds of existence + sure + log p(distance) >= log odds of PRESENT
+
+p(distance) is log-normal, wide, and never a limit: people are seen at 0.4 to 15 m by a lens of 60
+degrees, at distances that grow with the focal length. After a track has ended a silhouette before
+a known scene suffices, too.
 
 Keypoints give poses, depth and lengths (see `initialisation`); a mask or a box gives mean poses of
 several headings. A detector may take left for right, and silhouettes do not tell sides at all: with
@@ -20,9 +24,11 @@ every pose comes its reversal in depth, and both ways to face are followed (see 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,6 +43,7 @@ from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.existence import CLEAR, PRESENT, Existence
 from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.initialisation import (
     mixture_from_box,
@@ -51,6 +58,11 @@ from hmt_ros.tracking.start_depth import depths_of, moved_to_depth
 from hmt_ros.tracking.subject import Subject
 from hmt_ros.tracking.view import View
 
+# Distances at which a lens of so many degrees sees 95 % of people, m.
+NEAREST, FARTHEST, LENS = 0.4, 15.0, math.radians(60.0)
+# What a prediction is sure of by itself, nats: in the first image nothing else has spoken.
+AT_ONCE = 1.5 * CLEAR.nats
+PRESENT_LOG_ODDS = math.log(PRESENT / (1.0 - PRESENT))
 # A person hardly moves in so long a time, ns.
 SAME_MOMENT_NS = 200_000_000
 # Number of the best poses from keypoints whose reversals in depth are searched, too.
@@ -95,145 +107,159 @@ class Beginning:
         return self.start[:1]
 
 
-def shows_a_start(view: View, body: Body, *, masked: bool) -> bool:
-    """Whether an image shows somebody that a first track can start from, if somebody is there.
-
-    Args:
-        view: of the image.
-        body: model of the person.
-        masked: whether the silhouette is a segmenter's.
-    """
-    if suffices(view.keypoints, body) or shows_a_part(view.keypoints, body):
-        return True
-    return masked and view.silhouette is not None and looks_like_person(view.silhouette)
-
-
-class Starts:
-    """Decides at which image a track starts, and from which input.
-
-    Args:
-        model: of a person; a subject's lengths replace the model's.
-        camera: that sees the person.
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """An image, and what was given before it.
 
     Attributes:
-        given: subject or mixture that the track starts from; None: the images start it.
-        box: (left, top, right, bottom) of the person in the next image, px; None: unknown.
-    """
-
-    def __init__(self, model: Body, camera: Camera) -> None:
-        self.given: Subject | GaussianMixture | None = None
-        self.box: Box | None = None
-        self._model, self._camera = model, camera
-
-    def first(
-        self,
-        view: View,
-        stamp: int,
-        body: Body,
-        upright: Gravity | None,
-        prediction: PosePrediction | None,
-        observed: Callable[[], Observation],
-        *,
-        masked: bool,
-        somebody: bool,
-    ) -> Beginning | None:
-        """The start of the track at an image; None: it does not start there.
-
-        Args:
-            view: of the image.
-            stamp: of the image, ns.
-            body: of the poses of a mixture.
-            upright: gravity; None: unknown.
-            prediction: by the image, if any.
-            observed: makes the observation of the image.
-            masked: whether the silhouette is a segmenter's.
-            somebody: whether a person is in view.
-        """
-        given, model, camera = self.given, self._model, self._camera
-        if given is not None and self.box is None:
-            if isinstance(given, Subject) and stamp < given.stamp_ns:
-                return None
-            depths = None
-            if isinstance(given, Subject) and stamp - given.stamp_ns <= SAME_MOMENT_NS:
-                depths = depths_of(view.depth)
-            return beginning_given(given, model, body, camera, upright, depths)
-        at_once = prediction is not None and not suffices(view.keypoints, model)
-        shown = somebody and shows_a_start(view, model, masked=masked)
-        if self.box is None and not at_once and not shown:
-            return None
-        return beginning_seen(view, model, camera, upright, prediction, self.box, observed)
-
-
-def beginning_given(
-    start: Subject | GaussianMixture, model: Body, body: Body, camera: Camera,
-    upright: Gravity | None, depths: ImageMap | None = None,
-) -> Beginning:  # fmt: skip
-    """The body and the poses that a track begins with, from a given start.
-
-    Args:
-        start: subject or mixture that it starts from.
-        model: body, whose lengths those of a subject replace.
+        view: of the image.
+        stamp: of the image, ns.
+        model: of a person; a subject's lengths replace the model's.
         body: of the poses of a mixture.
         camera: that sees the person.
         upright: gravity; None: unknown.
-        depths: of the image that a subject's joints were seen in; None: unknown.
-    """
-    if isinstance(start, GaussianMixture):
-        return Beginning(Source.MIXTURE, body, start)
-    begun = start_from_keypoints(model, camera, start, upright=upright, depths=depths)
-    return Beginning(Source.SUBJECT, begun.body, begun.poses, clicked=start.keypoints)
-
-
-def beginning_seen(
-    view: View,
-    model: Body,
-    camera: Camera,
-    upright: Gravity | None,
-    prediction: PosePrediction | None,
-    box: Box | None,
-    observed: Callable[[], Observation],
-) -> Beginning | None:
-    """The body and the poses that a track begins with, from an image.
-
-    Args:
-        view: of the image.
-        model: body whose lengths are fitted to keypoints.
-        camera: that sees the person.
-        upright: gravity; None: unknown.
+        given: subject or mixture that the track starts from; None: the images start it.
+        box: (left, top, right, bottom) of the person, px; None: unknown.
         prediction: by the image, if any.
-        box: in which the person is, if one was given.
+        masked: whether the silhouette is a segmenter's.
         observed: makes the observation of the image.
-
-    Returns:
-        None: nobody is shown.
     """
-    keypoints = view.keypoints
-    enough = suffices(keypoints, model)
-    depths = depths_of(view.depth)
-    if keypoints is not None and (
-        enough or (prediction is None and shows_a_part(keypoints, model))
-    ):
-        begun = start_from_keypoints(
-            model, camera, Subject(0, keypoints, {}), upright=upright, depths=depths
-        )
-        poses = [with_reversals(begun.body, begun.poses)]
-        lifted = lifted_poses(begun.body, camera, keypoints)
-        poses.append(moved_to_depth(begun.body, camera, lifted, depths))
-        if prediction is not None:
-            predicted = prediction.seen_as(begun.body).means
-            poses.append(moved_to_depth(begun.body, camera, predicted, depths))
-        return Beginning(Source.KEYPOINTS, begun.body, np.concatenate(poses))
-    if prediction is not None:
-        both = _mixture_at(prediction.both_ways(prediction.body), prediction.body, camera, depths)
-        return Beginning(Source.PREDICTION, prediction.body, both)
-    if box is not None:
-        start = _mixture_at(mixture_from_box(model, camera, box), model, camera, depths)
-        return Beginning(Source.BOX, model, start)
-    outline = observed().outline
+
+    view: View
+    stamp: int
+    model: Body
+    body: Body
+    camera: Camera
+    upright: Gravity | None
+    given: Subject | GaussianMixture | None
+    box: Box | None
+    prediction: PosePrediction | None
+    masked: bool
+    observed: Callable[[], Observation]
+
+    @property
+    def depths(self) -> ImageMap | None:
+        """Of the image; None: unknown."""
+        return depths_of(self.view.depth)
+
+
+def _from_subject(shown: Shown) -> Beginning:
+    subject = shown.given
+    assert isinstance(subject, Subject)
+    fresh = shown.stamp - subject.stamp_ns <= SAME_MOMENT_NS
+    begun = start_from_keypoints(
+        shown.model, shown.camera, subject, upright=shown.upright,
+        depths=shown.depths if fresh else None,
+    )  # fmt: skip
+    return Beginning(Source.SUBJECT, begun.body, begun.poses, clicked=subject.keypoints)
+
+
+def _from_mixture(shown: Shown) -> Beginning:
+    assert isinstance(shown.given, GaussianMixture)
+    return Beginning(Source.MIXTURE, shown.body, shown.given)
+
+
+def _from_keypoints(shown: Shown) -> Beginning:
+    keypoints, camera, depths = shown.view.keypoints, shown.camera, shown.depths
+    assert keypoints is not None
+    begun = start_from_keypoints(
+        shown.model, camera, Subject(0, keypoints, {}), upright=shown.upright, depths=depths
+    )
+    more = [lifted_poses(begun.body, camera, keypoints)]
+    if shown.prediction is not None:
+        more.append(shown.prediction.seen_as(begun.body).means)
+    poses = [moved_to_depth(begun.body, camera, x, depths) for x in more]
+    own = with_reversals(begun.body, begun.poses)
+    return Beginning(Source.KEYPOINTS, begun.body, np.concatenate([own, *poses]))
+
+
+def _from_prediction(shown: Shown) -> Beginning:
+    assert shown.prediction is not None
+    body = shown.prediction.body
+    both = _mixture_at(shown.prediction.both_ways(body), body, shown.camera, shown.depths)
+    return Beginning(Source.PREDICTION, body, both)
+
+
+def _from_box(shown: Shown) -> Beginning:
+    assert shown.box is not None
+    mixture = mixture_from_box(shown.model, shown.camera, shown.box)
+    start = _mixture_at(mixture, shown.model, shown.camera, shown.depths)
+    return Beginning(Source.BOX, shown.model, start)
+
+
+def _from_mask(shown: Shown) -> Beginning | None:
+    outline, camera = shown.observed().outline, shown.camera
     if outline is None:
         return None
-    outlined = moved_to_depth(model, camera, poses_from_outline(model, camera, outline), depths)
-    return Beginning(Source.MASK, model, outlined)
+    poses = poses_from_outline(shown.model, camera, outline)
+    return Beginning(
+        Source.MASK, shown.model, moved_to_depth(shown.model, camera, poses, shown.depths)
+    )
+
+
+def _masked(shown: Shown) -> bool:
+    silhouette = shown.view.silhouette
+    return shown.masked and silhouette is not None and looks_like_person(silhouette)
+
+
+class StartKind(NamedTuple):
+    """A row of the table.
+
+    Attributes:
+        needs: whether an image has what it takes.
+        sure: how sure it is that somebody is there, beside the evidence for existence, nats.
+        begin: makes the start; None: the image does not show it after all.
+    """
+
+    needs: Callable[[Shown], bool]
+    sure: float
+    begin: Callable[[Shown], Beginning | None]
+
+
+STARTS = (
+    StartKind(
+        lambda x: isinstance(x.given, Subject) and x.box is None and x.stamp >= x.given.stamp_ns,
+        math.inf,
+        _from_subject,
+    ),
+    StartKind(
+        lambda x: isinstance(x.given, GaussianMixture) and x.box is None, math.inf, _from_mixture
+    ),
+    StartKind(lambda x: suffices(x.view.keypoints, x.model), 0.0, _from_keypoints),
+    StartKind(lambda x: x.prediction is not None, AT_ONCE, _from_prediction),
+    StartKind(lambda x: shows_a_part(x.view.keypoints, x.model), 0.0, _from_keypoints),
+    StartKind(lambda x: x.box is not None, math.inf, _from_box),
+    StartKind(_masked, 0.0, _from_mask),
+)
+
+
+def first_start(shown: Shown, existence: Existence) -> Beginning | None:
+    """The start of the track at an image; None: it does not start there."""
+    awaited = shown.given is not None and shown.box is None
+    kinds = (
+        kind for kind in STARTS if kind.needs(shown) and (kind.sure == math.inf or not awaited)
+    )
+    kind = next(kinds, None)
+    if kind is None:
+        return None
+    sure = math.inf if shown.box is not None else kind.sure
+    log_odds = existence.log_odds + sure
+    if log_odds < PRESENT_LOG_ODDS or (not sure and existence.llr <= 0.0):
+        return None
+    begun = kind.begin(shown)
+    if begun is not None:
+        log_odds += log_prior_of_distance(shown.camera, float(begun.best[0, 2]))
+    return begun if log_odds >= PRESENT_LOG_ODDS else None
+
+
+def log_prior_of_distance(camera: Camera, distance: float) -> float:
+    """How usual it is that a camera sees a person at a distance, m, in nats below the most usual.
+
+    Log-normal, and wide: it is a prior, and limits nothing.
+    """
+    lens = camera.fx / (0.5 * camera.width / math.tan(0.5 * LENS))
+    middle, sigma = math.sqrt(NEAREST * FARTHEST), math.log(FARTHEST / NEAREST) / 4.0
+    return -0.5 * (math.log(max(distance, 1e-3) / (lens * middle)) / sigma) ** 2
 
 
 def lifted_poses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:

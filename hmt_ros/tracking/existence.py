@@ -139,6 +139,12 @@ class Existence:
         return sum(self.said.values())
 
     @property
+    def log_odds(self) -> float:
+        """Of somebody in view, nats."""
+        nobody, somebody = np.log(np.maximum(self._p, 1e-300))
+        return float(somebody - nobody)
+
+    @property
     def told(self) -> bool:
         """Whether any cue has spoken."""
         return bool(self._asked)

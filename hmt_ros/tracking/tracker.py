@@ -34,8 +34,9 @@ from hmt_ros.tracking.beginning import (
     FROM_JOINTS,
     FROM_SILHOUETTES,
     Beginning,
+    Shown,
     Source,
-    Starts,
+    first_start,
     poses_to_search,
 )
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
@@ -112,7 +113,9 @@ class Tracker:
         self.track_id = 0
         self.started_from: Source | None = None
         self._seed = seed
-        self._starts = Starts(body, camera)
+        # What the track starts from, and where the person is in the next image.
+        self._given: Subject | GaussianMixture | None = None
+        self._box: Box | None = None
         self._extra = tuple(extra)
         self._ground = GroundEstimator(known_ground)
         self._track = self._new_track(body)
@@ -153,8 +156,8 @@ class Tracker:
         if box is not None:
             check_box(box, self.camera)
         if start is not None:
-            self._starts.given = start
-        self._starts.box = box
+            self._given = start
+        self._box = box
         self._drop_track()
         self._existence, self._nobody = Existence(), False
         self._last_stamp = None
@@ -534,7 +537,7 @@ class Tracker:
             waiting=True,
         )
         somebody = self._existence.somebody and self._existence.llr > 0.0
-        if self._nobody and self._starts.box is None:
+        if self._nobody and self._box is None:
             observation = self._observe(view, None)
             poses = self._poses_to_search(observation, prediction) if somebody else None
             if poses is None:
@@ -545,12 +548,13 @@ class Tracker:
             arrived = Beginning(Source.ARRIVAL, self.body, poses)
             self._begin(near, arrived, stamp)
         else:
-            beginning = self._starts.first(
-                view, stamp, self.body, self._gravity, prediction,
-                lambda: self._observe(view, None), masked=masked, somebody=somebody,
+            shown = Shown(
+                view, stamp, self.model, self.body, self.camera, self._gravity, self._given,
+                self._box, prediction, masked, lambda: self._observe(view, None),
             )  # fmt: skip
+            beginning = first_start(shown, self._existence)
             if beginning is None:
-                if self._starts.given is not None or self._existence.llr <= 0.0:
+                if self._given is not None or self._existence.llr <= 0.0:
                     said = self._existence.said.get('detector', 0.0)
                     if masked and view.silhouette is not None:
                         said = 1.0 if view.silhouette.any() else -1.0
@@ -576,7 +580,7 @@ class Tracker:
                 self._existence.learn(view, stamp, self.body, self.camera, pose)
                 self._existence.look(view, stamp, self.body)
         self.track_id += 1
-        self._starts.box, self._nobody = None, False
+        self._box, self._nobody = None, False
         return observation
 
     def _expected(self, stamp: int) -> GaussianMixture:

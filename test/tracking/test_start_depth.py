@@ -15,7 +15,8 @@ from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_frames, sensed_depth
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.beginning import Starts
+from hmt_ros.tracking.beginning import Shown, first_start
+from hmt_ros.tracking.existence import Existence
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.start_depth import depths_of, joint_depths, moved_to_depth
@@ -120,18 +121,20 @@ def test_poses_move_along_their_rays(tall, camera):
     assert np.array_equal(moved_to_depth(body, camera, beside, depths_of(depths[0])), beside)
 
 
+def shown(view, stamp, model, camera, given=None, box=None):
+    """An image without any other input."""
+    return Shown(view, stamp, model, model, camera, None, given, box, None, False, lambda: None)
+
+
 def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
     body, poses, images, depths, _ = tall
     pixels = camera.project(body.joint_positions(poses[:1]))[0]
     model = load_body('human37')
-    starts = Starts(model, camera)
-    starts.box = (*pixels.min(0), *pixels.max(0))
+    box = (*pixels.min(0), *pixels.max(0))
     found = {}
     for name, depth in (('with', depths[0]), ('without', None)):
         view = View(images[0], depth=depth)
-        beginning = starts.first(
-            view, 0, model, None, None, lambda: None, masked=False, somebody=True
-        )
+        beginning = first_start(shown(view, 0, model, camera, box=box), Existence())
         assert isinstance(beginning.start, GaussianMixture)
         found[name] = np.abs(beginning.start.means[:, 2] - poses[0, 2]).max()
     assert found['with'] < 0.18 < found['without']
@@ -141,12 +144,11 @@ def test_the_joints_of_an_older_image_are_not_looked_up_in_this_depth(tall, came
     """A person who was clicked in another image is elsewhere by now."""
     body, poses, images, depths, _ = tall
     model = load_body('human37')
-    starts = Starts(model, camera)
-    starts.given = subject_of(keypoints_of(body, poses[0], 1.0))
+    given = subject_of(keypoints_of(body, poses[0], 1.0))
     # A wall stands where the person was.
     view = View(images[0], depth=np.full_like(depths[0], 1.5))
     late, plain = (
-        starts.first(x, 900 * MS, model, None, None, lambda: None, masked=False, somebody=True)
+        first_start(shown(x, 900 * MS, model, camera, given=given), Existence())
         for x in (view, View(images[0]))
     )
     assert np.array_equal(late.best, plain.best)
