@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -107,23 +108,34 @@ def as_json(
     verticals: Mapping[str, GravityScores] | None = None,
 ) -> dict[str, Any]:
     """The object that `--json` prints."""
-    return {
-        'truth': truth.source,
-        'truth_frames': len(truth.joints),
-        'model_sigma_m': model_sigma,
-        'topics': {
-            name: {
-                'kind': topic.kind,
-                'missing': topic.missing,
-                'without_truth': topic.without_truth,
-                'note': topic.note,
-                **topic.scores.summary(),
-                **({} if topic.ground is None else {'feet': topic.ground.summary()}),
-            }
-            for name, topic in found.items()
-        },
-        'gravity': {name: scores.summary() for name, scores in (verticals or {}).items()},
-    }
+    return _finite(
+        {
+            'truth': truth.source,
+            'truth_frames': len(truth.joints),
+            'model_sigma_m': model_sigma,
+            'topics': {
+                name: {
+                    'kind': topic.kind,
+                    'missing': topic.missing,
+                    'without_truth': topic.without_truth,
+                    'note': topic.note,
+                    **topic.scores.summary(),
+                    **({} if topic.ground is None else {'feet': topic.ground.summary()}),
+                }
+                for name, topic in found.items()
+            },
+            'gravity': {name: scores.summary() for name, scores in (verticals or {}).items()},
+        }
+    )
+
+
+def _finite(value: Any) -> Any:
+    """The value with None for the numbers that JSON does not have: infinity and NaN."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def as_text(
@@ -274,7 +286,11 @@ def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
         for topic in bag.topics.values()
         if topic.msgtype == TRAJECTORY_MIXTURE and topic.message_count
     ]
-    present = [*poses, *trajectories]
+    present = [*poses, *trajectories] or [
+        topic.name  # of images without anybody
+        for topic in bag.topics.values()
+        if topic.msgtype == POSE_MIXTURE and not topic.message_count
+    ]
     chosen = [bag.topic(name).name for name in wanted] or present
     for name in chosen:
         if name not in present:

@@ -330,9 +330,11 @@ def _topic(bag: BagReader, wanted: str | None) -> str:
             raise ValueError(f'{bag.path} has several motions: --topic one of {named}')
         if kind in kinds:
             return kinds[kind][0]
+    tracked = any(topic.msgtype == POSE_MIXTURE for topic in bag.topics.values())
+    nothing = 'nobody is found in its images' if tracked else 'it has no mixtures over poses'
     raise ValueError(
         f'{bag.path} has no smoothed poses, no posterior and no predictions: '
-        + (f'--topic one of {named}' if named else 'it has no mixtures over poses')
+        + (f'--topic one of {named}' if named else nothing)
     )
 
 

@@ -33,10 +33,12 @@ from hmt_ros.experts.lifted_fit import lift_poses
 from hmt_ros.experts.lifter import SHIPPED, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.error_model import seconds
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.camera_session import CAMERA_INFO, FRAME_ID
 from hmt_ros.sessions.image_inputs import PREDICTION
 from hmt_ros.tracking import read_subject
+from hmt_ros.tracking.existence import SAME_PERSON
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
@@ -139,7 +141,8 @@ def _lift(arguments: argparse.Namespace) -> int:
     camera = camera_of(arguments, size, partial(tell_user, 'lift'))
     times, seen = _chosen(found, arguments.person, arguments.fps)
     stamps = [arguments.first_stamp + time for time in times]
-    if not any(len(one.names) for one in seen):
+    nobody = not any(len(one.names) for one in seen)
+    if nobody and (not seen or any(found.persons())):
         raise ValueError(f'{arguments.keypoints}: no keypoints of the chosen person; see --person')
     gravity, body, ups = gravity_of(arguments), _body(camera, arguments), None
     if gravity is not None:
@@ -150,17 +153,22 @@ def _lift(arguments: argparse.Namespace) -> int:
             lengths_known=arguments.subject is not None, causal=arguments.causal,
             scheme=arguments.scheme,
         )  # fmt: skip
-    if all(one is None for one in mixtures):
+    if all(one is None for one in mixtures) and not nobody:
         raise ValueError(
             f'{arguments.keypoints}: no image shows five landmarks that are known; see --scheme'
         )
     folder.mkdir(parents=True, exist_ok=True)
     messages = RosbagsMessages()
     with BagWriter(folder / LIFTED, overwrite=arguments.overwrite) as bag:
+        track, met = 1, stamps[0]
         for stamp, mixture in zip(stamps, mixtures, strict=True):
+            track += SAME_PERSON.transition(seconds(stamp - met))[1, 1] < 0.5
+            met = met if mixture is None else stamp
             info = camera_info_message(messages, camera, stamp, FRAME_ID)
             bag.write(CAMERA_INFO, stamp, info)
-            content = PoseMixture.of_body(body, mixture, MixtureKind.PREDICTION, stamp, FRAME_ID)
+            content = PoseMixture.of_body(
+                body, mixture, MixtureKind.PREDICTION, stamp, FRAME_ID, track_id=track
+            )
             bag.write(PREDICTION, stamp, pose_mixture_message(messages, content))
     options = ReportOptions(
         folder / LIFTED, folder / REPORT, overwrite=arguments.overwrite, quiet=quiet,

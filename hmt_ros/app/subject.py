@@ -20,6 +20,7 @@ from hmt_ros.body import Body, load_body
 from hmt_ros.image.keypoint_schemes import landmarks_of
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagReader
+from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.keypoints import keypoints_of
 
@@ -142,9 +143,7 @@ def find_start(
         for stored in with_progress(messages, str(path), 'messages', topic.message_count):
             stamp = time_ns(stored.message.header.stamp)
             first = stamp if first is None else first
-            names = stored.message.names
-            keypoints = keypoints_of(stored.message, LEAST_SIGMA) if len(names) else None
-            seen = Seen(stamp, joints_of(keypoints, body))
+            seen = Seen(stamp, joints_of(keypoints_of(stored.message, LEAST_SIGMA), body))
             if stamp_ns is not None or time is not None:
                 at = stamp_ns if stamp_ns is not None else first + round((time or 0) * SECOND_NS)
                 if nearest is None or abs(stamp - at) < abs(nearest.stamp_ns - at):
@@ -168,15 +167,12 @@ def find_start(
     return chosen
 
 
-def joints_of(keypoints: Keypoints | None, body: Body) -> Keypoints:
+def joints_of(keypoints: Keypoints, body: Body) -> Keypoints:
     """The joints of a body at which confident landmarks lie, under the names of the body.
 
     A landmark that has the name of the joint stands for it; if the detector has none of that name,
     the mean of those at the joint does, as of the fingers for the hand.
     """
-    empty = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
-    if keypoints is None:
-        return empty
     names, known = keypoints.names, body.joint_names
     sure = keypoints.seen & (keypoints.confidences >= CONFIDENT)
     places: dict[str, list[int]] = {}
@@ -187,7 +183,7 @@ def joints_of(keypoints: Keypoints | None, body: Body) -> Keypoints:
         if sure[i] and joint in known and stands_for_it and not beside_it:
             places.setdefault(joint, []).append(i)
     if not places:
-        return empty
+        return NO_KEYPOINTS
     pixels = np.array([keypoints.pixels[i].mean(0) for i in places.values()])
     covariances = np.array([keypoints.covariances[i].mean(0) for i in places.values()])
     confidences = np.array([keypoints.confidences[i].mean() for i in places.values()])

@@ -129,12 +129,18 @@ def _track(arguments: argparse.Namespace) -> int:
     video, start = folder / VIDEO, folder / SUBJECT
     imported = import_video(ImportOptions.of(arguments, video), tell)
     say(f'{video}: {imported}')
+    subject = arguments.subject
     if stature is not None:
-        seen = find_start(video, load_body('human37'))
-        start.write_text(subject_text(seen, stature=stature), encoding='utf-8')
-        say(f'{start}: {len(seen.joints.names)} joints at {seen.stamp_ns} ns')
+        try:
+            seen = find_start(video, load_body('human37'))
+        except ValueError as error:
+            tell(f'{error}: --stature is not used')
+        else:
+            subject = start
+            start.write_text(subject_text(seen, stature=stature), encoding='utf-8')
+            say(f'{start}: {len(seen.joints.names)} joints at {seen.stamp_ns} ns')
     options = ReplayOptions(
-        overwrite=overwrite, quiet=quiet, subject=arguments.subject if stature is None else start,
+        overwrite=overwrite, quiet=quiet, subject=subject,
         background=arguments.background, seed=arguments.seed,
         settings=[*settings, *_of_gravity(arguments), *arguments.settings],
     )  # fmt: skip

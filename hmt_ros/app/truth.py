@@ -23,9 +23,10 @@ def read_truth(path: Path) -> Truth:
     """Truth from a file of arrays (.npz) or from a bag.
 
     The file has `stamps` (T,) ns, `joint_names` (J,) and `joints` (T, J, 3) m in the camera optical
-    frame. It may have the true floor: `gravity` (T, 3) and `camera_height` (T,) m, and with them
-    `contact` (T, 2) of the left and right foot, and the pose of a camera that moves in the world:
-    `camera_position` (T, 3) m and `camera_quaternion` (T, 4) x y z w.
+    frame, all NaN where nobody is in view. It may have the true floor: `gravity` (T, 3) and
+    `camera_height` (T,) m, and with them `contact` (T, 2) of the left and right foot, and the pose
+    of a camera that moves in the world: `camera_position` (T, 3) m and `camera_quaternion` (T, 4)
+    x y z w.
 
     Raises:
         ValueError: another file, arrays that are missing or do not fit each other.
@@ -69,7 +70,8 @@ def _from_arrays(path: Path) -> Truth:
         raise ValueError(f'{path}: joints must be numbers (T, J, 3), saw {joints.shape}')
     if len(stamps) != len(joints):
         raise ValueError(f'{path}: {len(stamps)} stamps for {len(joints)} frames of joints')
-    frames = {int(t): x.astype(np.float64) for t, x in zip(stamps, joints, strict=True)}
+    pairs = zip(stamps, joints.astype(np.float64), strict=True)
+    frames = {int(t): x for t, x in pairs if not np.isnan(x).all()}
     ground = _ground(path, content, stamps)
     return Truth(str(path), tuple(str(name) for name in np.ravel(names)), frames, ground=ground)
 
@@ -137,10 +139,9 @@ def _truth_of(bag: BagReader, topic: str) -> Truth:
     for stored in bag.messages([topic]):
         try:
             content = pose_mixture_of(stored.message, None, names)
-            if not len(content.weights):
-                raise MessageError('mixture has no components')
         except MessageError as error:
             raise ValueError(f'{source}: message at {stored.log_time_ns} ns: {error}') from error
         names, frame_id = content.joint_names, frame_id or content.frame_id
-        joints[content.stamp_ns] = content.joint_positions[0]
+        if len(content.weights):
+            joints[content.stamp_ns] = content.joint_positions[0]
     return Truth(source, names or (), joints, frame_id)

@@ -220,8 +220,19 @@ class Scores:
 
         return Scores(parts[0].names, *(joined(field.name) for field in fields(Scores)[1:]))
 
+    @staticmethod
+    def of_nobody(names: Sequence[str], frames: int = 0) -> Scores:
+        """Scores of frames without an estimate: NaN."""
+        errors, each = np.full((frames, len(names)), np.nan), np.full(frames, np.nan)
+        return Scores(tuple(names), errors, errors, errors, each, each, None, None, None)
+
     def summary(self) -> dict[str, Any]:
-        """Means over the frames, errors in mm; None for scores that need unknown covariances."""
+        """Means over the frames, errors in mm; None for scores that need unknown covariances.
+
+        They are NaN where there are no frames.
+        """
+        if not len(self):
+            return self.of_nobody(self.names, 1).summary() | {'frames': 0}
         errors = {
             key: 1e3 * value.mean(1)
             for key, value in (

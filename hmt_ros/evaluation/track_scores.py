@@ -193,11 +193,13 @@ class TrackScorer:
         """All scores.
 
         Raises:
-            ValueError: no frame has a truth, or see `take`.
+            ValueError: no estimate has a truth, or see `take`.
         """
         for stamp in sorted(self._window):
             self.take(self._window[stamp])
         self._score_waiting()
+        if not self._parts and not self._without_truth:
+            self._parts.append(Scores.of_nobody(self._joints))
         if not self._parts:
             raise ValueError(
                 f'no stamp of {self.name} is among those of {self.truth.source}, '

@@ -98,7 +98,7 @@ def _read_depth(message: Any, stamp: int) -> Any:
 
 
 def _read_positions(message: Any, _stamp: int) -> Any:
-    return positions_of(message) if len(message.names) else None
+    return positions_of(message)
 
 
 MASK_INPUT = ImageInput(

@@ -160,7 +160,7 @@ class KeypointReader:
         sigma_px: float,
     ) -> Keypoints | None:  # fmt: skip
         if self._source == OWN_KEYPOINTS:
-            return keypoints_of(message, sigma_px) if len(message.names) else None
+            return keypoints_of(message, sigma_px)
         try:
             if self._source == 'skeleton2d':
                 if camera is None:
@@ -195,7 +195,7 @@ class KeypointReader:
         """
         if found is None or not found.names:
             return found
-        if positions is not None:
+        if positions is not None and positions.names:
             found = positions.added_to(found)
             if not set(positions.names) & set(found.names):
                 self._log.note(

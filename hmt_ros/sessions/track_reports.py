@@ -27,12 +27,14 @@ class TrackCondition(NamedTuple):
             wanted: keypoints track the person without.
         moved: whether the camera has moved since the background was taken.
         contradicted: whether the lines of the scene contradict the gravity that is given.
+        track_id: number of the track.
     """
 
     status: Status = Status.WAITING
     doubted: bool = False
     moved: bool = False
     contradicted: bool = False
+    track_id: int = 0
 
     @classmethod
     def of(cls, tracker: Tracker | None) -> TrackCondition:
@@ -47,6 +49,7 @@ class TrackCondition(NamedTuple):
             and tracker.started_from is not Source.KEYPOINTS,
             silhouettes.watch.moved,
             tracker.gravity_contradicted,
+            tracker.track_id,
         )
 
 
@@ -84,13 +87,14 @@ def report_change(
             'camera is mounted',
             warn=True,
         )
-    if now.status is not before.status:
-        _report_status(log, before.status, tracker, initial, stamp_ns)
+    newer = now.track_id != before.track_id and now.status is Status.TRACKING
+    if newer or now.status is not before.status:
+        _report_status(log, before, tracker, initial, stamp_ns)
 
 
 def _report_status(
     log: HandlingLog,
-    before: Status,
+    before: TrackCondition,
     tracker: Tracker,
     initial: Subject | GaussianMixture | None,
     stamp_ns: int,
@@ -99,12 +103,14 @@ def _report_status(
     at = f'at the image of {stamp_ns} ns'
     if now is Status.NOBODY:
         log.tell(f'nobody in view {at}: {track} ends, another starts when somebody comes')
-    elif before is Status.LOST:
+    elif now is Status.WAITING:
+        log.tell(f'{track} ends {at}: whoever is there may be somebody else')
+    elif tracker.track_id == before.track_id and before.status is Status.LOST:
         log.tell(f'{track} is found again {at}')
-    elif before is not Status.TRACKING:
+    elif tracker.track_id != before.track_id:
         origin = 'what was given' if tracker.started_from is None else tracker.started_from.value
         log.tell(f'{track} starts from {origin} {at}')
-        if isinstance(initial, Subject) and before is Status.WAITING:
+        if isinstance(initial, Subject) and before.status is Status.WAITING:
             _report_age(log, stamp_ns - initial.stamp_ns)
     if now is Status.LOST:
         log.note(

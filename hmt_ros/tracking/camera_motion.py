@@ -205,14 +205,11 @@ class CameraPath:
             if not before:
                 return None
             return CameraMotion.between(_pose_at(before[0], (stamp, pose), last), pose)
-        self.known = len(self._given) == 2 and self._is_near(stamp)
+        self.known = len(self._given) == 2 and seconds(stamp - self._given[-1][0]) <= LONGEST_GUESS
         if not self.known:
             return None
         first, second = self._given
         return CameraMotion.between(_pose_at(first, second, last), _pose_at(first, second, stamp))
-
-    def _is_near(self, stamp: int) -> bool:
-        return seconds(stamp - self._given[-1][0]) <= LONGEST_GUESS
 
 
 def _pose_at(

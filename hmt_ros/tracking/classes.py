@@ -60,9 +60,8 @@ class Facing:
         A way is lost if it has no mode, or none that the odds could make up for.
         """
         back = self.back
-        if not back.any() or back.all():
-            return True
-        return bool(log_weights[back].max() > log_weights[~back].max() + MOST)
+        one_way = not back.any() or back.all()
+        return bool(one_way or log_weights[back].max() > log_weights[~back].max() + MOST)
 
     def lead(self, body: Body, poses: Array) -> None:
         """Makes the first of the modes, poses (K, d), the reference for the facing direction."""

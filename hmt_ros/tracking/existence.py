@@ -53,6 +53,8 @@ from hmt_ros.tracking.view import View
 # Rates at which somebody comes into an empty view, and leaves it, per second.
 BIRTH, LEAVING = 0.1, 0.2
 CHAIN = MarkovChain.of_two(BIRTH, LEAVING)
+# Whether who comes is who was seen last: another takes the place once in so many seconds, unseen.
+SAME_PERSON = MarkovChain.of_two(0.0, 1.0 / 3600.0)
 # Above the first probability somebody is there, and a new track may start; below the second nobody
 # is, if the image says so. Between them it is undecided.
 PRESENT, ABSENT = 0.85, 0.03
@@ -111,6 +113,7 @@ class Existence:
         seen: whether the last image shows a filter something to follow: a cue shows somebody, or
             none shows nobody and the image can be used.
         hidden: whether others hid most of the person in the last image.
+        met: stamp of the last image that showed the person, ns; None: nobody is known.
         elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
             of no use: the track has to search.
     """
@@ -119,6 +122,7 @@ class Existence:
         self._p = np.array([1.0 - probability, probability])
         self.said: dict[str, float] = {}
         self.seen = self.hidden = self.elsewhere = False
+        self.met: int | None = None
         self._stamps: tuple[int, int] | None = None  # of the first and of the last image
         self._asked: dict[str, int] = {}  # when each cue spoke last
         self._appearance = Appearance()
@@ -161,6 +165,7 @@ class Existence:
 
     def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
         """Learns the appearance from the last image, in which the person is at a pose (d,)."""
+        self.met = stamp
         self._appearance.learn(view, stamp, body, camera, pose)
 
     def look(self, view: View, stamp: int, body: Body, *, waiting: bool = False) -> None:

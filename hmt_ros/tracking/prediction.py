@@ -31,9 +31,8 @@ from hmt_ros.tracking.posterior import Posterior
 
 def dynamics_of(body: Body, motion: str) -> LinearGaussianDynamics:
     """The dynamics of the poses of a body, by the setting `motion`."""
-    if motion == 'learned':
-        return motion_prior(body)
-    return LinearGaussianDynamics.random_walk(body.rates)
+    learned = motion == 'learned'
+    return motion_prior(body) if learned else LinearGaussianDynamics.random_walk(body.rates)
 
 
 def predict(

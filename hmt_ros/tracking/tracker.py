@@ -4,6 +4,7 @@
     TRACKING           -> (no image says where)            ->  LOST
     LOST               -> (found again)                    ->  TRACKING
     TRACKING or LOST   -> (an image says: nobody is there) ->  NOBODY
+    TRACKING or LOST   -> (not seen for an hour)           ->  WAITING, for anybody
 
 The tracker knows images, background, starts and existence; a `MixtureFilter` knows the person and
 carries the mixture.
@@ -39,7 +40,7 @@ from hmt_ros.tracking.beginning import (
     poses_to_search,
 )
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
-from hmt_ros.tracking.existence import GIVEN, Existence, Status
+from hmt_ros.tracking.existence import GIVEN, SAME_PERSON, Existence, Status
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.ground import Gravity, Ground, GroundEstimator, KnownGround, unit_vector
 from hmt_ros.tracking.hypotheses import LIKELY, Modes
@@ -243,7 +244,7 @@ class Tracker:
     @property
     def status(self) -> Status:
         """State of the tracker."""
-        if self._nobody:
+        if self._nobody and (self._existence.nobody or self._existence.met is not None):
             return Status.NOBODY
         if not self._track.begun:
             return Status.WAITING
@@ -406,8 +407,7 @@ class Tracker:
 
         They are unknown in the first image of a track, and where poses walk randomly.
         """
-        velocities = self.modes.velocities
-        return velocities if velocities.any() else None
+        return self.modes.velocities if self.modes.velocities.any() else None
 
     @property
     def posterior(self) -> GaussianMixture:
@@ -437,8 +437,7 @@ class Tracker:
         opinions = []
         if self._lifter is not None:
             self._seen.add(keypoints, seconds(stamp))
-            begun = self._track.begun
-            person = self._lifter.proportions(self.body) if begun else None
+            person = self._lifter.proportions(self.body) if self._track.begun else None
             opinions.append(self._seen.lift(self._lifter, self.vertical, person))
         if keypoints.positions is not None:
             opinions.append(lifted_positions(self.camera, keypoints))
@@ -456,9 +455,9 @@ class Tracker:
             body, self.camera, self.settings, self._seed, self._extra, self._ground
         )
 
-    def _drop_track(self) -> None:
-        """Keeps nothing but the body."""
-        self._track = self._new_track(self.body)
+    def _drop_track(self, body: Body | None = None) -> None:
+        """Keeps nothing but the body, or takes another one."""
+        self._track = self._new_track(body or self.body)
         self._point = PointEstimate()
         self._ground.reset()
         self._observer.last_image, self._followed = None, None
@@ -469,6 +468,13 @@ class Tracker:
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """See `step`."""
         masked, existence, self._foreseen = mask is not None, self._existence, False
+        if (
+            existence.met is not None
+            and SAME_PERSON.transition(seconds(stamp - existence.met))[1, 1] < 0.5
+        ):
+            # Whoever comes now is somebody else, of whom nothing is known.
+            self._drop_track(self.model)
+            self._nobody, existence.met = True, None
         if self._track.begun:
             existence.look(view, stamp, self.body)
             if existence.nobody:

@@ -2,6 +2,7 @@
 
 A keypoint is not seen if its confidence is 0, if its position is not a number, or if it lies at
 (0, 0) in the image, where detectors put missing keypoints. Its other fields then do not matter.
+A message without names says that nobody was seen; it has no keypoints.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
 
     Returns:
         The keypoints; those that were not seen have NaN as pixels, and confidence 0. Unknown
-        covariances are NaN.
+        covariances are NaN. None at all where nobody was seen.
 
     Raises:
         MessageError: a name twice, arrays whose lengths contradict each other, a position of which
@@ -111,7 +112,7 @@ def positions_of(message: Any) -> Positions:
     """The content of an hmt_msgs/Keypoints3D, of `rosbags` or of ROS.
 
     A landmark has a position unless its confidence is 0; higher confidences all count the same
-    here.
+    here. There are no landmarks where nobody was seen.
 
     Raises:
         MessageError: as `keypoints_of`.
@@ -171,10 +172,7 @@ def positions_message(
 def _names(values: Sequence[str], what: str) -> tuple[str, ...]:
     if len(values) > MAX_KEYPOINTS:
         raise MessageError(f'{what} has {len(values)} names, the limit is {MAX_KEYPOINTS}')
-    names = names_of(values, what)
-    if not names:
-        raise MessageError(f'{what} has no names')
-    return names
+    return names_of(values, what)
 
 
 def _columns(fields: Sequence[Any], symbols: str, n: int, what: str) -> Array:

@@ -13,7 +13,7 @@ from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, joint_mixtures, score
 from hmt_ros.inference import GaussianMixture
-from msg_tools import BagWriter, RosbagsMessages
+from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.ground import GroundState, ground_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
@@ -277,6 +277,38 @@ def test_predictions_without_anybody_are_missing(capsys, tmp_path, body, mixture
     found = report(capsys, path, '--truth', truth_file)['topics']['/pose_prediction']
     assert (found['frames'], found['missing']) == (FRAMES - 2, 2)
     assert found['coverage_90'] is not None
+
+
+def test_a_bag_of_nobody_and_a_truth_without_anybody(
+    capsys, tmp_path, bag, body, poses, mixtures, truth_file
+):
+    empty = write(tmp_path / 'none', body, mixtures, change=without_components)
+    found = report(capsys, empty, '--truth', truth_file)['topics']['/pose_mixture']
+    assert (found['frames'], found['missing']) == (0, FRAMES)
+    assert found['best_mm'] is None
+    assert found['by_joint']['neck']['best_mm'] is None
+    assert run(capsys, empty, '--truth', truth_file)[0] == 0
+    # Nobody is in view at the first two times.
+    joints = body.joint_positions(poses)
+    joints[:2] = np.nan
+    late = save(
+        tmp_path / 'late.npz', stamps=STAMPS, joint_names=np.array(body.joint_names), joints=joints
+    )
+    found = report(capsys, bag, '--truth', late)
+    assert found['truth_frames'] == FRAMES - 2
+    assert found['topics']['/pose_mixture']['without_truth'] == 2
+    known = write(tmp_path / 'known', body, mixtures, poses=poses)
+    with BagReader(known) as source, BagWriter(tmp_path / 'truth') as out:
+        for i, stored in enumerate(source.messages(['ground_truth'])):
+            out.write('ground_truth', stored.log_time_ns, (
+                without_components(stored.message) if i < 2 else stored.message
+            ))  # fmt: skip
+    assert report(capsys, bag, '--truth', tmp_path / 'truth')['truth_frames'] == FRAMES - 2
+
+
+def without_components(message):
+    message.components = []
+    return message
 
 
 def test_the_body_may_change_on_the_way(capsys, tmp_path, body, poses, truth_file):

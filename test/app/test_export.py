@@ -17,6 +17,7 @@ from hmt_ros.motion.motion_file import read_motion
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.ground import GroundState, ground_message
 from msg_tools.messages.pose_mixtures import (
+    POSE_MIXTURE,
     MixtureKind,
     PoseMixture,
     pose_mixture_message,
@@ -331,6 +332,10 @@ def test_recordings_without_a_motion(made, body, poses, tmp_path, capsys):
     nobody = write_run(tmp_path / 'nobody', body, poses, empty)
     likely = write_run(tmp_path / 'likely', body, poses, STEPS, kind=MixtureKind.LIKELIHOOD)
     plain = write_run(tmp_path / 'plain', body, poses, [Step(x, identities=(0, 0)) for x in STAMPS])
+    unmet = tmp_path / 'unmet'
+    with BagWriter(unmet) as bag:
+        bag.add_topic('pose_mixture', POSE_MIXTURE)
+        bag.write('note', STAMPS[0], MESSAGES.create('std_msgs/msg/String', data='nobody came'))
     two = tmp_path / 'two'
     with BagWriter(two) as bag:
         for name in ('p1', 'p2'):
@@ -340,6 +345,7 @@ def test_recordings_without_a_motion(made, body, poses, tmp_path, capsys):
                 bag.write(f'{name}/smoothed', content.stamp_ns, message)
     for bag, options, said in (
         (nobody, [], r'nobody is seen in any mixture$'),
+        (unmet, [], r'no predictions: nobody is found in its images$'),
         (likely, [], r'no posterior and no predictions: --topic one of /likelihood$'),
         (made.images, [], r'it has no mixtures over poses$'),
         (plain, ['--identity', '1'], r'its modes have no identities$'),

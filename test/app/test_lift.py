@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from hmt_ros.app import lift
+from hmt_ros.app.export import read_tracked_motion
 from hmt_ros.app.rendered_bag import START_NS
 from hmt_ros.body import Camera, load_body
 from hmt_ros.experts.training_set import procedural_sequence
@@ -126,6 +127,32 @@ def test_bad_input_is_one_line(tmp_path, capsys, arguments, said):
     assert said in error
     assert error.count('\n') == 1
     assert not (tmp_path / 'out' / 'lifted').exists()
+
+
+def test_nobody_in_the_whole_file(tmp_path, capsys):
+    path = arrays(tmp_path / 'walk.npz', detected=np.zeros(6, dtype=bool))
+    assert lift.main([str(path), '-o', str(tmp_path / 'out'), *USUAL[:-1]]) == 0
+    told = capsys.readouterr().out
+    assert 'lifted: 6 images, 0 with a pose' in told
+    assert 'nobody is found at 6 of 6 times' in told
+    assert [len(one.weights) for one in mixtures(tmp_path / 'out')] == [0] * 6
+    assert (tmp_path / 'out' / 'report' / 'report.html').stat().st_size > 50_000
+
+
+def test_hours_without_anybody_begin_another_track(tmp_path, capsys):
+    pixels, sure = seen()
+    names = SCHEME.names
+    head = ','.join(f'{name}_{x}' for name in names for x in ('u', 'v', 'confidence'))
+    rows = [f'time_s,{head}']
+    for t, time in enumerate((0.0, 0.1, 60.0, 10_860.0, 10_860.1, 10_860.2)):
+        cells = np.concatenate([pixels[t], sure[t, :, None]], axis=1).ravel()
+        rows.append(','.join(f'{x:.6g}' for x in (time, *cells)))
+    path, out = tmp_path / 'walk.csv', tmp_path / 'out'
+    path.write_text('\n'.join(rows), 'utf-8')
+    assert lift.main([str(path), '-o', str(out), *USUAL]) == 0
+    assert [one.track_id for one in mixtures(out)] == [1, 1, 1, 2, 2, 2]
+    motion = read_tracked_motion(out / 'lifted', track=2)
+    assert np.allclose(motion.times, [0.0, 0.1, 0.2])
 
 
 def test_too_few_landmarks_are_told(tmp_path, capsys):

@@ -12,6 +12,7 @@ from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import load_body
 from hmt_ros.tracking import read_subject
+from test.app.conftest import data_of
 from test.test_docs import ROOT, commands
 
 
@@ -116,6 +117,33 @@ def test_gravity(walk_video, tmp_path, monkeypatch, capsys):
     both = ['--level', '--gravity', '0', '1', '0']
     assert run(walk_video, '-o', str(tmp_path / 'both'), *both) == 1
     assert 'not allowed with argument --level' in capsys.readouterr().err
+
+
+def video(path, pictures, fps=10.0):
+    kind = cv2.VideoWriter_fourcc(*'mp4v')
+    writer = cv2.VideoWriter(str(path), kind, fps, pictures[0].shape[1::-1])
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    return path
+
+
+def test_nobody_in_the_whole_video(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    pictures = list(rng.integers(0, 256, (3, 48, 64, 3), dtype=np.uint8))
+    source, out = video(tmp_path / 'empty.mp4', pictures), tmp_path / 'out'
+    (tmp_path / 'nobody.json').write_text('[]', 'utf-8')
+    arguments = [str(source), '-o', str(out), '--fov', '60', '--stature', '1.7']
+    assert track_video.main([*arguments, '--keypoints', str(tmp_path / 'nobody.json')]) == 0
+    told = capsys.readouterr()
+    assert 'tracked: 0 of 3 images tracked' in told.out
+    assert 'nobody is found at 3 of 3 times' in told.out
+    assert 'wanted 4 at least: --stature is not used' in told.err
+    assert 'nobody is found in its 3 images' in told.err
+    data = data_of((out / 'report' / 'report.html').read_text('utf-8'))
+    assert np.allclose(data['times'], [0.0, 0.1, 0.2])
+    assert (data['layers'], len(data['images']['jpegs'])) == ([], 3)
+    assert not (out / 'subject.yaml').exists()
 
 
 def test_without_options_the_detector_and_the_usual_lens_are_used(

@@ -64,6 +64,29 @@ def test_nobody_in_view_and_the_next_track_are_told_once(one, small_camera, stub
     assert [each.warnings for each in handled] == 6 * [()]
 
 
+def test_who_comes_after_hours_is_another_track(one, small_camera, stub_tracker, monkeypatch):
+    """In the first image that is tracked again, or later."""
+    step = stub_tracker.step
+
+    def patched(self, image, stamp, *arguments, **named):
+        found = step(self, image, stamp, *arguments, **named)
+        if stamp >= small_camera.stamp(3):
+            self.track_id = 2
+        if stamp == small_camera.stamp(5):
+            self.status, found = Status.WAITING, (None, None)
+        return found
+
+    monkeypatch.setattr(stub_tracker, 'step', patched)
+    handled = [one.take(IMAGE, small_camera.image(index)) for index in range(6)]
+    told = {index: each.events for index, each in enumerate(handled) if each.events}
+    assert sorted(told) == [0, 3, 5]
+    assert told[3][0].startswith('track 2 starts from ')
+    assert told[5] == (
+        f'track 2 ends at the image of {small_camera.stamp(5)} ns: whoever is there may be '
+        'somebody else',
+    )
+
+
 def test_a_moved_camera_is_told_once(one, small_camera, stub_tracker):
     one.take(IMAGE, small_camera.image(0))
     watch = stub_tracker.made[0].silhouettes.watch

@@ -14,7 +14,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render, render_frames
 from hmt_ros.rendering.scene import Scene
-from hmt_ros.tracking import PosePrediction, Status, Tracker, TrackerSettings
+from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker, TrackerSettings
 
 FRAME = 100_000_000  # ns
 SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, searched_chains=1, estimate_shape=False)
@@ -90,6 +90,42 @@ def test_a_person_leaves_and_returns(film, tracked, human32):
     assert tracker.body.segment_lengths == human32.segment_lengths
     # A silhouette alone does not tell the pose at once, but the place.
     assert np.abs(tracker.posterior.means[0, :3] - poses[9][:3]).max() < 0.3
+
+
+@pytest.mark.parametrize('evidence', ['silhouettes', 'keypoints'])
+def test_after_hours_somebody_else_comes(film, tracked, human32, keypoints_of, evidence):
+    """A minute without images does not end who somebody is; three hours do."""
+    poses, images, _ = film
+    long = dict(human32.segment_lengths) | {'thigh': 0.52}
+    subject = Subject(0, keypoints_of(human32, poses[0]), long)
+
+    def inputs(i):
+        by_keypoints = evidence == 'keypoints'
+        return {'keypoints': keypoints_of(human32, poses[i])} if by_keypoints else {}
+
+    for gap, wanted in ((60.0, 1), (10_800.0, 2)):
+        stamps = [0.0, 0.1, 0.2, *(gap + 0.1 * np.arange(4))]
+        statuses, tracks, components, tracker = tracked(
+            images[:7], inputs, evidence == 'silhouettes', start=subject, stamps=stamps
+        )
+        assert tracks == [1] * 3 + [wanted] * 4
+        assert statuses[-1] is TRACKING
+        assert min(components) > 0
+        kept = tracker.body.segment_lengths['thigh'] > human32.segment_lengths['thigh'] + 0.04
+        assert kept == (wanted == 1)
+
+
+def test_lengths_of_somebody_who_left_hours_ago(film, tracked, human32, keypoints_of):
+    long = dict(human32.segment_lengths) | {'thigh': 0.52}
+    subject = Subject(0, keypoints_of(human32, film[0][0]), long)
+    images = [*film[1][:3], *nothing(film, 'empty', 8), *film[1][:6]]
+    for hours in (0.0, 3.0):
+        stamps = [0.1 * i + (3600.0 * hours if i > 10 else 0.0) for i in range(len(images))]
+        statuses, tracks, _, tracker = tracked(images, start=subject, stamps=stamps)
+        assert statuses[10] is NOBODY
+        assert (statuses[-1], tracks[-1]) == (TRACKING, 2)
+        kept = tracker.body.segment_lengths['thigh'] > human32.segment_lengths['thigh'] + 0.04
+        assert kept == (hours == 0.0)
 
 
 @pytest.mark.parametrize('kind', ['black', 'noise', 'white'])

@@ -19,7 +19,14 @@ import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Masks, Selection, open_source
-from hmt_ros.app.import_video.keypoint_files import Choice, Chooser, FoundPersons, read_keypoints
+from hmt_ros.app.import_video.keypoint_files import (
+    LARGEST,
+    NEAREST,
+    Choice,
+    Chooser,
+    FoundPersons,
+    read_keypoints,
+)
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.body import Camera
@@ -262,7 +269,7 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
             )
         _check_ends(options, source, found, masks, tell)
         if found is not None:
-            _check_keypoints(options, result)
+            _check_keypoints(options, result, found, tell)
         if masks is not None and not result.with_masks:
             raise ValueError(
                 f'{options.masks}: no mask belongs to one of the {result.images} imported frames; '
@@ -405,7 +412,10 @@ def _check_ends(
     masks: Masks | None,
     tell: Tell,
 ) -> None:
-    """Whether frames, keypoints and masks are equally many, as far as the frames were read."""
+    """Whether frames, keypoints and masks are equally many, as far as the frames were read.
+
+    Those of frames that a truncated file has lost are left out.
+    """
     if not source.ended:
         return
     count, claimed = source.count, source.claimed
@@ -416,13 +426,13 @@ def _check_ends(
         )
     of_masks = -1 if masks is None else masks.last
     of_keypoints = -1 if found is None else found.last
-    if found is not None and found.rows is not None and found.rows != count:
+    if found is not None and found.rows not in (None, count, claimed):
         raise ValueError(
             f'{options.keypoints} has {found.rows} rows, but {source.path} has {count} frames; '
             'wanted one row for each frame'
         )
     for path, last in ((options.keypoints, of_keypoints), (options.masks, of_masks)):
-        if last >= count:
+        if last >= max(count, claimed):
             first = options.first_number
             raise ValueError(
                 f'{path} has frame {last + first}, but {source.path} has {count} frames, {first} '
@@ -431,13 +441,18 @@ def _check_ends(
             )
 
 
-def _check_keypoints(options: ImportOptions, result: Imported) -> None:
+def _check_keypoints(
+    options: ImportOptions, result: Imported, found: FoundPersons, tell: Tell
+) -> None:
     """Raises ValueError where keypoints are not those of the images."""
-    if not result.with_keypoints:
-        raise ValueError(
+    if not result.with_keypoints and any(found.persons()):
+        text = (
             f'{options.keypoints}: none of the {result.images} imported frames has keypoints of '
             'the chosen person; see --person and --first-number'
         )
+        if options.person.kind not in (LARGEST, NEAREST):
+            raise ValueError(text)
+        tell(text)
     if result.inside < _INSIDE * (result.inside + result.outside):
         raise ValueError(
             f'{options.keypoints}: {result.outside} of {result.inside + result.outside} keypoints '

@@ -239,10 +239,9 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
                 'folder of OpenPose, .npz or .csv'
             )
         farthest = max(
-            (float(np.nanmax(np.abs(x.keypoints.pixels))) for x in found.persons()), default=None
+            (float(np.nanmax(np.abs(x.keypoints.pixels))) for x in found.persons()),
+            default=_FARTHEST,
         )
-        if farthest is None:
-            raise ValueError('no keypoint was seen in any frame')
         if farthest > _FARTHEST:
             raise ValueError(f'a keypoint lies {farthest:g} px away, wanted places in an image')
         for names in {x.keypoints.names for x in found.persons()}:
@@ -331,11 +330,12 @@ def _openpose(path: Path, source: FrameSource) -> FoundPersons:
 def _arrays(path: Path) -> FoundPersons:
     """Row t of each array is frame t."""
     content = read_archive(path)
-    missing = [name for name in ('landmark_names', 'pixels') if name not in content]
-    if missing:
-        raise ValueError(f'no array {missing[0]}; wanted landmark_names and pixels')
-    names = tuple(str(x) for x in content['landmark_names'])
-    rows, n = len(content['pixels']), len(names)
+    if 'pixels' not in content:
+        raise ValueError('no array pixels; wanted pixels and landmark_names')
+    rows, size = len(content['pixels']), content['pixels'].size
+    given = content.get('landmark_names')
+    names = _names(size // max(2 * rows, 1)) if given is None else tuple(map(str, given))
+    n = len(names)
     shapes = {
         'pixels': (rows, n, 2),
         'visibility': (rows, n),

@@ -20,7 +20,7 @@ from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import Handled
-from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE
+from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, KEYPOINTS
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession
 from hmt_ros.sessions.track_start import prepare_start
@@ -108,7 +108,10 @@ def replay_bag(
             ):
                 result = _play(options, bag, recorded, track, out, behind, bar, tell)
             if not result.tracked:
-                raise ValueError(f'{source}: {_why_nothing(result, subject)}')
+                why = f'{source}: {_why_nothing(result, subject, KEYPOINTS in recorded.given)}'
+                if subject is not None or result.last_fault or not result.images:
+                    raise ValueError(why)
+                tell(why)
     return result
 
 
@@ -235,18 +238,18 @@ def _readable(
         yield found
 
 
-def _why_nothing(result: Replayed, subject: object) -> str:
+def _why_nothing(result: Replayed, subject: object, detected: bool) -> str:
     if isinstance(subject, Subject) and result.images and subject.stamp_ns > result.last_stamp:
         return (
             f'the joints of the subject file were seen at {subject.stamp_ns} ns, after the last '
             f'image, at {result.last_stamp} ns: is it the file of another bag?'
         )
     if subject is None and not result.last_fault:
-        return (
-            f'nobody is seen in its {result.images} images: give an image of the empty scene by '
-            '--background FILE, the joints of the person in one image by --subject FILE, or a '
-            'bag with keypoints'
+        remedy = (
+            ': give an image of the empty scene by --background FILE, the joints of the person in '
+            'one image by --subject FILE, or a bag with keypoints'
         )
+        return f'nobody is found in its {result.images} images{"" if detected else remedy}'
     why = f': {result.last_fault}' if result.last_fault else ''
     return f'none of its {result.images} images was tracked{why}'
 

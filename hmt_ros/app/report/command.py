@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -165,6 +166,10 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
     stamps = _shown(everything, options.times)
     mixtures = everything.at(stamps)
     notes = [*options.notes]
+    if everything.empty:
+        told = f'nobody is found at {len(everything.empty)} of {len(everything.stamps)} times'
+        why = Counter(everything.answered[stamp] for stamp in everything.empty).most_common(1)[0][0]
+        notes.append(f'{told}: {why}' if why else told)
     if len(stamps) < len(everything.stamps):
         notes.append(f'{len(stamps)} of {len(everything.stamps)} times are shown')
     notes += [
@@ -211,5 +216,5 @@ def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:
 def _shown(mixtures: RecordedMixtures, most: int) -> list[int]:
     """Times that are shown: all, or every n-th if the page would get too large."""
     stamps = mixtures.stamps
-    most = min(most, int(len(stamps) * min(DATA_BYTES / data_size(mixtures), 1.0)))
+    most = min(most, int(len(stamps) * min(DATA_BYTES / max(data_size(mixtures), 1), 1.0)))
     return stamps[:: -(-len(stamps) // max(most, 1))]

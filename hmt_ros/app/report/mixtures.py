@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -12,11 +13,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from hmt_ros.app.evaluate import chosen_topics
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
+from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics, topic_beside
 from hmt_ros.body import Body
 from hmt_ros.inference.arrays import Array
 from msg_tools import BagMessage, BagReader
 from msg_tools.messages.ground import GroundState
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.keep_out import KEEP_OUT, KeepOutState
 from msg_tools.messages.message_error import MessageError
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, PoseMixture, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
@@ -204,30 +207,40 @@ class RecordedMixtures:
     Attributes:
         layers: mixtures over poses, those of the posterior first.
         trajectories: mixtures over trajectories.
+        answered: by stamp of an image, ns, what is missing where no pose is known; '': nothing.
     """
 
     layers: list[Layer[Moment]]
     trajectories: list[Layer[Window]]
+    answered: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def stamps(self) -> list[int]:
-        """All times of poses and ends of windows, increasing; without poses all of the windows."""
-        stamps = {stamp for layer in self.layers for stamp in layer.mixtures}
+        """Times of images, poses and ends of windows, increasing; without poses all of windows."""
+        stamps = {*self.answered, *(stamp for layer in self.layers for stamp in layer.mixtures)}
         for layer in self.trajectories:
             stamps.update(layer.mixtures)
             if not self.layers:
                 stamps.update(stamp for one in layer.mixtures.values() for stamp in one.stamps_ns)
         return sorted(stamps)
 
+    @property
+    def empty(self) -> set[int]:
+        """Stamps of the images, ns, in which nobody is seen."""
+        windows = (one.stamps_ns for layer in self.trajectories for one in layer.mixtures.values())
+        return set(self.answered).difference(*(layer.mixtures for layer in self.layers), *windows)
+
     def at(self, stamps: Iterable[int]) -> RecordedMixtures:
         """The mixtures at some times only; the windows that end then, or else the last."""
         wanted = set(stamps)
+        layers = [layer.at(wanted) for layer in self.layers]
         return RecordedMixtures(
-            [layer.at(wanted) for layer in self.layers],
+            [layer for layer in layers if layer.mixtures],
             [
                 layer.at(wanted if wanted & layer.mixtures.keys() else {max(layer.mixtures)})
                 for layer in self.trajectories
             ],
+            {stamp: text for stamp, text in self.answered.items() if stamp in wanted},
         )
 
 
@@ -254,12 +267,17 @@ def read_mixtures(
     found: dict[str, Layer[Any]] = {}
     with BagReader(path) as bag:
         names = chosen_topics(bag, topics)
+        every = bag.messages(filter(None, [topic_beside(bag, KEEP_OUT, names[0])]))
+        told = (x.message for x in every if x.message.state != KeepOutState.STALE)
+        answered = {time_ns(x.header.stamp): str(getattr(x, 'reason', '')) for x in told}
         bodies = RecordedBodies(body_model)
         for stored in bag.messages([*body_topics(bag), *names]):
             if stored.msgtype == BODY:
                 bodies.learn(stored)
             else:
                 _take(found, stored, bodies, grounds or {})
+                if stored.msgtype == POSE_MIXTURE:
+                    answered.setdefault(time_ns(stored.message.header.stamp), '')
             if progress is not None:
                 progress(1)
     for name, layer in found.items():
@@ -267,11 +285,10 @@ def read_mixtures(
     layers = [found[name] for name in names if name in found]
     layers.sort(key=lambda layer: _ORDER.index(layer.kind))
     poses = [layer for layer in layers if layer.kind != _TRAJECTORIES]
-    result = RecordedMixtures(poses, layers[len(poses) :])
+    result = RecordedMixtures(poses, layers[len(poses) :], answered)
     if not result.stamps:
         raise ValueError(f'{path}: nobody is seen in any mixture on {", ".join(names)}')
-    first = layers[0]
-    for layer in layers:
+    for first, layer in pairwise(layers):
         if layer.frame_id != first.frame_id:
             raise ValueError(
                 f'{path}: {layer.topic} is in the frame {layer.frame_id!r}, {first.topic} in '

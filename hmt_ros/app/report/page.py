@@ -405,16 +405,7 @@ def _scores(content: Content) -> dict[str, Any] | None:
             )
         }  # fmt: skip
     result['probabilities'] = PROBABILITIES.tolist()
-    return _finite(result)
-
-
-def _finite(value: Any) -> Any:
-    """The value with None for the numbers that JSON does not have: infinity and NaN."""
-    if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    return result
 
 
 def _base64(values: Array) -> str:

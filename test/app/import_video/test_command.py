@@ -216,6 +216,26 @@ def test_video_that_breaks_off_is_told(video, tmp_path, capsys):
     assert run(path, tmp_path / 'bag') == 0
     (line,) = capsys.readouterr().err.splitlines()
     assert 'of the 20 frames that its head announces can be read' in line
+    # A detector that saw the whole video has keypoints of all its frames.
+    for found in (arrays(tmp_path / 'all.npz', 20), tmp_path / 'all.csv'):
+        if found.suffix == '.csv':
+            found.write_text('frame,a_u,a_v\n' + ''.join(f'{i},5,6\n' for i in range(20)), 'utf-8')
+        out = tmp_path / found.suffix
+        assert run(path, out, '--keypoints', found) == 0
+        topics = content(out)
+        assert 0 < len(topics['/keypoints']) == len(topics['/image/compressed']) < 20
+    assert run(path, tmp_path / 'few', '--keypoints', arrays(tmp_path / 'few.npz', 19)) == 1
+
+
+def test_a_part_of_the_video_in_which_nobody_is(video, tmp_path, capsys):
+    found = arrays(tmp_path / 'late.npz', 10, detected=np.arange(10) > 6)
+    out = tmp_path / 'bag'
+    assert run(video, out, '--keypoints', found, '--end', '0.2') == 0
+    assert 'none of the 5 imported frames has keypoints' in capsys.readouterr().err
+    topics = content(out)
+    for topic in ('/keypoints', '/keypoints_3d'):
+        assert [len(message.names) for _, message in topics[topic]] == [0] * 5
+    assert run(video, tmp_path / 'one', '--keypoints', found, '--person', 'index:1') == 1
 
 
 def test_memory_does_not_grow_with_the_video(tmp_path, monkeypatch):

@@ -193,7 +193,6 @@ def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
             },
             'entry 0 has 2 keypoints, but 3 are named in categories',
         ),
-        ('a.json', [], 'no keypoint was seen in any frame'),
         ('a.csv', 'u,v\n1,2\n', 'wanted a column frame, time_s or stamp_ns'),
         ('a.csv', 'frame,nose\n1,2\n', 'wanted columns NAME_u and NAME_v, or name, u and v'),
         ('a.csv', 'frame,nose_u\n1,2\n', 'no column nose_v'),

@@ -12,6 +12,7 @@ from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import compressed_image_message, image_message
+from msg_tools.messages.keep_out import KeepOutState
 
 ROOT = Path(__file__).resolve().parents[3]
 SHARED = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared'))
@@ -241,14 +242,17 @@ def test_subject_files(good, subject, message, tmp_path, capsys):
     assert message in fails(good, tmp_path, capsys, subject=subject)
 
 
-def test_without_a_subject_somebody_must_be_seen(tmp_path, capsys):
+def test_nobody_is_seen_without_a_start(tmp_path, capsys):
     out = tmp_path / 'out'
     bag = write(tmp_path / 'bag', INFO, IMAGE)
-    assert main([str(bag), '-o', str(out)]) == 1
+    assert main([str(bag), '-o', str(out)]) == 0
     told, line = capsys.readouterr().err.splitlines()
     assert told == 'replay: no --subject: the track starts from a pose_prediction with components'
-    assert 'nobody is seen in its 1 images: give an image of the empty scene by' in line
-    assert not out.exists()
+    assert 'nobody is found in its 1 images: give an image of the empty scene by' in line
+    with BagReader(out) as written:
+        (state,) = (stored.message.state for stored in written.messages(['keep_out']))
+        assert state == KeepOutState.UNKNOWN
+        assert not written.message_count(['pose_mixture'])
 
 
 @pytest.mark.parametrize(

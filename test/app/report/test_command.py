@@ -21,7 +21,8 @@ from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.ground import GroundState, ground_message
 from msg_tools.messages.headers import time_message, time_ns
 from msg_tools.messages.images import compressed_image_message
-from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
 from test.app.conftest import (
     CAMERA,
@@ -308,7 +309,45 @@ def test_mixtures_without_covariances_and_missing_frames(body, poses, tmp_path):
                 message.components = []
             bag.write('pose_prediction', stamp, message)
     found = data_of(make(tmp_path / 'predicted', tmp_path / 'second'))
-    assert np.allclose(found['times'], [0.0, 0.2])
+    assert np.allclose(found['times'], [0.0, 0.1, 0.2])
+    assert [len(weights) for weights in found['layers'][0]['weights']] == [1, 0, 1]
+    assert found['notes'] == ['nobody is found at 1 of 3 times']
+
+
+@pytest.mark.usefixtures('no_pictures')
+def test_images_without_anybody(made, body, poses, tmp_path, capsys):
+    """Every image that was answered is shown; of nobody at all, too."""
+    answered = [STAMPS[0] - 100_000_000, *STAMPS]
+    nobody = tmp_path / 'nobody'
+    somebody = write_out(tmp_path / 'some', body, poses, truth=False)
+    with BagWriter(nobody) as bag:
+        bag.add_topic('pose_mixture', POSE_MIXTURE)
+        for stamp in answered:
+            bag.write('keep_out', stamp, keep_out(stamp, reason='no scene'))
+        # Of a time without an image.
+        bag.write('keep_out', STAMPS[-1] + 1, keep_out(STAMPS[-1] + 1, KeepOutState.STALE))
+    images = write_images(tmp_path / 'images', answered)
+    found = data_of(make(nobody, tmp_path / 'first', '--images', images, '--truth', made.truth))
+    assert np.allclose(found['times'], np.arange(FRAMES + 1) / 10)
+    assert found['layers'] == []
+    assert found['notes'] == [f'nobody is found at {FRAMES + 1} of {FRAMES + 1} times: no scene']
+    assert all(found['images']['jpegs'])
+    scores = found['scores']['topics']['/pose_mixture']
+    assert (scores['frames'], scores['missing'], scores['heaviest_mm']) == (0, FRAMES, None)
+    with BagReader(somebody) as source, BagWriter(tmp_path / 'out') as bag:
+        for stored in source.messages():
+            bag.write(stored.topic, stored.log_time_ns, stored.message)
+        for stamp in answered:
+            bag.write('keep_out', stamp, keep_out(stamp))
+    found = data_of(make(tmp_path / 'out', tmp_path / 'second', '--images', images))
+    assert found['notes'] == [f'nobody is found at 1 of {FRAMES + 1} times']
+    assert [bool(weights) for weights in found['layers'][0]['weights']] == [False, *[True] * FRAMES]
+
+
+def keep_out(stamp, state=KeepOutState.UNKNOWN, reason=''):
+    nothing = np.empty((0, 3))
+    content = KeepOut(stamp, FRAME_ID, state, nothing, nothing, np.empty(0), reason=reason)
+    return keep_out_message(MESSAGES, content)
 
 
 @pytest.mark.usefixtures('no_pictures')

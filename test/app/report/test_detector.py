@@ -8,7 +8,9 @@ from hmt_ros.app.report import command as report
 from hmt_ros.app.report.mixtures import read_mixtures
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools import BagReader, BagWriter
+from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import header_message
+from msg_tools.messages.keypoints import positions_message
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 from test.app.conftest import FRAMES, MESSAGES, STAMPS, data_of, make, write_out
 from test.app.report.test_command import integers, positions
@@ -30,7 +32,7 @@ def landmarks(joints, names):
     return places - joints[hips].mean(0)
 
 
-def with_detector(path, source, body, poses, *, topics=('keypoints_3d',), spoil=None):
+def with_detector(path, source, body, poses, *, topics=('keypoints_3d',), spoil=None, nobody=False):
     """A bag with positions in space: not in the first image, and without a wrist in the third."""
     with BagReader(source) as bag, BagWriter(path) as result:
         for stored in bag.messages():
@@ -50,9 +52,17 @@ def with_detector(path, source, body, poses, *, topics=('keypoints_3d',), spoil=
             )
             if spoil is not None:
                 spoil(message)
+            if nobody and i == 3:
+                message = positions_message(MESSAGES, NO_KEYPOINTS, stamp, FRAME_ID)
             for topic in topics:
                 result.write(topic, stamp, message)
     return path
+
+
+def test_an_image_in_which_the_detector_saw_nobody(made, body, poses, tmp_path):
+    bag = with_detector(tmp_path / 'bag', made.out, body, poses, nobody=True)
+    known = data_of(make(bag, tmp_path / 'report'))['detector']['known']
+    assert known == [False, True, True, False, *[True] * (FRAMES - 4)]
 
 
 @pytest.mark.parametrize('where', ['with the mixtures', 'with the images'])

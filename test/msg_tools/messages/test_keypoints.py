@@ -10,6 +10,7 @@ import pytest
 
 from hmt_ros.body import load_body
 from msg_tools import MessageError, RosbagsMessages
+from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.keypoints import (
     keypoints_message,
     keypoints_of,
@@ -72,7 +73,7 @@ def test_covariance_of_a_joint_that_was_not_seen_does_not_matter(messages: Rosba
 @pytest.mark.parametrize(
     ('changes', 'error'),
     [
-        ({'names': [], 'u': [], 'v': []}, r'keypoints has no names'),
+        ({'names': []}, r'keypoints: u has 3 values, wanted 0'),
         ({'names': ['neck', 'neck', 'head']}, r"keypoints has the name 'neck' twice"),
         ({'names': ['x'] * 10_001}, r'keypoints has 10001 names, the limit is 10000'),
         ({'u': [1.0, 2.0]}, r'keypoints: u has 2 values, wanted 3'),
@@ -135,6 +136,15 @@ def test_positions_join_keypoints_by_name(messages: RosbagsMessages) -> None:
     assert (len(without.names), len(without.x), len(without.confidence)) == (0, 0, 0)
 
 
+def test_a_message_of_nobody(messages: RosbagsMessages) -> None:
+    """What a detector writes that saw nobody is read: no keypoints, no positions."""
+    written = keypoints_message(messages, NO_KEYPOINTS, 7, 'camera')
+    found = keypoints_of(written, 3.0)
+    assert (found.names, found.pixels.shape, found.covariances.shape) == ((), (0, 2), (0, 2, 2))
+    nowhere = positions_of(positions_message(messages, NO_KEYPOINTS, 7, 'camera'))
+    assert (nowhere.names, nowhere.positions.shape) == ((), (0, 3))
+
+
 def test_a_message_without_covariances(messages: RosbagsMessages) -> None:
     content = keypoints_of(message(messages), 3.0)
     unknown = replace(content, covariances=np.full((3, 2, 2), np.nan))
@@ -149,7 +159,7 @@ def test_a_message_without_covariances(messages: RosbagsMessages) -> None:
 @pytest.mark.parametrize(
     ('changes', 'error'),
     [
-        ({'names': [], 'x': [], 'y': [], 'z': []}, r'keypoints_3d has no names'),
+        ({'names': []}, r'keypoints_3d: x has 3 values, wanted 0'),
         ({'names': ['head', 'neck', 'head']}, r"keypoints_3d has the name 'head' twice"),
         ({'names': ['x'] * 10_001}, r'keypoints_3d has 10001 names, the limit is 10000'),
         ({'z': [1.0, 2.0]}, r'keypoints_3d: z has 2 values, wanted 3'),

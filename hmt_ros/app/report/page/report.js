@@ -26,6 +26,7 @@ const choices = [
     weightsAt: (t) => (topic.at[t] ? topic.at[t].weights : []), what: 'trajectories',
   })),
 ];
+if (!choices.length) choices.push({ name: 'nobody', layer: null, index: 0, weightsAt: () => [], what: 'modes' });
 const chosen = () => choices[shown.chosen];
 const errorsKnown = () => Boolean(chosen().layer && chosen().layer.errors_mm);
 const motionsKnown = () => Boolean(chosen().layer && chosen().layer.motions.length > 1);
@@ -128,7 +129,7 @@ function tellModes() {
   element('modes-caption').textContent = weights.length
     ? `${weights.length} ${what}; effective number, by the entropy of the weights: ${Math.exp(entropy).toFixed(1)}${more}`
       + `${layer ? '. Click a number to show that mode alone.' : ''}`
-    : 'Nothing at this time.';
+    : what === 'modes' ? 'Nobody is found at this time.' : 'Nothing at this time.';
 }
 
 function choose(index) {
@@ -350,10 +351,13 @@ function tellScores() {
 let timer = null;
 let due = 0;
 
+// Longest time for which an image stands while the page plays, s: nobody waits for hours.
+const LONGEST = 2;
+
 /** Duration for which a time is shown, ms. */
 function duration(time) {
   const seconds = time < LAST ? TIMES[time + 1] - TIMES[time] : TIMES[LAST] / Math.max(LAST, 1) || 1;
-  return (1000 * seconds) / Number(element('speed').value);
+  return (1000 * Math.min(seconds, LONGEST)) / Number(element('speed').value);
 }
 
 function play(on) {
