@@ -124,6 +124,8 @@ class Existence:
         self.seen = self.hidden = self.elsewhere = False
         self.met: int | None = None
         self._stamps: tuple[int, int] | None = None  # of the first and of the last image
+        # Whether the last image showed the person, or the same as one that did.
+        self._followed = True
         self._asked: dict[str, int] = {}  # when each cue spoke last
         self._appearance = Appearance()
         self._counted: NDArray[np.float32] | None = None  # the picture in which keypoints counted
@@ -180,13 +182,14 @@ class Existence:
         # Nothing but the image tells, so that its changes are worth a look.
         alone = view.anywhere is None and view.keypoints is None and not waiting
         motion = self._appearance.motion(view) if alone else NO_MOTION
-        if self._stamps is not None and not motion.still:
+        still = motion.still and self._followed
+        if self._stamps is not None and not still:
             self._p = CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
         # After so long a time the person who was seen last may have gone.
         forgotten = CHAIN.transition(self._appearance.unseen(stamp))[1, 1] < MOST
         self.hidden = self._appearance.open_to_view(view.others) < 1.0 - MOST
         cues, usable, apart = self._cues(view, stamp, body)
-        if motion.moved:
+        if motion.moved and not any(value < 0.0 for value, _ in cues.values()):
             cues['motion'] = 1.0, DOUBTFUL
         if waiting and cues.get('detector', (0.0, CLEAR))[0] > 0.0 and self._is_counted(view):
             del cues['detector']
@@ -199,6 +202,7 @@ class Existence:
         self._p = update(self._p, [0.0, self.llr])
         values = [value for value, _ in cues.values()]
         shown = any(value > 0.0 for value in values)
+        self._followed = shown or still
         self.seen = shown or (usable and not any(value < 0.0 for value in values))
         self.elsewhere = shown and (forgotten or apart)
         self._asked |= dict.fromkeys(cues, stamp)

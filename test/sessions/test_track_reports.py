@@ -27,7 +27,7 @@ def lost(stub_tracker, monkeypatch):
         known, self.status = self.status, Status.TRACKING if stamp in stamps else self.status
         found = step(self, image, stamp, *arguments, **named)
         if stamp in stamps:
-            self.status, self.misfit = Status.LOST, 0.62
+            self.status, self.reason = Status.LOST, 'no mode explains 62% of what is seen'
         elif known is Status.LOST:
             self.track_id = 1
         return found
