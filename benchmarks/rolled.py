@@ -1,4 +1,4 @@
-"""rolled: a camera that is turned about its optical axis, its gravity given, against an upright one.
+"""rolled: a camera turned about its optical axis, its gravity given, against an upright one.
 
 Images, keypoints, calibration, truth and gravity of clips are turned by 15, 90 and 180 degrees, as
 a camera on its side or upside down would have seen the scene. `lift` takes the keypoints alone,
@@ -129,6 +129,7 @@ def measure(
     clips: Path | None = None,
     names: tuple[str, ...] = CLIPS,
     stages: tuple[str, ...] = STAGES,
+    gravities: tuple[str, ...] = GRAVITIES,
     *,
     quick: bool = False,
 ) -> dict[str, Any]:
@@ -138,6 +139,7 @@ def measure(
         clips: folder of the clips; None: the development clips.
         names: of the clips; those that are not there are left out.
         stages: some of `STAGES`.
+        gravities: some of `GRAVITIES`.
         quick: the first clip alone.
 
     Raises:
@@ -152,7 +154,7 @@ def measure(
             f'{source} has no keypoints_mediapipe.npz of {", ".join(names)} (set HMT_SHARED, or '
             '--clips)'
         )
-    kinds = list(product(stages, GRAVITIES, folders))
+    kinds = list(product(stages, gravities, folders))
     work = [(x, stage, gravity, a) for stage, gravity, x in kinds for a in ANGLES]
     found = dict(zip(work, in_processes(scored, work, 0, 'rolled'), strict=True))
     rows = [
@@ -181,12 +183,14 @@ def main(arguments: list[str]) -> int:
     parser = benchmark_parser('rolled', __doc__, quick='only one clip')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     parser.add_argument('--names', nargs='+', default=CLIPS, help='of the clips')
+    parser.add_argument('--gravity', nargs='+', choices=GRAVITIES, default=GRAVITIES)
     add_choice(parser, STAGES)
     options = parser.parse_args(arguments)
     try:
         result = measure(
-            options.clips, tuple(options.names), tuple(options.only), quick=options.quick
-        )
+            options.clips, tuple(options.names), tuple(options.only), tuple(options.gravity),
+            quick=options.quick,
+        )  # fmt: skip
     except (FileNotFoundError, ValueError) as error:
         print(f'rolled: {error}', file=sys.stderr)
         return 1

@@ -21,6 +21,8 @@ from hmt_ros.inference.arrays import Array
 DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
 
 NEAR = 0.01  # least depth of a point that has an image, m
+# Least part of the vertical across the optical axis by which a camera has a roll.
+STEEP = 0.1
 STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
 
 
@@ -186,6 +188,23 @@ class Camera:
         value = np.stack([a * scale, b * scale])
         mixed = a * b * slope
         return value, ((scale + a * a * slope, mixed), (mixed, scale + b * b * slope))
+
+
+def roll(ups: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) about the optical axis, from an upright camera's axes to a camera's.
+
+    Args:
+        ups: (..., 3) vectors against gravity, camera frame. Those nearly along the optical axis
+            (`STEEP`), and zeros, tell of no roll.
+    """
+    x, y, _ = np.moveaxis(np.asarray(ups, dtype=np.float64), -1, 0)
+    length = np.hypot(x, y)
+    x, y = np.where(length > STEEP, (x, y), np.reshape((0.0, -1.0), (2, *(1,) * np.ndim(length))))
+    sine, cosine = np.stack([x, -y]) / np.hypot(x, y)
+    result = np.zeros((*np.shape(x), 3, 3))
+    result[..., 0, 0] = result[..., 1, 1] = cosine
+    result[..., 0, 1], result[..., 1, 0], result[..., 2, 2] = -sine, sine, 1.0
+    return result
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,8 @@ from scipy.special import expit, logsumexp
 from hmt_ros.body.camera import Camera
 from hmt_ros.inference.arrays import Array, Image, Index
 
+# The level of an upright camera.
+UPRIGHT = np.eye(3)
 # Images are made this large at most, px, and a line has this length at least, rad.
 LARGEST, SHORTEST = 800, 0.03
 # Lines in planes through the camera that differ by less are one line, rad.
@@ -76,10 +78,18 @@ class Vertical:
     sigma: float
 
 
-def seen_vertical(image: Image, camera: Camera) -> Vertical | None:
-    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines show none."""
+def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Vertical | None:
+    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines show none.
+
+    Args:
+        image: seen by the camera.
+        camera: that is mounted as most are, but for its level.
+        level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
+    """
     lines = straight_lines(image, camera)
-    return vertical_of(lines) if len(lines.normals) else None
+    upright = lines._replace(normals=lines.normals @ level, middles=lines.middles @ level)
+    found = vertical_of(upright) if len(lines.normals) else None
+    return None if found is None else Vertical(level @ found.up, found.sigma)
 
 
 def straight_lines(image: Image, camera: Camera) -> Lines:

@@ -148,7 +148,8 @@ class Starts:
             masked: whether the silhouette is a segmenter's.
             somebody: whether a person is in view.
         """
-        given, model, camera = self.given, self._model, self._camera
+        given, camera = self.given, self._camera
+        model = self._model.levelled(body.level)
         if given is not None and self.box is None:
             if isinstance(given, Subject) and stamp < given.stamp_ns:
                 return None
