@@ -239,10 +239,9 @@ class GroundEstimator:
         return up if up is None or not self.reversed else -up
 
     def see(self, keypoints: Keypoints) -> None:
-        """Takes in which way up a detector sees the person."""
+        """Takes in which way up a detector sees the person, by names of our joints."""
         if self.known.up is not None:
-            said = LYING * uprightness(keypoints, self.known.up)
-            self._by_keypoints = float(np.clip(self._by_keypoints + said, -LYING, LYING))
+            self._by_keypoints += uprightness(keypoints, self.known.up)
             self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
