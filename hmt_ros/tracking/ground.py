@@ -54,8 +54,12 @@ LOOK_TIME = 1.0
 CONTRARY = np.radians(10.0)
 # Share of looks at lines whose vertical is right, and density of one that is not, 1/sr.
 RIGHT, ANYWHERE = 0.9, 1.0 / (2.0 * np.pi)
+# Number of images from the start on that show a person head down by a given vertical, above which
+# it is the wrong way round though it points up in the image: handstands are shorter.
+HEAD_DOWN = 30.0
 # Log odds that a given vertical is wrong: before any image, for a camera that is about upright and
-# for another; most that one look at lines says. Most that a person says: some lie.
+# for another; most that one look at lines says. What somebody who lies says at most: some do, and
+# few stand on their head, who says twice that.
 WRONG, ONE_LOOK, LYING = (-3.5, -2.5), 2.0, 3.5
 # Concentration of the axes of people who do not lie about the vertical.
 STANDING = 8.0
@@ -141,10 +145,11 @@ class GroundEstimator:
     axis last, so its images count as one per `AXIS_TIME`, and the deviation never goes below
     `AXIS_SIGMA`.
 
-    Lines that show another vertical, and a person who lies by it, make a given one doubtful. One
-    that points down in the image may be that of a camera that hangs upside down, or the reading of
-    an accelerometer, which at rest points up: keypoints tell which, and the other one is used. A
-    jump of the vertical of the lines alone is believed when the next look shows it too.
+    Lines that show another vertical, and a person who lies by it, make a given one doubtful. It may
+    be the wrong way round, as an accelerometer at rest measures gravity: where keypoints show the
+    person head down, from the first image on where it points down in the image, else for
+    `HEAD_DOWN` images, its opposite is used. A jump of the vertical of the lines alone is believed
+    when the next look shows it too.
 
     Args:
         known: gravity and floor without the images; None: unknown.
@@ -217,7 +222,9 @@ class GroundEstimator:
     def reversed(self) -> bool:
         """Whether the opposite of the given vertical is used; see `GroundEstimator`."""
         up = self.known.up
-        return up is not None and bool(up @ IMAGE_UP < 0.0) and self._by_keypoints < 0.0
+        if up is None:
+            return False
+        return self._by_keypoints < (0.0 if up @ IMAGE_UP < 0.0 else -HEAD_DOWN)
 
     @property
     def contradicted(self) -> bool:
@@ -300,9 +307,12 @@ class GroundEstimator:
             axes = mass.centre_of_mass(frames) - points.mean(0)
             axis = axes / np.linalg.norm(axes, axis=0) @ weights
             if self._given is not None:
-                stands = 2.0 * STANDING * np.exp(STANDING * (float(axis @ self._given) - 1.0))
-                said = -np.log(stands + np.exp(-LYING)) * min(dt / AXIS_TIME, 1.0)
-                self._by_person = float(np.clip(self._by_person + said, -LYING, LYING))
+                cosine = float(axis @ self._given)
+                stands = 2.0 * STANDING * np.exp(STANDING * (cosine - 1.0))
+                lies = np.exp(-LYING * (1.0 + max(-cosine, 0.0)))
+                said = -np.log(stands + lies) * min(dt / AXIS_TIME, 1.0)
+                most = LYING * (1.0 + max(-cosine, 0.0))
+                self._by_person = float(np.clip(self._by_person + said, -LYING, most))
             elif self._seen is None:
                 self._follow_axis(axis, place, resting, dt)
                 self._conclude()

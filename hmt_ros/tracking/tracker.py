@@ -210,8 +210,11 @@ class Tracker:
         self._move_camera(stamp)
         if self.settings.ground.on:
             self._ground.look(image, self.camera, stamp)
+            before = self._ground.reversed
             if keypoints is not None:
                 self._ground.see(keypoints)
+            if before != self._ground.reversed and self._track.begun:
+                self._drop_track()
         if not self._track.begun:
             self._stand_upright()
         known = self.background.frames > 0 and not self.silhouettes.doubted
