@@ -30,6 +30,8 @@ from hmt_ros.inference.arrays import Array
 # the x and y radii, distances by which it exceeds the start and the end of its segment more than
 # the model's, and its shift along the y axis, m.
 GROWTH = ('width', 'depth', 'start', 'end', 'shift')
+# Angles of a root that can be levelled.
+ROOT_ANGLES = ('root_z', 'root_y', 'root_x')
 # Half of the least height of a part, m.
 LEAST_HEIGHT = 5e-3
 
@@ -301,12 +303,13 @@ class Body:
         """The same body, with the angles of the root measured against other axes.
 
         Somebody upright is then far from the poles and the limits of these angles, however the
-        camera is turned. Translations stay in the axes of the camera.
+        camera is turned. Translations stay in the axes of the camera. A body whose root has other
+        angles keeps its level.
 
         Args:
             level: (3, 3) rotation from those axes, of an upright camera, to the camera's.
         """
-        if np.array_equal(level, self.level):
+        if np.array_equal(level, self.level) or not {*ROOT_ANGLES} <= {*self.dof_names}:
             return self
         mounts = self.skeleton.mounts.copy()
         mounts[0] = level @ self.level.T @ mounts[0]

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmt_ros.body.body import Body
+from hmt_ros.body.body import ROOT_ANGLES, Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, other_side
 from hmt_ros.inference.arrays import Array, Index, Mask
@@ -27,6 +27,9 @@ SIDEWAYS = 0.12
 # Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'
 TURN = 2.0 * np.pi
+# Share of their limits below which the angles of a root are far from them and from the poles.
+CLEAR = 0.85
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def mirror(body: Body, poses: ArrayLike) -> Array:
@@ -153,6 +156,23 @@ def relevelled(body: Body, mixture: GaussianMixture, to: Body) -> GaussianMixtur
     jacobians = turn_jacobians(body, mixture.means, to, means)
     covariances = propagated(jacobians, mixture.covariances)
     return GaussianMixture(mixture.weights, means, covariances)
+
+
+def clear_level(body: Body, pose: Array) -> Array:
+    """The level (3, 3) at which the root angles of a pose (d,) are far from their limits.
+
+    It is that of the body where they are, else turned about the optical axis by quarter turns.
+    """
+    best, least = body.level, CLEAR
+    if not {*ROOT_ANGLES} <= {*body.dof_names}:
+        return best
+    limits = root_rotation_dofs(body.skeleton)[1:]
+    for turn in (np.eye(3), QUARTER, QUARTER @ QUARTER, QUARTER.T):
+        angles = turned(body, pose[None], body.levelled(turn @ body.level))[0, limits]
+        share = float(np.abs(angles / body.upper[limits]).max())
+        if share < least:
+            best, least = turn @ body.level, 0.0 if turn[0, 0] > 0.5 else share
+    return best
 
 
 def propagated(jacobians: Array, covariances: Array) -> Array:
