@@ -169,13 +169,14 @@ def measure(
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """The errors as a table, mm, and what the worst angle costs."""
-    rows = [['', 'gravity', 'clip', *(f'{a} degrees' for a in ANGLES), 'at worst, %']]
+    rows = [['mm', 'clip', *(f'{a} degrees' for a in ANGLES), 'at worst, %']]
     for one in result['rows']:
         upright, *others = (one['mm'][str(a)] for a in ANGLES)
         cost = 100.0 * (max(others) / upright - 1.0)
         cells = [f'{one["mm"][str(a)]:.1f}' for a in ANGLES]
-        rows.append([one['stage'], one['gravity'], one['clip'], *cells, f'{cost:+.0f}'])
-    return table(rows, left=3, markdown=markdown)
+        kind = one['stage'] if one['gravity'] == GIVEN else f'{one["stage"]}, {one["gravity"]}'
+        rows.append([kind, one['clip'], *cells, f'{cost:+.0f}'])
+    return table(rows, left=2, markdown=markdown)
 
 
 def main(arguments: list[str]) -> int:
