@@ -48,6 +48,8 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 LIFTED, REPORT = 'lifted', 'report'
+# Part of gravity along the optical axis above which poses are checked that were lifted without it.
+STEEP = 0.8
 # Lean of the trunk above which a person lies, rad.
 LYING = np.radians(55.0)
 
@@ -149,18 +151,23 @@ def _lift(arguments: argparse.Namespace) -> int:
     body = _body(camera, arguments)
     up = _up(seen, body, arguments)
     ups = None if up is None else np.tile(up, (len(stamps), 1))
-    with show_progress('lifting', quiet=quiet):
-        mixtures = lift_poses(
+
+    def lifted(ups: Array | None) -> list[GaussianMixture | None]:
+        return lift_poses(
             lifter, body, camera, 1e-9 * np.array(times, dtype=np.float64), seen, ups,
             lengths_known=arguments.subject is not None, causal=arguments.causal,
             scheme=arguments.scheme,
         )  # fmt: skip
+
+    with show_progress('lifting', quiet=quiet):
+        mixtures = lifted(ups)
     if all(one is None for one in mixtures):
         raise ValueError(
             f'{arguments.keypoints}: no image shows five landmarks that are known; see --scheme'
         )
     if up is not None:
-        _check_gravity(up, body, [one for one in mixtures if one is not None])
+        checked = mixtures if abs(up[2]) < STEEP else lifted(None)
+        _check_gravity(up, body, [one for one in checked if one is not None])
     folder.mkdir(parents=True, exist_ok=True)
     messages = RosbagsMessages()
     with BagWriter(folder / LIFTED, overwrite=arguments.overwrite) as bag:

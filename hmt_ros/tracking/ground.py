@@ -57,6 +57,8 @@ RIGHT, ANYWHERE = 0.9, 1.0 / (2.0 * np.pi)
 # Number of images from the start on that show a person head down by a given vertical, above which
 # it is the wrong way round though it points up in the image: handstands are shorter.
 HEAD_DOWN = 30.0
+# Cosine between trunk and vertical in an image from which it is upright or head down.
+HEAD_UP = 0.7
 # Log odds that a given vertical is wrong: before any image, for a camera that is about upright and
 # for another; most that one look at lines says. What somebody who lies says at most: some do, and
 # few stand on their head, who says twice that.
@@ -248,7 +250,8 @@ class GroundEstimator:
     def see(self, keypoints: Keypoints) -> None:
         """Takes in which way up a detector sees the person, by names of our joints."""
         if self.known.up is not None:
-            self._by_keypoints += uprightness(keypoints, self.known.up)
+            cosine = uprightness(keypoints, self.known.up)
+            self._by_keypoints += cosine if abs(cosine) > HEAD_UP else 0.0
             self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
