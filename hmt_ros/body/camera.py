@@ -207,6 +207,21 @@ def roll(ups: ArrayLike) -> Array:
     return result
 
 
+def shortest_turn(start: Array, end: Array) -> Array:
+    """The rotation (3, 3) by the least angle that takes a unit vector to another.
+
+    For opposite vectors in the plane of the image, where no rotation is the shortest, it is the one
+    about the optical axis, as when the camera hangs upside down.
+    """
+    cosine = float(start @ end)
+    if cosine <= -1.0 + 1e-9:
+        return np.diag([-1.0, -1.0, 1.0])
+    x, y, z = np.cross(start, end)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    result: Array = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+    return result
+
+
 @dataclass(frozen=True)
 class Viewpoint:
     """A camera over a floor.

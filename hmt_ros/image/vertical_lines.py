@@ -46,6 +46,8 @@ FINER = tuple(np.radians([4.0, 3.0, 2.0, 1.0, 0.5, 0.5, 0.5]))
 # Deviation of the vertical of the best frame on the raster, and of the refined one where lines are
 # many: walls lean and lenses bend, rad.
 RASTER_SIGMA, LEAST_SIGMA = np.radians(4.0), np.radians(1.0)
+# Share of looks whose vertical is right, and density of one that is not, 1/sr.
+RIGHT, ANYWHERE = 0.9, 1.0 / (2.0 * np.pi)
 # Probability that there is a frame, and that its vertical is in the surroundings of the best one,
 # rad, above which that is believed.
 BELIEVED, SURROUNDINGS = 0.95, np.radians(10.0)
@@ -76,6 +78,20 @@ class Vertical:
 
     up: Array
     sigma: float
+
+    def agreement(self, up: Array, sigma: float) -> float:
+        """Density of this vertical where another (3,) with a deviation is right, over any alone."""
+        variance = sigma**2 + self.sigma**2
+        square = 2.0 - 2.0 * float(up @ self.up)
+        near = np.exp(-0.5 * square / variance) / (2.0 * np.pi * variance)
+        return float(RIGHT * near / ANYWHERE + 1.0 - RIGHT)
+
+    def refined(self, up: Array, sigma: float) -> Vertical:
+        """Another vertical, (3,) with a deviation, refined by this one as far as both agree."""
+        right = 1.0 - (1.0 - RIGHT) / self.agreement(up, sigma)
+        share = max(right, 0.0) * sigma**2 / (sigma**2 + self.sigma**2)
+        mean = (1.0 - share) * up + share * self.up
+        return Vertical(mean / np.linalg.norm(mean), sigma * float(np.sqrt(1.0 - share)))
 
 
 def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Vertical | None:

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera, roll
+from hmt_ros.body.camera import Camera, roll, shortest_turn
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm, masses, soles
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.mirror import root_angles, root_rotation_dofs, root_rotations
+from hmt_ros.body.mirror import turned
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.vertical_lines import Vertical, seen_vertical
 from hmt_ros.inference.arrays import Array, Image
@@ -50,10 +50,6 @@ LEVEL_SIGMA, FIRST_LEVEL_SIGMA = 0.04, 0.10
 TURNED = 0.003
 # Time from one look at the lines of the scene to the next, s.
 LOOK_TIME = 1.0
-# Verticals of two looks that differ by more are different ones, rad: no lines err so far.
-CONTRARY = np.radians(10.0)
-# Share of looks at lines whose vertical is right, and density of one that is not, 1/sr.
-RIGHT, ANYWHERE = 0.9, 1.0 / (2.0 * np.pi)
 # Number of images from the start on that show a person head down by a given vertical, above which
 # it is the wrong way round though it points up in the image: handstands are shorter.
 HEAD_DOWN = 30.0
@@ -114,11 +110,6 @@ class Ground:
         return None if self.height is None else np.append(self.up, self.height)
 
 
-def _contradict(first: Array, second: Array) -> bool:
-    """Whether two verticals (3,) contradict each other."""
-    return bool(first @ second < np.cos(CONTRARY))
-
-
 def unit_vector(up: ArrayLike) -> Array:
     """A direction (3,) of unit length.
 
@@ -174,7 +165,7 @@ class GroundEstimator:
     def forget_scene(self) -> None:
         """Forgets the estimates from images and from a track."""
         self._seen: Vertical | None = None
-        self._newest: Array | None = None
+        self._missed = False
         self._looked: int | None = None
         self._by_lines = self._by_person = self._by_keypoints = 0.0
         self.reset()
@@ -205,8 +196,6 @@ class GroundEstimator:
         self._covariance = motion.rotation @ self._covariance @ motion.rotation.T
         if self._seen is not None:
             self._seen = replace(self._seen, up=motion.directions(self._seen.up))
-        if self._newest is not None:
-            self._newest = motion.directions(self._newest)
         self._levels = deque((time, level + rise) for time, level in self._levels)
         self._conclude()
 
@@ -250,7 +239,8 @@ class GroundEstimator:
     def see(self, keypoints: Keypoints) -> None:
         """Takes in which way up a detector sees the person, by names of our joints."""
         if self.known.up is not None:
-            cosine = uprightness(keypoints, self.known.up)
+            trunk = keypoints.trunk
+            cosine = float(trunk @ self.known.up[:2]) / max(float(np.linalg.norm(trunk)), 1e-9)
             self._by_keypoints += cosine if abs(cosine) > HEAD_UP else 0.0
             self._conclude()
 
@@ -262,21 +252,15 @@ class GroundEstimator:
         found = seen_vertical(image, camera, np.eye(3) if given is None else roll(given))
         if found is None:
             return
-        before, self._newest = self._newest, found.up
-        again = before is not None and not _contradict(before, found.up)
-        if self._seen is None or again or not _contradict(self._seen.up, found.up):
-            self._seen = found
+        again, before = self._missed, self._seen
+        self._missed = before is not None and found.agreement(before.up, before.sigma) < 1.0
+        if not self._missed or again:
+            self._seen, self._missed = found, False
         if given is not None:
-            said = np.clip(-np.log(self._agreement(given, found)), -ONE_LOOK, ONE_LOOK)
+            said = -np.log(found.agreement(given, self.known.up_sigma))
+            said = np.clip(said, -ONE_LOOK, ONE_LOOK)
             self._by_lines = float(np.clip(self._by_lines + said, -ONE_LOOK, 2.0 * ONE_LOOK))
         self._conclude()
-
-    def _agreement(self, given: Array, seen: Vertical) -> float:
-        """Density of the vertical of lines, or of any, by a given vertical (3,), over any alone."""
-        variance = self.known.up_sigma**2 + seen.sigma**2
-        square = 2.0 - 2.0 * float(given @ seen.up)
-        near = np.exp(-0.5 * square / variance) / (2.0 * np.pi * variance)
-        return float(RIGHT * near / ANYWHERE + 1.0 - RIGHT)
 
     @property
     def vertical_known(self) -> bool:
@@ -352,17 +336,13 @@ class GroundEstimator:
 
     def _conclude(self) -> None:
         known, seen, given = self.known, self._seen, self._given
-        if given is not None:
-            up, up_sigma = given, known.up_sigma
-            if seen is not None:
-                right = 1.0 - (1.0 - RIGHT) / self._agreement(given, seen)
-                share = right * up_sigma**2 / (up_sigma**2 + seen.sigma**2)
-                up = unit_vector((1.0 - share) * up + share * seen.up) if right > 0.5 else up
-                up_sigma *= float(np.sqrt(1.0 - share))
-        elif seen is not None:
-            up, up_sigma = seen.up, seen.sigma
-        else:
-            up, up_sigma = self._mean, float(np.sqrt(self._covariance.trace() / 3.0))
+        if given is not None and seen is not None:
+            seen = seen.refined(given, known.up_sigma)
+        elif given is not None:
+            seen = Vertical(given, known.up_sigma)
+        if seen is None:
+            seen = Vertical(self._mean, float(np.sqrt(self._covariance.trace() / 3.0)))
+        up, up_sigma = seen.up, seen.sigma
         tracked, tracked_sigma = self._tracked_level()
         height, sigma = tracked, tracked_sigma
         if known.camera_height is not None:
@@ -406,33 +386,4 @@ class Gravity:
     def turned(self, body: Body, poses: Array) -> Array:
         """Poses (N, d) upright in the image, turned the shortest way to be upright in space."""
         turn = shortest_turn(body.level @ IMAGE_UP, self.plane.up)
-        result = poses.copy()
-        angles = root_rotation_dofs(body.skeleton)
-        result[:, angles] = root_angles(body, turn @ root_rotations(body, poses))
-        return np.clip(result, body.lower, body.upper)
-
-
-def uprightness(keypoints: Keypoints, up: Array) -> float:
-    """Cosine between the trunk in an image and a vertical (3,), camera frame; 0: not known."""
-    places = dict(zip(keypoints.names, np.where(keypoints.seen[:, None], keypoints.pixels, np.nan)))
-    trunk = np.zeros(2)
-    for name, sign in (('shoulder', 0.5), ('hip', -0.5)):
-        for side in ('left', 'right'):
-            trunk = trunk + sign * places.get(f'{side}_{name}', np.array([np.nan, np.nan]))
-    length = float(np.linalg.norm(trunk))
-    return float(trunk @ up[:2]) / length if length > 0.0 else 0.0
-
-
-def shortest_turn(start: Array, end: Array) -> Array:
-    """The rotation (3, 3) by the least angle that takes a unit vector to another.
-
-    For opposite vectors in the plane of the image, where no rotation is the shortest, it is the one
-    about the optical axis, as when the camera hangs upside down.
-    """
-    cosine = float(start @ end)
-    if cosine <= -1.0 + 1e-9:
-        return np.diag([-1.0, -1.0, 1.0])
-    x, y, z = np.cross(start, end)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    result: Array = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
-    return result
+        return np.clip(turned(body, poses, body, turn), body.lower, body.upper)
