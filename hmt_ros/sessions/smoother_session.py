@@ -283,7 +283,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
     def _clear(self, of: SmoothedBody, mixture: GaussianMixture) -> SmoothedBody:
         """The person, with a level at which the heaviest pose is far from the poles."""
-        heaviest = mixture[np.argmax(mixture.weights)[None]]
+        heaviest = mixture[np.array([np.argmax(mixture.weights)])]
         seen = relevelled(of.body.levelled(np.eye(3)), heaviest, of.body)
         level = clear_level(of.body, seen.means[0])
         if np.array_equal(level, of.body.level):
