@@ -87,9 +87,13 @@ class Vertical:
         return float(RIGHT * near / ANYWHERE + 1.0 - RIGHT)
 
     def refined(self, up: Array, sigma: float) -> Vertical:
-        """Another vertical, (3,) with a deviation, refined by this one as far as both agree."""
+        """Another vertical, (3,) with a deviation, refined by this one as far as both agree.
+
+        It moves by its deviation at most.
+        """
         right = 1.0 - (1.0 - RIGHT) / self.agreement(up, sigma)
         share = max(right, 0.0) * sigma**2 / (sigma**2 + self.sigma**2)
+        share = min(share, sigma / max(float(np.linalg.norm(self.up - up)), 1e-9))
         mean = (1.0 - share) * up + share * self.up
         return Vertical(mean / np.linalg.norm(mean), sigma * float(np.sqrt(1.0 - share)))
 

@@ -226,15 +226,21 @@ def pitched(degrees: float, sigma: float = 2.0) -> KnownGround:
 def test_a_given_vertical_is_refined_by_lines_that_agree():
     alone = looked(GroundEstimator(), 15.0).estimate
     for sigma in (0.5, 2.0, 8.0):
-        found = looked(GroundEstimator(pitched(12.0, sigma)), 15.0).estimate
+        found = looked(GroundEstimator(pitched(13.5, sigma)), 15.0).estimate
         # Two measurements of one angle: the mean by their precisions.
         precise = np.array([np.radians(sigma), alone.up_sigma]) ** -2.0
         between = precise[1] / precise.sum()
-        angle = degrees_between(found.up, pitched(12.0).up)
+        angle = degrees_between(found.up, pitched(13.5).up)
         assert angle == pytest.approx(
-            between * degrees_between(alone.up, pitched(12.0).up), abs=0.3
+            between * degrees_between(alone.up, pitched(13.5).up), abs=0.3
         )
         assert found.up_sigma == pytest.approx(precise.sum() ** -0.5, rel=0.1)
+
+
+def test_lines_move_a_given_vertical_by_its_deviation_at_most():
+    for given in (6.0, 8.0, 10.0):
+        found = looked(GroundEstimator(pitched(given)), 15.0).estimate
+        assert degrees_between(found.up, pitched(given).up) < 2.01
 
 
 @pytest.mark.parametrize(('given', 'seen'), [(40.0, (None, None)), (-30.0, (0.0,))])
