@@ -31,6 +31,7 @@ BENCHMARKS = {
     'nodes': 'images at the rate of a camera, through DDS',
     'people': 'two people cross: are they told apart afterwards?',
     'real_video': 'real videos without truth: keypoints held out, feet, lengths; contact sheets',
+    'rolled': 'what a camera on its side or upside down costs, its gravity given',
     'smoothing': 'exactness, speed and peers of the smoother',
     'soak': 'nodes and files under load and fault',
     'tracking': 'accuracy, calibration and speed of the tracker on clips with known truth',

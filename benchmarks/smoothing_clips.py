@@ -42,6 +42,7 @@ from benchmarks.runs import (
 from benchmarks.tracking_means import GROUPS, group_of
 from benchmarks.tracking_scores import heaviest_joints, scores_of
 from hmt_ros.body import Body, load_body
+from hmt_ros.body.mirror import propagated
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.inference.reduction import leaders
@@ -53,7 +54,7 @@ from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import Transform
 from hmt_ros.tracking import TrackerSettings
-from hmt_ros.tracking.camera_motion import CameraMotion, propagated
+from hmt_ros.tracking.camera_motion import CameraMotion
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.pose_mixtures import (

@@ -26,6 +26,7 @@ from benchmarks import (
     live,
     nodes,
     real_video,
+    rolled,
     vertical,
     votes,
 )
@@ -563,6 +564,35 @@ def test_the_vertical_of_a_clip_is_seen(one_clip, capsys):
     assert text.splitlines()[-1].startswith('| all')
     assert main(['vertical', '--clips', str(ROOT / 'test')]) == 1
     assert capsys.readouterr().err.startswith('vertical: ')
+
+
+# rolled
+
+
+@pytest.mark.parametrize('degrees', rolled.ANGLES)
+def test_a_turned_camera_sees_the_same(degrees):
+    lens = (-0.05, 0.1, 1e-3, -2e-3, 0.0)
+    camera = Camera(600.0, 600.0, 310.0, 250.0, 640, 480, lens)
+    made, pixels = rolled.turned(camera, degrees)
+    points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 5), (20, 3))
+    angle = np.radians(degrees)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    moved = np.column_stack([points[:, :2] @ turn.T, points[:, 2]])
+    wanted = camera.project(points) @ pixels[:, :2].T + pixels[:, 2]
+    assert np.abs(made.project(moved) - wanted).max() < 1e-6
+    assert degrees != 90 or (made.width, made.height) == (480, 640)
+
+
+def test_turned_clips_are_compared(monkeypatch, capsys, tmp_path):
+    mm = {0: 50.0, 15: 51.0, 90: 45.0, 180: 60.0}
+    monkeypatch.setattr(rolled, 'in_processes', lambda _, work, *__: [mm[x[3]] for x in work])
+    monkeypatch.setattr(rolled, 'find_clips', lambda *_, **__: ([tmp_path / 'walk'], 'clips'))
+    (tmp_path / 'walk').mkdir()
+    (tmp_path / 'walk' / 'keypoints_mediapipe.npz').touch()
+    text = rolled.as_text(rolled.measure())
+    assert text.splitlines()[1].split() == ['lift', 'walk', '50.0', '51.0', '45.0', '60.0', '+20']
+    assert main(['rolled', '--names', 'none']) == 1
+    assert capsys.readouterr().err.startswith('rolled: clips has no keypoints_mediapipe.npz of no')
 
 
 # real_video

@@ -8,7 +8,7 @@ See `experts.lifter`; with images, `track-video` says more.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -33,12 +33,16 @@ from hmt_ros.experts.lifted_fit import lift_poses
 from hmt_ros.experts.lifter import SHIPPED, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.camera_session import CAMERA_INFO, FRAME_ID
 from hmt_ros.sessions.image_inputs import PREDICTION
+from hmt_ros.sessions.track_reports import reversed_gravity
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.existence import SAME_PERSON
+from hmt_ros.tracking.ground import GroundEstimator, KnownGround
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
@@ -47,6 +51,10 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 LIFTED, REPORT = 'lifted', 'report'
+# Part of gravity along the optical axis above which poses are checked that were lifted without it.
+STEEP = 0.8
+# Lean of the trunk above which a person lies, rad.
+LYING = np.radians(55.0)
 
 EPILOG = """\
 KEYPOINTS is what import-video takes: COCO (.json), a folder of OpenPose, .npz or .csv.
@@ -144,19 +152,26 @@ def _lift(arguments: argparse.Namespace) -> int:
     nobody = not any(len(one.names) for one in seen)
     if nobody and (not seen or any(found.persons())):
         raise ValueError(f'{arguments.keypoints}: no keypoints of the chosen person; see --person')
-    gravity, body, ups = gravity_of(arguments), _body(camera, arguments), None
-    if gravity is not None:
-        ups = np.tile(-unit_vector(gravity, '--gravity'), (len(stamps), 1))
-    with show_progress('lifting', quiet=quiet):
-        mixtures = lift_poses(
+    body = _body(camera, arguments)
+    up = _up(seen, body, arguments)
+    ups = None if up is None else np.tile(up, (len(stamps), 1))
+
+    def lifted(ups: Array | None) -> list[GaussianMixture | None]:
+        return lift_poses(
             lifter, body, camera, 1e-9 * np.array(times, dtype=np.float64), seen, ups,
             lengths_known=arguments.subject is not None, causal=arguments.causal,
             scheme=arguments.scheme,
         )  # fmt: skip
+
+    with show_progress('lifting', quiet=quiet):
+        mixtures = lifted(ups)
     if all(one is None for one in mixtures) and not nobody:
         raise ValueError(
             f'{arguments.keypoints}: no image shows five landmarks that are known; see --scheme'
         )
+    if up is not None:
+        checked = mixtures if abs(up[2]) < STEEP else lifted(None)
+        _check_gravity(up, body, [one for one in checked if one is not None])
     folder.mkdir(parents=True, exist_ok=True)
     messages = RosbagsMessages()
     with BagWriter(folder / LIFTED, overwrite=arguments.overwrite) as bag:
@@ -197,6 +212,38 @@ def _chosen(found: FoundPersons, choice: Choice, fps: float) -> tuple[list[int],
         chosen = chooser.of(i, those)
         seen.append(NO_KEYPOINTS if chosen is None else chosen.keypoints)
     return times, seen
+
+
+def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) -> Array | None:
+    """Unit vector (3,) against gravity as it is given, camera frame; None: it is not.
+
+    Where gravity points to the head of the person, an accelerometer has measured it: the opposite
+    is used, which is told.
+    """
+    gravity = gravity_of(arguments)
+    if gravity is None:
+        return None
+    ground = GroundEstimator(KnownGround(-unit_vector(gravity, '--gravity')))
+    for one in seen:
+        ground.see(one.named_for(body, arguments.scheme)[0])
+    if ground.reversed:
+        tell_user('lift', reversed_gravity(ground.estimate.up))
+    return ground.estimate.up
+
+
+def _check_gravity(up: Array, body: Body, mixtures: Sequence[GaussianMixture]) -> None:
+    """Tells where most poses lie by the given vertical (3,)."""
+    joints = body.joint_positions(np.array([one.means[0] for one in mixtures]))
+    neck, pelvis = body.skeleton.joint_index(('neck', 'pelvis'))
+    trunk = joints[:, neck] - joints[:, pelvis]
+    lean = float(np.median(np.arccos(trunk @ up / np.linalg.norm(trunk, axis=1))))
+    if lean > LYING:
+        tell_user(
+            'lift',
+            f'the person leans by {np.degrees(lean):.0f} degrees by the gravity that is given: '
+            'somebody who lies, or --gravity is not in the optical frame (x right, y down, z '
+            'forward)',
+        )
 
 
 def _body(camera: Camera, arguments: argparse.Namespace) -> Body:

@@ -30,6 +30,8 @@ from hmt_ros.inference.arrays import Array
 # the x and y radii, distances by which it exceeds the start and the end of its segment more than
 # the model's, and its shift along the y axis, m.
 GROWTH = ('width', 'depth', 'start', 'end', 'shift')
+# Angles of a root that can be levelled.
+ROOT_ANGLES = ('root_z', 'root_y', 'root_x')
 # Half of the least height of a part, m.
 LEAST_HEIGHT = 5e-3
 
@@ -107,6 +109,8 @@ class Body:
         joint_errors: (J,) standard deviation of a coordinate of each joint, relative to the pelvis,
             that all poses share, because people's joints are not exactly the model's, m.
         growth: (B, 5) how each part differs from the model's; see `GROWTH`.
+        level: (3, 3) rotation from the axes that the angles of the root are measured against to
+            those of the camera; see `levelled`.
     """
 
     skeleton: Skeleton
@@ -121,6 +125,7 @@ class Body:
     symmetries: Mapping[str, Symmetry]
     joint_errors: Array
     growth: Array = field(default_factory=lambda: np.zeros((0, len(GROWTH))))
+    level: Array = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
         wanted = (len(self.shapes), len(GROWTH))
@@ -293,6 +298,22 @@ class Body:
             ValueError: another shape, or numbers that are not finite.
         """
         return replace(self, growth=np.asarray(growth, dtype=np.float64))
+
+    def levelled(self, level: Array) -> Body:
+        """The same body, with the angles of the root measured against other axes.
+
+        Somebody upright is then far from the poles and the limits of these angles, however the
+        camera is turned. Translations stay in the axes of the camera. A body whose root has other
+        angles keeps its level.
+
+        Args:
+            level: (3, 3) rotation from those axes, of an upright camera, to the camera's.
+        """
+        if np.array_equal(level, self.level) or not {*ROOT_ANGLES} <= {*self.dof_names}:
+            return self
+        mounts = self.skeleton.mounts.copy()
+        mounts[0] = level @ self.level.T @ mounts[0]
+        return replace(self, skeleton=replace(self.skeleton, mounts=mounts), level=level)
 
     def with_widths(self, widths: Sequence[float]) -> Body:
         """The same body, the x and y radii of its parts (B,) multiplied by these factors."""

@@ -22,6 +22,8 @@ from hmt_ros.inference.arrays import Array
 DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
 
 NEAR = 0.01  # least depth of a point that has an image, m
+# Least part of the vertical across the optical axis by which a camera has a roll.
+STEEP = 0.1
 STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
 # Tangents at which a distortion is checked, and the largest factor by which a lens magnifies more
 # farther out: calibrations of real lenses reach 2.5, at the corners of wide images.
@@ -240,6 +242,38 @@ def unfolded_share(camera: Camera) -> float:
     steepest = LARGEST_RISE * np.minimum.accumulate(slope, axis=1).clip(max=1.0)
     folded = (reached < corners) & ((slope <= 0) | (slope > steepest))
     return float(np.where(folded, reached / corners, 1.0).min())
+
+
+def roll(ups: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) about the optical axis, from an upright camera's axes to a camera's.
+
+    Args:
+        ups: (..., 3) vectors against gravity, camera frame. Those nearly along the optical axis
+            (`STEEP`), and zeros, tell of no roll.
+    """
+    x, y, _ = np.moveaxis(np.asarray(ups, dtype=np.float64), -1, 0)
+    length = np.hypot(x, y)
+    x, y = np.where(length > STEEP, (x, y), np.reshape((0.0, -1.0), (2, *(1,) * np.ndim(length))))
+    sine, cosine = np.stack([x, -y]) / np.hypot(x, y)
+    result = np.zeros((*np.shape(x), 3, 3))
+    result[..., 0, 0] = result[..., 1, 1] = cosine
+    result[..., 0, 1], result[..., 1, 0], result[..., 2, 2] = -sine, sine, 1.0
+    return result
+
+
+def shortest_turn(start: Array, end: Array) -> Array:
+    """The rotation (3, 3) by the least angle that takes a unit vector to another.
+
+    For opposite vectors in the plane of the image, where no rotation is the shortest, it is the one
+    about the optical axis, as when the camera hangs upside down.
+    """
+    cosine = float(start @ end)
+    if cosine <= -1.0 + 1e-9:
+        return np.diag([-1.0, -1.0, 1.0])
+    x, y, z = np.cross(start, end)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    result: Array = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+    return result
 
 
 @dataclass(frozen=True)

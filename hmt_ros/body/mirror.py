@@ -15,16 +15,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmt_ros.body.body import Body
+from hmt_ros.body.body import ROOT_ANGLES, Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, other_side
 from hmt_ros.inference.arrays import Array, Index, Mask
+from hmt_ros.inference.mixture import GaussianMixture
 
 # A person whose front is turned away from the image plane by less than this is seen from the side,
 # as sine of the angle.
 SIDEWAYS = 0.12
 # Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'
+TURN = 2.0 * np.pi
+# Share of their limits below which the angles of a root are far from them and from the poles.
+CLEAR = 0.85
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def mirror(body: Body, poses: ArrayLike) -> Array:
@@ -105,6 +110,77 @@ def root_angles(body: Body, rotations: Array) -> Array:
     return np.stack([z, y, x], axis=1)
 
 
+def turned(
+    body: Body, poses: Array, to: Body, rotation: Array | None = None, turn: float = 0.0
+) -> Array:
+    """Poses (N, d) whose roots are turned, of a body that may have another level.
+
+    Args:
+        body: of the poses.
+        poses: (N, d).
+        to: the same body, of the result.
+        rotation: (3, 3) by which the roots are turned, camera frame; None: not at all.
+        turn: angle about z by which the roots have turned before, up to whole turns, rad.
+    """
+    root, rotations = root_rotation_dofs(body.skeleton), root_rotations(body, poses)
+    angles = root_angles(to, rotations if rotation is None else rotation @ rotations)
+    # The turn nearest to that of before.
+    offset_of_turns = poses[:, root[0]] + turn - angles[:, 0]
+    angles[:, 0] += TURN * np.round(offset_of_turns / TURN)
+    result = poses.copy()
+    result[:, root] = angles
+    return result
+
+
+def turn_jacobians(
+    body: Body, before: Array, to: Body, after: Array, rotation: Array | None = None
+) -> Array:
+    """Derivatives (N, d, d) of `turned` at poses (N, d), whose results are `after`."""
+    root = root_rotation_dofs(body.skeleton)
+    # Columns are the axes that the angles turn about.
+    old, new = (
+        forward(one.skeleton, poses).axes[root].transpose(2, 1, 0)
+        for one, poses in ((body, before), (to, after))
+    )
+    result = np.tile(np.eye(body.dimension), (len(before), 1, 1))
+    moved = old if rotation is None else rotation @ old
+    result[np.ix_(range(len(before)), root, root)] = np.linalg.solve(new, moved)
+    return result
+
+
+def relevelled(body: Body, mixture: GaussianMixture, to: Body) -> GaussianMixture:
+    """A mixture over poses of a body, as one over poses of the same body with another level."""
+    if np.array_equal(body.level, to.level):
+        return mixture
+    means = turned(body, mixture.means, to)
+    jacobians = turn_jacobians(body, mixture.means, to, means)
+    covariances = propagated(jacobians, mixture.covariances)
+    return GaussianMixture(mixture.weights, means, covariances)
+
+
+def clear_level(body: Body, pose: Array) -> Array:
+    """The level (3, 3) at which the root angles of a pose (d,) are far from their limits.
+
+    It is that of the body where they are, else turned about the optical axis by quarter turns.
+    """
+    best, least = body.level, CLEAR
+    if not {*ROOT_ANGLES} <= {*body.dof_names}:
+        return best
+    limits = root_rotation_dofs(body.skeleton)[1:]
+    for turn in (np.eye(3), QUARTER, QUARTER @ QUARTER, QUARTER.T):
+        angles = turned(body, pose[None], body.levelled(turn @ body.level))[0, limits]
+        share = float(np.abs(angles / body.upper[limits]).max())
+        if share < least:
+            best, least = turn @ body.level, 0.0 if turn[0, 0] > 0.5 else share
+    return best
+
+
+def propagated(jacobians: Array, covariances: Array) -> Array:
+    """Covariances J S J' (N, n, n), from Jacobians J (N, n, m) and covariances S (N, m, m)."""
+    result: Array = jacobians @ covariances @ jacobians.swapaxes(1, 2)
+    return 0.5 * (result + result.swapaxes(1, 2))
+
+
 def left_directions(body: Body, poses: Array) -> Array:
     """Unit vectors (N, 3) to the left of the persons in poses (N, d), in the camera frame.
 
@@ -144,9 +220,6 @@ def faces_back(body: Body, poses: Array, reference: Array) -> Mask:
     away = np.linalg.det(np.stack([left, up, _units(pelvis)], axis=1))
     apart = (away[1:] * away[0] < 0) & (np.abs(away[1:] - away[0]) > 2 * SIDEWAYS)
     return np.asarray((left[1:] @ left[0] < 0) | apart, dtype=np.bool_)
-
-
-TURN = 2.0 * np.pi
 
 
 def endless(body: Body) -> Mask:

@@ -18,8 +18,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera import Camera, roll
 from hmt_ros.body.kinematics import forward, point_energy
+from hmt_ros.body.mirror import relevelled
 from hmt_ros.body.pose_prior import LEARNED, pose_prior
 from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_offsets, landmark_rays
 from hmt_ros.image.keypoint_schemes import AUTO, noise_of
@@ -84,13 +85,15 @@ def lift_poses(
     person = lifter.proportions(body) if lengths_known else None
     lifted = lifter.lift(stamps, rays, confidences, stamps, ups, person, causal=causal)
     rows = [i for i, one in enumerate(lifted) if one is not None]
+    level = body.level if ups is None else roll(ups.mean(0))
+    upright = body.levelled(level)
     found = poses_of(
-        body, [one for one in lifted if one is not None], rays[rows], confidences[rows],
+        upright, [one for one in lifted if one is not None], rays[rows], confidences[rows],
         KNOWN_SIZE if lengths_known else UNKNOWN_SIZE,
     )  # fmt: skip
     result: list[GaussianMixture | None] = [None] * len(lifted)
     for row, mixture in zip(rows, found, strict=True):
-        result[row] = mixture
+        result[row] = relevelled(upright, mixture, body)
     return result
 
 

@@ -13,7 +13,8 @@ A window has a place for each of `TIMES`, relative to the image that is asked fo
 fills it, if it is near enough, so that any frame rate fits. Its inputs are the places of the
 landmarks in the plane of a camera that looks at the trunk, over their extent, with confidences, how
 far each image is from its time, the extent, the direction against gravity in that camera, and the
-proportions of the person, as far as both are known.
+proportions of the person, as far as both are known. That camera is turned about its axis until it
+stands upright, as far as gravity is known: the experts have seen no other.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Body
-from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera import Camera, roll
 from hmt_ros.body.model_file import load_body
 from hmt_ros.experts.model_file import (
     FAULTS,
@@ -188,8 +189,10 @@ def window_inputs(
     weight = now * core
     weight = np.where((weight > 0).sum(1, keepdims=True) >= 2, weight, now) + f32(1e-9)
     middle = (places[:, 0] * weight[..., None]).sum(1) / weight.sum(1)[:, None]
-    ahead = np.concatenate([middle, np.ones((n, 1), dtype=f32)], axis=1)
-    axes = ray_rotations(ahead.astype(np.float64)).transpose(0, 2, 1)
+    ahead = np.concatenate([middle, np.ones((n, 1), dtype=f32)], axis=1).astype(np.float64)
+    level = roll(ups)
+    upright = ray_rotations(np.einsum('nj,nji->ni', ahead, level)).transpose(0, 2, 1)
+    axes = upright @ level.transpose(0, 2, 1)
     turn = axes.astype(f32)
     homogeneous = np.concatenate([places, np.ones((n, s, count, 1), dtype=f32)], axis=3)
     seen = homogeneous.reshape(n, -1, 3) @ turn.transpose(0, 2, 1)

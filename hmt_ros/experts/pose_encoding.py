@@ -1,7 +1,8 @@
 """The encoding of poses as targets for experts: as the camera sees them, without wrap-around.
 
 A target has D = 6 + A numbers. The first six are the front axis and the up axis of the pelvis, in
-the frame of the viewing ray: the camera, turned so that its optical axis meets the pelvis. One
+the frame of the viewing ray: the camera at the level of the body, turned so that its optical axis
+meets the pelvis. One
 posture then has one target wherever it is in the image, and a turning person does not jump from
 +180 to -180 degrees. The other numbers are the A joint angles, whose limits span less than a turn.
 The position of the person is not part of the target, because the shape of a silhouette does not
@@ -65,7 +66,7 @@ class PoseEncoding:
         """
         poses = np.asarray(poses, dtype=np.float64)
         turned = root_rotations(self.body, poses)
-        seen = ray_rotations(poses[:, :3]).transpose(0, 2, 1) @ turned
+        seen = self._from_view(poses[:, :3]).transpose(0, 2, 1) @ turned
         axes = seen[:, :, 1:].transpose(0, 2, 1).reshape(-1, AXES)
         return np.concatenate([axes, poses[:, AXES:]], axis=1)
 
@@ -78,7 +79,7 @@ class PoseEncoding:
         targets, roots = self._checked(targets, roots)
         poses = np.empty((len(targets), self.body.dimension))
         poses[:, :3] = roots
-        turned = ray_rotations(roots) @ _orthogonal(targets[:, :AXES])
+        turned = self._from_view(roots) @ _orthogonal(targets[:, :AXES])
         poses[:, 3:AXES] = root_angles(self.body, turned)
         lower, upper = self.body.lower[AXES:], self.body.upper[AXES:]
         poses[:, AXES:] = np.clip(targets[:, AXES:], lower, upper)
@@ -96,13 +97,13 @@ class PoseEncoding:
         axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
         from_rotation = np.linalg.pinv(axes, rcond=np.cos(STEEPEST) / 2)
         by_target, by_root = np.zeros((n, d, d)), np.zeros((n, d, 3))
-        to_camera = ray_rotations(roots)
+        to_camera = self._from_view(roots)
         by_target[:, 3:AXES, :AXES] = (
             from_rotation @ to_camera @ _rotation_by_axes(targets[:, :AXES])
         )
         by_target[:, AXES:, AXES:] = np.eye(d - AXES)
         by_root[:, :3] = np.eye(3)
-        by_root[:, 3:AXES] = from_rotation @ _rotation_by_root(roots)
+        by_root[:, 3:AXES] = from_rotation @ self._view_by_root(roots)
         return by_target, by_root
 
     def encoding_jacobians(self, poses: ArrayLike) -> Array:
@@ -110,15 +111,27 @@ class PoseEncoding:
         poses = np.asarray(poses, dtype=np.float64)
         d = self.body.dimension
         result = np.zeros((len(poses), d, d))
-        to_ray = ray_rotations(poses[:, :3]).transpose(0, 2, 1)
+        to_ray = self._from_view(poses[:, :3]).transpose(0, 2, 1)
         axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
         turned = root_rotations(self.body, poses)  # camera frame
         # The frame of the ray turns with the root, so in it an axis turns back.
-        turns = np.concatenate([-_rotation_by_root(poses[:, :3]), axes], axis=2)
+        turns = np.concatenate([-self._view_by_root(poses[:, :3]), axes], axis=2)
         for k in range(2):  # front and up
             moved = np.cross(turns, turned[:, :, k + 1, None], axis=1)
             result[:, 3 * k : 3 * k + 3, :AXES] = to_ray @ moved
         result[:, AXES:, AXES:] = np.eye(d - AXES)
+        return result
+
+    def _from_view(self, points: Array) -> Array:
+        """Rotations (N, 3, 3) from a camera that looks at points (N, 3), upright by the level."""
+        level = self.body.level
+        result: Array = level @ ray_rotations(points @ level)
+        return result
+
+    def _view_by_root(self, points: Array) -> Array:
+        """Derivatives (N, 3, 3) of that rotation by the points, camera frame."""
+        level = self.body.level
+        result: Array = level @ _rotation_by_root(points @ level) @ level.T
         return result
 
     def _checked(self, targets: ArrayLike, roots: ArrayLike) -> tuple[Array, Array]:

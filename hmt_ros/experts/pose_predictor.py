@@ -136,7 +136,7 @@ class PosePredictor:
         return self.encoding.body
 
     def with_body(self, body: Body) -> PosePredictor:
-        """The predictor for a person with other segment lengths.
+        """The predictor for a person with other segment lengths, or another level.
 
         Raises:
             ValueError: the body has other degrees of freedom.
@@ -205,7 +205,8 @@ class PosePredictor:
         return self._described(person_blob(mask), camera)
 
     def _described(self, blob: PersonBlob, camera: Camera) -> Array:
-        parts = silhouette_parts(centred_view(blob, camera), self.descriptor.points)
+        view = centred_view(blob, camera, self.body.level)
+        parts = silhouette_parts(view, self.descriptor.points)
         result: Array = self.descriptor.describe([parts])[0]
         return result
 

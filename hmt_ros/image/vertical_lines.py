@@ -26,6 +26,8 @@ from scipy.special import expit, logsumexp
 from hmt_ros.body.camera import Camera
 from hmt_ros.inference.arrays import Array, Image, Index
 
+# The level of an upright camera.
+UPRIGHT = np.eye(3)
 # Images are made this large at most, px, and a line has this length at least, rad.
 LARGEST, SHORTEST = 800, 0.03
 # Lines in planes through the camera that differ by less are one line, rad.
@@ -44,6 +46,8 @@ FINER = tuple(np.radians([4.0, 3.0, 2.0, 1.0, 0.5, 0.5, 0.5]))
 # Deviation of the vertical of the best frame on the raster, and of the refined one where lines are
 # many: walls lean and lenses bend, rad.
 RASTER_SIGMA, LEAST_SIGMA = np.radians(4.0), np.radians(1.0)
+# Share of looks whose vertical is right, and density of one that is not, 1/sr.
+RIGHT, ANYWHERE = 0.9, 1.0 / (2.0 * np.pi)
 # Probability that there is a frame, and that its vertical is in the surroundings of the best one,
 # rad, above which that is believed.
 BELIEVED, SURROUNDINGS = 0.95, np.radians(10.0)
@@ -75,11 +79,37 @@ class Vertical:
     up: Array
     sigma: float
 
+    def agreement(self, up: Array, sigma: float) -> float:
+        """Density of this vertical where another (3,) with a deviation is right, over any alone."""
+        variance = sigma**2 + self.sigma**2
+        square = 2.0 - 2.0 * float(up @ self.up)
+        near = np.exp(-0.5 * square / variance) / (2.0 * np.pi * variance)
+        return float(RIGHT * near / ANYWHERE + 1.0 - RIGHT)
 
-def seen_vertical(image: Image, camera: Camera) -> Vertical | None:
-    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines show none."""
+    def refined(self, up: Array, sigma: float) -> Vertical:
+        """Another vertical, (3,) with a deviation, refined by this one as far as both agree.
+
+        It moves by its deviation at most.
+        """
+        right = 1.0 - (1.0 - RIGHT) / self.agreement(up, sigma)
+        share = max(right, 0.0) * sigma**2 / (sigma**2 + self.sigma**2)
+        share = min(share, sigma / max(float(np.linalg.norm(self.up - up)), 1e-9))
+        mean = (1.0 - share) * up + share * self.up
+        return Vertical(mean / np.linalg.norm(mean), sigma * float(np.sqrt(1.0 - share)))
+
+
+def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Vertical | None:
+    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines show none.
+
+    Args:
+        image: seen by the camera.
+        camera: that is mounted as most are, but for its level.
+        level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
+    """
     lines = straight_lines(image, camera)
-    return vertical_of(lines) if len(lines.normals) else None
+    upright = lines._replace(normals=lines.normals @ level, middles=lines.middles @ level)
+    found = vertical_of(upright) if len(lines.normals) else None
+    return None if found is None else Vertical(level @ found.up, found.sigma)
 
 
 def straight_lines(image: Image, camera: Camera) -> Lines:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from hmt_ros.experts.lifter import SHIPPED as LIFTER
 from hmt_ros.experts.pose_predictor import ALONE, PROPAGATIONS
 from hmt_ros.image.background import BackgroundSettings
+from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_CONFIGURE,
@@ -32,6 +33,9 @@ class BmeParameters(CameraNodeParameters):
         background_file: Image of the empty scene as the camera sees it; if empty, it is learned
             once nothing has moved for two seconds.
         stature: Height of the person, m; 0 selects that of the model.
+        gravity: Direction of gravity in the camera optical frame, three numbers of any length.
+            Images and keypoints of a camera on its side are turned upright by it. Empty: it is
+            upright.
         least_height: Minimum height of a silhouette that counts as a person, px.
         predict_from: Cue of the predictions: 'silhouettes', 'keypoints' of a detector (no image is
             needed), or 'both'. With 'both' an image waits for its keypoints; silhouettes serve
@@ -52,6 +56,7 @@ class BmeParameters(CameraNodeParameters):
     model_file: str = parameter_field('', NEXT_CONFIGURE)
     background_file: str = parameter_field('', NEXT_CONFIGURE)
     stature: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3.0))
+    gravity: tuple[float, ...] = parameter_field((), NEXT_CONFIGURE)
     least_height: int = parameter_field(40, AT_ONCE, (1, 10_000))
     predict_from: str = parameter_field(FROM_SILHOUETTES, NEXT_CONFIGURE)
     lifter: str = parameter_field(LIFTER, NEXT_CONFIGURE)
@@ -66,6 +71,8 @@ class BmeParameters(CameraNodeParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.gravity:
+            unit_vector(self.gravity, 'gravity')
         check_choices(self, propagation=PROPAGATIONS, predict_from=CUES)
         if self.predict_from != FROM_SILHOUETTES and not self.lifter:
             raise ValueError(f"predict_from {self.predict_from!r} needs a lifter, saw ''")

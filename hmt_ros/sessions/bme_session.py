@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Camera
+from hmt_ros.body.camera import roll
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.lifted_fit import KeypointPredictor
 from hmt_ros.experts.pose_predictor import (
@@ -56,6 +57,7 @@ from hmt_ros.sessions.bme_parameters import (
     FROM_SILHOUETTES,
     BmeParameters,
 )
+from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
     CAMERA_MOVED,
@@ -285,7 +287,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                     self._predictor.body, self.parameters.keypoint_scheme
                 )
                 made.add(known, each / SECOND_NS)
-        found = made.predict() if taken.get(stamp) is not None else None
+        gravity = self.parameters.gravity
+        up = -unit_vector(gravity, 'gravity') if gravity else None
+        found = made.predict(up) if taken.get(stamp) is not None else None
         return None if found is None else found[: self.parameters.max_hypotheses].normalised()
 
     def _take_image(self, message: Any, stamp: int) -> None:
@@ -498,10 +502,14 @@ def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
             f"propagation 'experts' needs a model that was trained with --dynamics, which "
             f'{parameters.model_file or SHIPPED} was not'
         )
-    if not parameters.stature:
-        return predictor, SIZE_SPREAD
-    body = predictor.body.with_stature(parameters.stature)
-    return predictor.with_body(body), _MEASURED_SPREAD
+    spread = SIZE_SPREAD
+    if parameters.stature:
+        predictor = predictor.with_body(predictor.body.with_stature(parameters.stature))
+        spread = _MEASURED_SPREAD
+    if parameters.gravity:
+        level = roll(-unit_vector(parameters.gravity, 'gravity'))
+        predictor = predictor.with_body(predictor.body.levelled(level))
+    return predictor, spread
 
 
 def _height(mask: Mask) -> int:

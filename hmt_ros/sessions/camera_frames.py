@@ -23,6 +23,10 @@ from hmt_ros.tracking.ground import KnownGround
 _SHORTEST = 1e-6
 
 
+# Standard deviation of a direction from transforms: of an inertial sensor and its mounting, rad.
+UP_SIGMA = 0.01
+
+
 class SeenGravity(NamedTuple):
     """Gravity and height of a camera, from the transforms at a time.
 
@@ -107,7 +111,7 @@ class CameraFrames:
         height = otherwise.camera_height
         if self._floor and self.gravity.height > 0:
             height = self.gravity.height
-        return KnownGround(self.gravity.up, height)
+        return KnownGround(self.gravity.up, height, UP_SIGMA)
 
     def _look_for_gravity(self, camera_frame: str, stamp_ns: int) -> list[tuple[Fault, str]]:
         name, self.newest = self.gravity_frame, False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from hmt_ros.image.background import BackgroundSettings
@@ -21,8 +22,6 @@ from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.evaluation_plan import LIVE
 from hmt_ros.tracking.ground import KnownGround
 
-# Gravity points down in the image, or up by 10 degrees at most, where a camera looks down steeply.
-UPSIDE_DOWN = -0.17
 # Settings that are parameters, with their limits.
 _TRACKER = {
     'evaluation_budget': (1, 100_000),
@@ -57,6 +56,8 @@ class FilterParameters(CameraNodeParameters):
             hypotheses.
         gravity: Direction of gravity in the camera optical frame, three numbers of any length,
             [0.0, 1.0, 0.0] for a level camera; if empty, lines of the scene show it where they can.
+        gravity_sigma: Standard deviation of the parameter gravity, degrees; lines of the scene
+            refine it within that.
         camera_height: Height of the camera above the floor, m; 0 if unknown.
         focal_length_sigma: Relative standard deviation of the focal length in camera_info, which
             makes the published depths uncertain; 0 for a calibrated camera, 0.2 for a guess.
@@ -96,6 +97,7 @@ class FilterParameters(CameraNodeParameters):
     use_depth: bool = parameter_field(False, AT_ONCE)
     use_predictions: bool = parameter_field(False, AT_ONCE)
     gravity: tuple[float, ...] = parameter_field((), NEXT_TRACK)
+    gravity_sigma: float = parameter_field(2.0, NEXT_TRACK, (0.1, 45.0))
     camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))
     focal_length_sigma: float = parameter_field(0.0, AT_ONCE, FRACTION)
     gravity_frame: str = parameter_field('', NEXT_CONFIGURE)
@@ -124,12 +126,8 @@ class FilterParameters(CameraNodeParameters):
             raise ValueError("body_model must be a name or a file, saw ''")
         if self.use_keypoints_3d and not self.use_keypoints:
             raise ValueError('use_keypoints_3d needs use_keypoints, which is false')
-        if self.gravity and unit_vector(self.gravity, 'gravity')[1] < UPSIDE_DOWN:
-            raise ValueError(
-                f'gravity must be the direction in which things fall, such as [0.0, 1.0, 0.0], saw '
-                f'{list(self.gravity)}, which points up in the image: an accelerometer at rest '
-                f'measures the opposite'
-            )
+        if self.gravity:
+            unit_vector(self.gravity, 'gravity')
         if self.publish_in_fixed_frame and not self.fixed_frame:
             raise ValueError('publish_in_fixed_frame needs the name of fixed_frame, which is empty')
         if self.floor_in_gravity_frame and not self.gravity_frame:
@@ -156,4 +154,4 @@ class FilterParameters(CameraNodeParameters):
     def known_ground(self) -> KnownGround:
         """Gravity and floor from the parameters, without transforms."""
         up = -unit_vector(self.gravity, 'gravity') if self.gravity else None
-        return KnownGround(up, self.camera_height or None)
+        return KnownGround(up, self.camera_height or None, math.radians(self.gravity_sigma))

@@ -252,7 +252,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             elif self.frames.newest:
                 seen = self.frames.known_ground(KnownGround())
                 assert seen.up is not None
-                self._tracker.set_gravity(seen.up, seen.camera_height)
+                self._tracker.set_gravity(seen.up, seen.camera_height, seen.up_sigma)
             if (pose := self.frames.pose) is not None:
                 self._tracker.set_camera(pose.translation, pose.rotation)
             posterior, likelihood = self._tracker.step(

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmt_ros.body import Body
-from hmt_ros.body.mirror import root_rotation_dofs
+from hmt_ros.body.mirror import propagated, root_rotation_dofs
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.transform_buffer import Transform
-from hmt_ros.tracking.camera_motion import CameraMotion, propagated
+from hmt_ros.tracking.camera_motion import CameraMotion
 
 # Rotation to (x forward, y left, z up) from (x right, y down, z forward).
 FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -57,12 +57,12 @@ class FixedFrame:
         """A mixture over poses of a body in the camera frame, and velocities (K, d), if known.
 
         Returns:
-            Both in the frame `optical`. Means are carried over exactly, covariances and velocities
-            with the Jacobian at the means.
+            Both in the frame `optical`, against whose axes root angles are measured. Means are
+            carried over exactly, covariances and velocities with the Jacobian at the means.
         """
-        motion = self.motion
-        means = motion.free_poses(body, mixture.means, self.turn)
-        jacobians = motion.jacobians(body, mixture.means, means)
+        motion, upright = self.motion, body.levelled(np.eye(3))
+        means = motion.free_poses(body, mixture.means, self.turn, upright)
+        jacobians = motion.jacobians(body, mixture.means, means, upright)
         covariances = propagated(jacobians, mixture.covariances)
         if velocities is not None:
             velocities = np.einsum('kij,kj->ki', jacobians, velocities)
@@ -71,7 +71,8 @@ class FixedFrame:
     def turn_of(self, body: Body, pose: Array) -> float:
         """The angle about z by which the root of a pose (d,) is turned, rad; see `turn`."""
         about_z = root_rotation_dofs(body.skeleton)[0]
-        placed = self.motion.free_poses(body, pose[None], self.turn)[0]
+        upright = body.levelled(np.eye(3))
+        placed = self.motion.free_poses(body, pose[None], self.turn, upright)[0]
         return float(placed[about_z] - pose[about_z])
 
 

@@ -158,13 +158,14 @@ class RobotOutputs:
                 f'{LONGEST_FORECAST:g} s later, saw {stamp_ns} ns'
             )
         mixture = with_depth_error(seen.forecaster.at(stamp_ns), seen.focal_length_sigma)
-        frame = seen.frame_id
+        body, frame = seen.body, seen.frame_id
         if seen.fixed is not None:
-            mixture, _ = seen.fixed.placed(seen.body, mixture)
+            mixture, _ = seen.fixed.placed(body, mixture)
+            body = body.levelled(np.eye(3))
             frame = seen.fixed.optical
         tracking = told.state is KeepOutState.TRACKING
         return PoseMixture.of_body(
-            seen.body, mixture, MixtureKind.FORECAST, stamp_ns, frame,
+            body, mixture, MixtureKind.FORECAST, stamp_ns, frame,
             state=TrackState.TRACKING if tracking else TrackState.LOST,
             track_id=told.track_id,
             existence_probability=told.existence,

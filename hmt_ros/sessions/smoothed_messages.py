@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hmt_ros.body import Body
+from hmt_ros.body.mirror import propagated, turn_jacobians, turned
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.reduction import led
@@ -85,6 +86,14 @@ def trajectory_content(
         for t, stamp in enumerate(content['stamps_ns']):
             wide[:, t] += shapes.get(stamp, 0.0)
         content['marginal_covariances'] = wide
+    if (camera := of.body.levelled(np.eye(3))) is not of.body:
+        means = found.means.reshape(-1, of.body.dimension)
+        placed = turned(of.body, means, camera)
+        content['means'] = placed.reshape(found.means.shape)
+        if covariances:
+            jacobians = turn_jacobians(of.body, means, camera, placed)
+            flat = content['marginal_covariances'].reshape(jacobians.shape)
+            content['marginal_covariances'] = propagated(jacobians, flat).reshape(wide.shape)
     return TrajectoryContent(
         **content,
         body_model=of.body.name,
@@ -145,8 +154,8 @@ def final_messages(
     if wanted('smoothed_joint_states'):
         yield 'smoothed_joint_states', heaviest_joint_state(MESSAGES, content)
     if shows_links:
-        heaviest = mixture.means[int(np.argmax(mixture.weights))]
-        names, rotations, origins = links_of(of.body, heaviest)
+        heaviest = content.means[int(np.argmax(content.weights))]
+        names, rotations, origins = links_of(of.body.levelled(np.eye(3)), heaviest)
         children = [f'{frame_prefix}{name}' for name in names]
         parents, stamp = [of.frame_id] * len(names), pose.stamp_ns
         yield '/tf', transforms_message(MESSAGES, parents, children, rotations, origins, stamp)

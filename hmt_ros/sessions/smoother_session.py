@@ -20,6 +20,8 @@ The rules, besides those of `Session`:
   (`or_missed`), and a motion passes over images that would turn it round and back.
 - The uncertainty of the person's shape is the same in all images. It is added once, to the
   covariances that are published.
+- Near the limits of the root's angles, as of a person before a camera on its side, mixtures are
+  smoothed as a camera sees them that is turned by quarter turns; then a new window begins.
 - Angles that go round are taken from mixture to mixture without whole turns, each mode from the
   nearest one before: to the dynamics a turn more would be a jump.
 - The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
@@ -34,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
-from hmt_ros.body.mirror import free_limits, without_turns
+from hmt_ros.body.mirror import clear_level, free_limits, relevelled, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.handled import Fault
@@ -173,6 +175,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 self._take_nobody(stamp, content.existence_probability)
                 return
             evidence, of = evidence_of(content), self._whose(content)
+            of = self._clear(of, evidence.mixture)
         except MessageError as error:
             self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
@@ -189,6 +192,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._end_window()
             self._first_identity = 1
         self._begin_track(of)
+        evidence = _levelled(evidence, of.body)
         evidence = self._without_turns(evidence, of.body)
         p = self.parameters
         if self._newest is not None:
@@ -212,9 +216,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._end_window()
             return
         self._newest, self._nobody = stamp, False
-        self._open[stamp] = OpenPose(
-            content.state, content.existence_probability, content.shape_covariance
-        )
+        self._open[stamp] = OpenPose(content.state, content.existence_probability, evidence.shape)
         self._log.counts['smoothed'] += 1
         self.kept = KeptMixtures(of, (*self.kept.items, evidence)[-p.window_length :])
         if update.trajectories is not None:
@@ -277,6 +279,18 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         body = body_of(content, model, any_name=bool(chosen))
         of = SmoothedBody(body, content.frame_id, content.track_id)
         self._resolved = about, of
+        return of
+
+    def _clear(self, of: SmoothedBody, mixture: GaussianMixture) -> SmoothedBody:
+        """The person, with a level at which the heaviest pose is far from the poles."""
+        heaviest = mixture[np.array([np.argmax(mixture.weights)])]
+        seen = relevelled(of.body.levelled(np.eye(3)), heaviest, of.body)
+        level = clear_level(of.body, seen.means[0])
+        if np.array_equal(level, of.body.level):
+            return of
+        of = replace(of, body=of.body.levelled(level))
+        assert self._resolved is not None
+        self._resolved = self._resolved[0], of
         return of
 
     def _begin_track(self, of: SmoothedBody) -> None:
@@ -407,6 +421,18 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
 
 
+def _levelled(evidence: Evidence, body: Body) -> Evidence:
+    """Evidence over poses with root angles against the camera, as one over poses of a body."""
+    camera = body.levelled(np.eye(3))
+    if camera is body:
+        return evidence
+    mixture, shape = evidence.mixture, evidence.shape
+    if shape is not None:
+        at_best = GaussianMixture(np.ones(1), mixture.means[:1], shape[None])
+        shape = relevelled(camera, at_best, body).covariances[0]
+    return evidence._replace(mixture=relevelled(camera, mixture, body), shape=shape)
+
+
 def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
     """The covariances of shapes that are known, by stamp."""
     return {stamp: shape for stamp, shape in items if shape is not None}
@@ -415,6 +441,8 @@ def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:
     """Whether two bodies are one person, whose lengths are estimated from image to image."""
     if (one.body.name, one.frame_id) != (other.body.name, other.frame_id):
+        return False
+    if not np.array_equal(one.body.level, other.body.level):
         return False
     if 0 not in (one.track_id, other.track_id) and one.track_id != other.track_id:
         return False

@@ -15,6 +15,7 @@ import numpy as np
 
 from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import turned
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import WaitingImage
@@ -109,9 +110,10 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     """
     stamp, frame = track.waiting.stamp_ns, track.waiting.frame_id
     tracker, p = track.tracker, track.parameters
-    body, point = tracker.body, tracker.point_estimate
-    skeleton, posterior = body.skeleton, track.posterior
-    joints = forward(skeleton, posterior.means).joints().transpose(2, 0, 1)
+    posterior = track.posterior
+    body, point = _against_camera(tracker)
+    skeleton = body.skeleton
+    joints = forward(tracker.body.skeleton, posterior.means).joints().transpose(2, 0, 1)
     ground = _ground_state(track)
     # Both are made before anything is published: either may be invalid for a message.
     made = {
@@ -126,7 +128,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     for topic, mixture in mixtures.items():
         yield topic, pose_mixture_message(MESSAGES, mixture)
     if wanted('person_pose'):
-        pose, its_frame = person_pose(body, posterior), frame
+        pose, its_frame = person_pose(tracker.body, posterior), frame
         if track.fixed is not None:
             pose, its_frame = pose.seen_from(*track.fixed.camera), track.fixed.name
         yield 'person_pose', person_pose_message(MESSAGES, pose, stamp, its_frame)
@@ -215,12 +217,13 @@ def robot_messages(
 def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
     """The posterior, with joints (K, J, 3) in the camera frame."""
     tracker, posterior, velocities = track.tracker, track.posterior, track.tracker.velocities
-    frame, positions = track.waiting.frame_id, joints
+    body, frame, positions = tracker.body, track.waiting.frame_id, joints
     if (fixed := track.fixed) is not None:
-        posterior, velocities = fixed.placed(tracker.body, posterior, velocities)
+        posterior, velocities = fixed.placed(body, posterior, velocities)
+        body = body.levelled(np.eye(3))
         frame, positions = fixed.optical, fixed.motion.points(joints)
     return PoseMixture.of_body(
-        tracker.body,
+        body,
         posterior,
         MixtureKind.POSTERIOR,
         track.waiting.stamp_ns,
@@ -242,13 +245,14 @@ def _likelihood(track: TrackedImage) -> PoseMixture:
     tracker, likelihood, frame = track.tracker, track.likelihood, track.waiting.frame_id
     # The focal length errs alike in all images, as the shape does.
     focal = depth_covariances(track.posterior.means[:1], track.parameters.focal_length_sigma)[0]
-    shape, errors = tracker.shape_covariance + focal, tracker.likelihood_errors
+    body, shape, errors = tracker.body, tracker.shape_covariance + focal, tracker.likelihood_errors
     if (fixed := track.fixed) is not None:
-        likelihood, _ = fixed.placed(tracker.body, likelihood)
+        likelihood, _ = fixed.placed(body, likelihood)
         at_best = GaussianMixture(np.ones(1), track.posterior.means[:1], shape[None])
-        shape, frame = fixed.placed(tracker.body, at_best)[0].covariances[0], fixed.optical
+        shape, frame = fixed.placed(body, at_best)[0].covariances[0], fixed.optical
+        body = body.levelled(np.eye(3))
     return PoseMixture.of_body(
-        tracker.body,
+        body,
         likelihood,
         MixtureKind.LIKELIHOOD,
         track.waiting.stamp_ns,
@@ -262,6 +266,13 @@ def _likelihood(track: TrackedImage) -> PoseMixture:
         shape_covariance=shape,
         reason=tracker.reason,
     )
+
+
+def _against_camera(tracker: Tracker) -> tuple[Body, Array]:
+    """The body and its point estimate (d,), root angles measured against the camera."""
+    body, point = tracker.body, tracker.point_estimate
+    upright = body.levelled(np.eye(3))
+    return upright, point if upright is body else turned(body, point[None], upright)[0]
 
 
 def _state(tracker: Tracker) -> TrackState:
@@ -290,7 +301,7 @@ def _in_range(probabilities: Mapping[str, float]) -> dict[str, float]:
 def _link_transforms(track: TrackedImage) -> Any:
     """Every link of the URDF in the point estimate, and frames with z up, from the camera."""
     tracker, camera, prefix = track.tracker, track.waiting.frame_id, track.parameters.frame_prefix
-    names, rotations, origins = links_of(tracker.body, tracker.point_estimate)
+    names, rotations, origins = links_of(*_against_camera(tracker))
     parents = [camera] * len(names)
     children = [f'{prefix}{name}' for name in names]
     more = []

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import IN_BACKGROUND, camera_moved_fault
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.tracking import Status, Subject, Tracker
 from hmt_ros.tracking.beginning import Source
-from hmt_ros.tracking.ground import CONTRARY
 from msg_tools.messages.headers import SECOND_NS
 
 # A person hardly moves meanwhile.
@@ -26,8 +24,9 @@ class TrackCondition(NamedTuple):
         doubted: whether the background was learned with the person in it, and silhouettes are
             wanted: keypoints track the person without.
         moved: whether the camera has moved since the background was taken.
-        contradicted: whether the lines of the scene contradict the gravity that is given.
+        contradicted: whether scene or person contradict the gravity that is given.
         track_id: number of the track.
+        reversed: whether the opposite of the gravity that is given is used.
     """
 
     status: Status = Status.WAITING
@@ -35,6 +34,7 @@ class TrackCondition(NamedTuple):
     moved: bool = False
     contradicted: bool = False
     track_id: int = 0
+    reversed: bool = False
 
     @classmethod
     def of(cls, tracker: Tracker | None) -> TrackCondition:
@@ -50,6 +50,7 @@ class TrackCondition(NamedTuple):
             silhouettes.watch.moved,
             tracker.gravity_contradicted,
             tracker.track_id,
+            tracker.gravity_reversed,
         )
 
 
@@ -78,18 +79,35 @@ def report_change(
         text = camera_moved_fault(tracker.silhouettes.watch.shift, stamp_ns, remedy)
         log.note(Fault.CAMERA_MOVED, text, warn=True)
     if now.contradicted and not before.contradicted:
-        up = ', '.join(f'{-x:.2f}' for x in tracker.ground.up)
         log.note(
             Fault.GRAVITY,
-            f'the lines of the scene contradict the gravity that is given by more than '
-            f'{np.degrees(CONTRARY):.0f} degrees at the image of {stamp_ns} ns: they show '
-            f'[{up}], which is used; check gravity, or the frame of gravity_frame and how the '
-            'camera is mounted',
+            f'the lines of the scene, or the person, contradict the gravity that is given, '
+            f'{_numbers(-tracker.ground.up)}, at the image of {stamp_ns} ns; it is used all the '
+            'same: check that it is in the optical frame (x right, y down, z forward), or '
+            'gravity_frame and how the camera is mounted',
             warn=True,
         )
     newer = now.track_id != before.track_id and now.status is Status.TRACKING
+    if now.reversed and not before.reversed:
+        log.note(Fault.GRAVITY, f'{reversed_gravity(tracker.ground.up)} ({stamp_ns} ns)', warn=True)
     if newer or now.status is not before.status:
         _report_status(log, before, tracker, initial, stamp_ns)
+
+
+def reversed_gravity(up: Array) -> str:
+    """What is told of a reading of an accelerometer that was given for gravity.
+
+    Args:
+        up: (3,) unit vector against gravity, camera frame.
+    """
+    return (
+        'the gravity that is given points to the head of the person, as an accelerometer at rest '
+        f'measures it: the opposite is used, {_numbers(-up)}'
+    )
+
+
+def _numbers(vector: Array) -> str:
+    return '[' + ', '.join(f'{x:.2f}' for x in vector + 0.0) + ']'
 
 
 def _report_status(

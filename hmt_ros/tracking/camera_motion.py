@@ -23,8 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.kinematics import forward
-from hmt_ros.body.mirror import root_angles, root_rotation_dofs, root_rotations
+from hmt_ros.body.mirror import propagated, turn_jacobians, turned
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds
 from hmt_ros.tracking.hypotheses import Modes
@@ -116,7 +115,9 @@ class CameraMotion:
         """Poses (N, d) of a body in the new camera frame, within its limits."""
         return np.clip(self.free_poses(body, poses), body.lower, body.upper)
 
-    def free_poses(self, body: Body, poses: Array, turn: float = 0.0) -> Array:
+    def free_poses(
+        self, body: Body, poses: Array, turn: float = 0.0, to: Body | None = None
+    ) -> Array:
         """Poses (N, d) of a body in the new frame, which need not be before a camera.
 
         Args:
@@ -124,27 +125,17 @@ class CameraMotion:
             poses: (N, d).
             turn: angle about z by which the root has turned, up to whole turns, rad: where it was
                 followed over several motions.
+            to: the same body with the level of the result; None: the level stays.
         """
-        root, offset = root_rotation_dofs(body.skeleton), body.skeleton.offsets[0]
-        result = poses.copy()
+        offset = body.skeleton.offsets[0]
+        result = turned(body, poses, body if to is None else to, self.rotation, turn)
         result[:, :3] = self.points(poses[:, :3] + offset) - offset
-        angles = root_angles(body, self.rotation @ root_rotations(body, poses))
-        # The turn nearest to that of before.
-        offset_of_turns = poses[:, root[0]] + turn - angles[:, 0]
-        angles[:, 0] += 2.0 * np.pi * np.round(offset_of_turns / (2.0 * np.pi))
-        result[:, root] = angles
         return result
 
-    def jacobians(self, body: Body, before: Array, after: Array) -> Array:
-        """Derivatives (N, d, d) of `poses` at poses (N, d), whose results are `after`."""
-        root = root_rotation_dofs(body.skeleton)
-        # Columns are the axes that the angles turn about.
-        old, new = (
-            forward(body.skeleton, poses).axes[root].transpose(2, 1, 0) for poses in (before, after)
-        )
-        result = np.tile(np.eye(body.dimension), (len(before), 1, 1))
+    def jacobians(self, body: Body, before: Array, after: Array, to: Body | None = None) -> Array:
+        """Derivatives (N, d, d) of `free_poses` at poses (N, d), whose results are `after`."""
+        result = turn_jacobians(body, before, body if to is None else to, after, self.rotation)
         result[:, :3, :3] = self.rotation
-        result[np.ix_(range(len(before)), root, root)] = np.linalg.solve(new, self.rotation @ old)
         return result
 
     def modes(self, body: Body, modes: Modes) -> Modes:
@@ -165,12 +156,6 @@ class CameraMotion:
             filtered=propagated(jacobians, modes.filtered),
             state_covariances=propagated(states, modes.state_covariances),
         )
-
-
-def propagated(jacobians: Array, covariances: Array) -> Array:
-    """Covariances J S J' (N, n, n), from Jacobians J (N, n, m) and covariances S (N, m, m)."""
-    result: Array = jacobians @ covariances @ jacobians.swapaxes(1, 2)
-    return 0.5 * (result + result.swapaxes(1, 2))
 
 
 class CameraPath:

@@ -3,7 +3,12 @@
     h(p) = n . p + d        height of a point p over the floor, camera frame, m
 
 with n the unit vector against gravity and d the height of the camera. Unknown values are estimated
-from the track; see `GroundEstimator`.
+from the track; see `GroundEstimator`. Given ones are measurements: others refine them within their
+error,
+
+    p(n | v) ~ N(n; n_0, s_0^2) [p N(v; n, s^2) + 1 - p],     v the vertical of the lines
+
+and contradict them, but never replace them.
 """
 
 from __future__ import annotations
@@ -15,10 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera import Camera, roll, shortest_turn
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm, masses, soles
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.mirror import root_angles, root_rotation_dofs, root_rotations
+from hmt_ros.body.mirror import turned
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.vertical_lines import Vertical, seen_vertical
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.tracking.camera_motion import USUAL_DISTANCE, CameraMotion
@@ -26,9 +32,8 @@ from hmt_ros.tracking.hypotheses import Modes
 
 __all__ = ['Ground', 'GroundEstimator', 'GroundSettings', 'KnownGround']
 
-# Standard deviations of a direction and of a height that are given: of an inertial sensor and its
-# mounting, rad, and of a measured height, m.
-GIVEN_UP_SIGMA, GIVEN_HEIGHT_SIGMA = 0.01, 0.02
+# Standard deviations of a direction whose own is not told, rad, and of a measured height, m.
+GIVEN_UP_SIGMA, GIVEN_HEIGHT_SIGMA = np.radians(2.0), 0.02
 # The y axis of an image points down; how far the direction of gravity is from it, and at most, rad.
 IMAGE_UP = np.array([0.0, -1.0, 0.0])
 UP_SIGMA, MOST_TILT = np.radians(15.0), np.radians(35.0)
@@ -45,8 +50,17 @@ LEVEL_SIGMA, FIRST_LEVEL_SIGMA = 0.04, 0.10
 TURNED = 0.003
 # Time from one look at the lines of the scene to the next, s.
 LOOK_TIME = 1.0
-# Verticals that differ by more contradict each other, rad: no sensor and no lines err so far.
-CONTRARY = np.radians(10.0)
+# Number of images from the start on that show a person head down by a given vertical, above which
+# it is the wrong way round though it points up in the image: handstands are shorter.
+HEAD_DOWN = 30.0
+# Cosine between trunk and vertical in an image from which it is upright or head down.
+HEAD_UP = 0.7
+# Log odds that a given vertical is wrong: before any image, for a camera that is about upright and
+# for another; most that one look at lines says. What somebody who lies says at most: some do, and
+# few stand on their head, who says twice that.
+WRONG, ONE_LOOK, LYING = (-3.5, -2.5), 2.0, 3.5
+# Concentration of the axes of people who do not lie about the vertical.
+STANDING = 8.0
 
 
 @dataclass(frozen=True)
@@ -56,6 +70,7 @@ class KnownGround:
     Attributes:
         up: (3,) unit vector against gravity in the camera frame; None: unknown.
         camera_height: height of the camera above the floor, m; None: unknown.
+        up_sigma: standard deviation of the direction about each horizontal axis, rad.
 
     Raises:
         ValueError: a direction that is no unit vector, or a height that is not positive.
@@ -63,6 +78,7 @@ class KnownGround:
 
     up: Array | None = None
     camera_height: float | None = None
+    up_sigma: float = GIVEN_UP_SIGMA
 
     def __post_init__(self) -> None:
         if self.up is not None:
@@ -94,11 +110,6 @@ class Ground:
         return None if self.height is None else np.append(self.up, self.height)
 
 
-def _contradict(first: Array, second: Array) -> bool:
-    """Whether two verticals (3,) contradict each other."""
-    return bool(first @ second < np.cos(CONTRARY))
-
-
 def unit_vector(up: ArrayLike) -> Array:
     """A direction (3,) of unit length.
 
@@ -121,14 +132,17 @@ class GroundEstimator:
 
     The height of the floor follows the lowest sole: a person stands on the floor for most of the
     time, and jumps at times, so it is a high quantile of the last seconds. The vertical is the
-    given one. Without one it comes from the lines of the scene (`image.vertical_lines`); where they
-    show none, it is near the vertical of the image, and near the axis of a body that stands, from
-    the middle of the feet to the centre of mass. Errors of that
+    given one, which the lines of the scene (`image.vertical_lines`) refine. Without one it is that
+    of the lines; where they show none, it is near the vertical of the image, and near the axis of a
+    body that stands, from the middle of the feet to the centre of mass. Errors of that
     axis last, so its images count as one per `AXIS_TIME`, and the deviation never goes below
     `AXIS_SIGMA`.
 
-    If the lines contradict a given vertical at two looks, theirs is followed instead. A jump of
-    the vertical of the lines is believed when the next look shows it too.
+    Lines that show another vertical, and a person who lies by it, make a given one doubtful. It may
+    be the wrong way round, as an accelerometer at rest measures gravity: where keypoints show the
+    person head down, from the first image on where it points down in the image, else for
+    `HEAD_DOWN` images, its opposite is used. A jump of the vertical of the lines alone is believed
+    when the next look shows it too.
 
     Args:
         known: gravity and floor without the images; None: unknown.
@@ -136,7 +150,6 @@ class GroundEstimator:
     Attributes:
         known: gravity and floor without the images.
         estimate: the present estimate.
-        contradicted: whether the lines of the scene contradict the vertical that is given.
         still: whether the motion of the camera is known, so that things at rest have known places
             in its frame; set by the tracker.
         turning: whether a newer direction of gravity contradicts the rotation of the camera that
@@ -152,9 +165,9 @@ class GroundEstimator:
     def forget_scene(self) -> None:
         """Forgets the estimates from images and from a track."""
         self._seen: Vertical | None = None
-        self._newest: Array | None = None
+        self._missed = False
         self._looked: int | None = None
-        self.contradicted = False
+        self._by_lines = self._by_person = self._by_keypoints = 0.0
         self.reset()
 
     def reset(self) -> None:
@@ -174,45 +187,79 @@ class GroundEstimator:
         rise = -float(up @ motion.translation)
         known = self.known
         height = None if known.camera_height is None else known.camera_height + rise
-        self.known = KnownGround(
-            None if known.up is None else motion.directions(known.up),
-            height if height is not None and height > 0 else None,
+        self.known = replace(
+            known,
+            up=None if known.up is None else motion.directions(known.up),
+            camera_height=height if height is not None and height > 0 else None,
         )
         self._mean = motion.directions(self._mean)
         self._covariance = motion.rotation @ self._covariance @ motion.rotation.T
         if self._seen is not None:
             self._seen = replace(self._seen, up=motion.directions(self._seen.up))
-        if self._newest is not None:
-            self._newest = motion.directions(self._newest)
         self._levels = deque((time, level + rise) for time, level in self._levels)
         self._conclude()
 
-    def set_gravity(self, up: ArrayLike, camera_height: float | None = None) -> None:
+    def set_gravity(
+        self, up: ArrayLike, camera_height: float | None = None, up_sigma: float = GIVEN_UP_SIGMA
+    ) -> None:
         """Takes a newer direction (3,) against gravity, camera frame, and height of the camera."""
         before, unit = self.known.up, unit_vector(up)
         self.turning = before is not None and float(np.linalg.norm(unit - before)) > TURNED
-        self.known = KnownGround(
-            unit, self.known.camera_height if camera_height is None else camera_height
-        )
+        height = self.known.camera_height if camera_height is None else camera_height
+        self.known = KnownGround(unit, height, up_sigma)
         self._conclude()
+
+    @property
+    def reversed(self) -> bool:
+        """Whether the opposite of the given vertical is used; see `GroundEstimator`."""
+        up = self.known.up
+        if up is None:
+            return False
+        return self._by_keypoints < (0.0 if up @ IMAGE_UP < 0.0 else -HEAD_DOWN)
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether lines of the scene, or the person, contradict the vertical that is given."""
+        given = self._given
+        if given is None:
+            return False
+        return WRONG[int(given @ IMAGE_UP < 0.5)] + self._by_lines + self._by_person > 0.0
+
+    @property
+    def level(self) -> Array:
+        """(3, 3) from an upright camera's axes to the camera's, as far as the vertical is known."""
+        return roll(self.estimate.up) if self.vertical_known else np.eye(3)
+
+    @property
+    def _given(self) -> Array | None:
+        """(3,) the given vertical, whose sign may have been that of an accelerometer."""
+        up = self.known.up
+        return up if up is None or not self.reversed else -up
+
+    def see(self, keypoints: Keypoints) -> None:
+        """Takes in which way up a detector sees the person, by names of our joints."""
+        if self.known.up is not None:
+            trunk = keypoints.trunk
+            cosine = float(trunk @ self.known.up[:2]) / max(float(np.linalg.norm(trunk)), 1e-9)
+            self._by_keypoints += cosine if abs(cosine) > HEAD_UP else 0.0
+            self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
         """Takes in the lines of an image, if it is time to; a stamp is in ns."""
         if self._looked is not None and 0 <= stamp - self._looked < 1e9 * LOOK_TIME:
             return
-        self._looked = stamp
-        found = seen_vertical(image, camera)
+        self._looked, given = stamp, self._given
+        found = seen_vertical(image, camera, np.eye(3) if given is None else roll(given))
         if found is None:
             return
-        before, self._newest = self._newest, found.up
-        again = before is not None and not _contradict(before, found.up)
-        if self._seen is None or again or not _contradict(self._seen.up, found.up):
-            self._seen = found
-        given = self.known.up
-        if given is None or not _contradict(given, found.up):
-            self.contradicted = False
-        elif again:
-            self.contradicted = True
+        again, before = self._missed, self._seen
+        self._missed = before is not None and found.agreement(before.up, before.sigma) < 1.0
+        if not self._missed or again:
+            self._seen, self._missed = found, False
+        if given is not None:
+            said = -np.log(found.agreement(given, self.known.up_sigma))
+            said = np.clip(said, -ONE_LOOK, ONE_LOOK)
+            self._by_lines = float(np.clip(self._by_lines + said, -ONE_LOOK, 2.0 * ONE_LOOK))
         self._conclude()
 
     @property
@@ -242,18 +289,25 @@ class GroundEstimator:
         weights = weights / weights.sum()
         points = frames.points(feet.segments, feet.local)
         self._time += dt
-        if not self.vertical_known and mass.known:
+        place = frames.origins[0] @ weights
+        if mass.known:
             axes = mass.centre_of_mass(frames) - points.mean(0)
-            axes = axes / np.linalg.norm(axes, axis=0)
-            place = frames.origins[0] @ weights
-            self._follow_axis(axes @ weights, place, resting, dt)
-            self._conclude()
+            axis = axes / np.linalg.norm(axes, axis=0) @ weights
+            if self._given is not None:
+                cosine = float(axis @ self._given)
+                stands = 2.0 * STANDING * np.exp(STANDING * (cosine - 1.0))
+                lies = np.exp(-LYING * (1.0 + max(-cosine, 0.0)))
+                said = -np.log(stands + lies) * min(dt / AXIS_TIME, 1.0)
+                most = LYING * (1.0 + max(-cosine, 0.0))
+                self._by_person = float(np.clip(self._by_person + said, -LYING, most))
+            elif self._seen is None:
+                self._follow_axis(axis, place, resting, dt)
+                self._conclude()
         up = self.estimate.up
         level = float(-np.einsum('pin,i->pn', points, up).min(0) @ weights)
         self._levels.append((self._time, level))
         while self._levels[0][0] < self._time - LEVEL_TIME:
             self._levels.popleft()
-        place = frames.origins[0] @ weights
         self._distance = float(np.linalg.norm(place - up * (up @ place)))
         self._conclude()
 
@@ -281,13 +335,14 @@ class GroundEstimator:
         self._covariance = (vectors * values) @ vectors.T
 
     def _conclude(self) -> None:
-        known, seen = self.known, self._seen
-        if known.up is not None and not self.contradicted:
-            up, up_sigma = known.up, GIVEN_UP_SIGMA
-        elif seen is not None:
-            up, up_sigma = seen.up, seen.sigma
-        else:
-            up, up_sigma = self._mean, float(np.sqrt(self._covariance.trace() / 3.0))
+        known, seen, given = self.known, self._seen, self._given
+        if given is not None and seen is not None:
+            seen = seen.refined(given, known.up_sigma)
+        elif given is not None:
+            seen = Vertical(given, known.up_sigma)
+        if seen is None:
+            seen = Vertical(self._mean, float(np.sqrt(self._covariance.trace() / 3.0)))
+        up, up_sigma = seen.up, seen.sigma
         tracked, tracked_sigma = self._tracked_level()
         height, sigma = tracked, tracked_sigma
         if known.camera_height is not None:
@@ -330,23 +385,5 @@ class Gravity:
 
     def turned(self, body: Body, poses: Array) -> Array:
         """Poses (N, d) upright in the image, turned the shortest way to be upright in space."""
-        turn = shortest_turn(IMAGE_UP, self.plane.up)
-        result = poses.copy()
-        angles = root_rotation_dofs(body.skeleton)
-        result[:, angles] = root_angles(body, turn @ root_rotations(body, poses))
-        return np.clip(result, body.lower, body.upper)
-
-
-def shortest_turn(start: Array, end: Array) -> Array:
-    """The rotation (3, 3) by the least angle that takes a unit vector to another.
-
-    For opposite vectors in the plane of the image, where no rotation is the shortest, it is the one
-    about the optical axis, as when the camera hangs upside down.
-    """
-    cosine = float(start @ end)
-    if cosine <= -1.0 + 1e-9:
-        return np.diag([-1.0, -1.0, 1.0])
-    x, y, z = np.cross(start, end)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    result: Array = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
-    return result
+        turn = shortest_turn(body.level @ IMAGE_UP, self.plane.up)
+        return np.clip(turned(body, poses, body, turn), body.lower, body.upper)

@@ -185,8 +185,8 @@ def poses_from_keypoints(
 
 def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
     """Mean poses (HEADINGS, d) of all headings, as high and where the silhouette is."""
-    low, high = np.quantile(outline.pixels, 0.02, axis=0), np.quantile(outline.pixels, 0.98, axis=0)
-    return _poses_between(body, camera, low, high)
+    rays = _level_rays(body, camera, outline.pixels)
+    return _poses_between(body, *np.quantile(rays, [0.02, 0.98], axis=0))
 
 
 def mixture_from_box(body: Body, camera: Camera, box: Box) -> GaussianMixture:
@@ -194,7 +194,11 @@ def mixture_from_box(body: Body, camera: Camera, box: Box) -> GaussianMixture:
 
     Limbs are as uncertain as the prior of the body says, the place by a share of the distance.
     """
-    poses = _poses_between(body, camera, np.array(box[:2], float), np.array(box[2:], float))
+    left, top, right, bottom = box
+    middle = (0.5 * (left + right), 0.5 * (top + bottom))
+    sides = np.array([(left, middle[1]), (right, middle[1]), (middle[0], top), (middle[0], bottom)])
+    rays = _level_rays(body, camera, sides)
+    poses = _poses_between(body, rays.min(0), rays.max(0))
     variances = np.tile(
         np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.5) ** 2, (HEADINGS, 1)
     )
@@ -221,19 +225,24 @@ def check_box(box: Box, camera: Camera) -> None:
         )
 
 
-def _poses_between(body: Body, camera: Camera, low: Array, high: Array) -> Array:
-    """Mean poses (HEADINGS, d) of all headings between two corners (2,) of a box, px."""
+def _level_rays(body: Body, camera: Camera, pixels: Array) -> Array:
+    """Rays (N, 2), x / z and y / z along the axes of the body's level, of pixels (N, 2)."""
+    rays = camera.rays(pixels) @ body.level
+    return np.asarray(rays[:, :2] / rays[:, 2:])
+
+
+def _poses_between(body: Body, low: Array, high: Array) -> Array:
+    """Mean poses (HEADINGS, d) of all headings between two corners (2,) of a box of level rays."""
     middle = 0.5 * (low + high)
-    ends = camera.rays(np.array([[middle[0], low[1]], [middle[0], high[1]], middle]))
-    ends = ends / ends[:, 2:]
     result = np.tile(body.prior_mean, (HEADINGS, 1))
     result[:, :3] = 0.0
     result[:, body.dof_names.index('root_z')] = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
-    joints = body.joint_positions(result)
-    top, bottom = joints[..., 1].min(1), joints[..., 1].max(1)
-    depth = (bottom - top) / max(ends[1, 1] - ends[0, 1], 1e-3)
-    result[:, :3] = depth[:, None] * ends[2]
+    heights = (body.joint_positions(result) @ body.level)[..., 1]
+    top, bottom = heights.min(1), heights.max(1)
+    depth = (bottom - top) / max(high[1] - low[1], 1e-3)
+    result[:, :3] = depth[:, None] * np.append(middle, 1.0)
     result[:, 1] -= 0.5 * (top + bottom)
+    result[:, :3] = result[:, :3] @ body.level.T
     return np.clip(result, body.lower, body.upper)
 
 

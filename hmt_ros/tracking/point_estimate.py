@@ -19,11 +19,11 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.mirror import left_directions, root_rotation_dofs
+from hmt_ros.body.mirror import left_directions, propagated, root_rotation_dofs
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.camera_motion import CameraMotion, propagated
+from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.classes import VALID
 
 

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.mirror import relevelled
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.experts.lifter import KeypointHistory, lifted_positions, load_lifter
 from hmt_ros.image.background import BackgroundModel
@@ -42,7 +43,14 @@ from hmt_ros.tracking.beginning import (
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
 from hmt_ros.tracking.existence import GIVEN, SAME_PERSON, Existence, Status
 from hmt_ros.tracking.filter import MixtureFilter
-from hmt_ros.tracking.ground import Gravity, Ground, GroundEstimator, KnownGround, unit_vector
+from hmt_ros.tracking.ground import (
+    GIVEN_UP_SIGMA,
+    Gravity,
+    Ground,
+    GroundEstimator,
+    KnownGround,
+    unit_vector,
+)
 from hmt_ros.tracking.hypotheses import LIKELY, Modes
 from hmt_ros.tracking.initialisation import check_box
 from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE
@@ -214,6 +222,13 @@ class Tracker:
         self._move_camera(stamp)
         if self.settings.ground.on:
             self._ground.look(image, self.camera, stamp)
+            before = self._ground.reversed
+            if keypoints is not None:
+                self._ground.see(keypoints)
+            if before != self._ground.reversed and self._track.begun:
+                self._drop_track()
+        if not self._track.begun:
+            self._stand_upright()
         known = self.silhouettes.scene.known and not self.silhouettes.doubted
         self._ground.still = self._camera_path.known or (known and not self._ground.turning)
         keypoints = self._lifted(keypoints, stamp)
@@ -280,20 +295,28 @@ class Tracker:
 
     @property
     def gravity_contradicted(self) -> bool:
-        """Whether the lines of the scene contradict the gravity that is given; they hold then."""
+        """Whether scene or person contradict the gravity that is given; it is used all the same."""
         return self._ground.contradicted
 
-    def set_gravity(self, up: ArrayLike, camera_height: float | None = None) -> None:
+    @property
+    def gravity_reversed(self) -> bool:
+        """Whether the gravity that is given is the opposite, as an accelerometer measures it."""
+        return self._ground.reversed
+
+    def set_gravity(
+        self, up: ArrayLike, camera_height: float | None = None, up_sigma: float = GIVEN_UP_SIGMA
+    ) -> None:
         """Takes a newer direction against gravity, before the image that it belongs to.
 
         Args:
             up: (3,) unit vector in the camera frame.
             camera_height: height of the camera above the floor, m; None: as it was known before.
+            up_sigma: standard deviation of the direction about each horizontal axis, rad.
 
         Raises:
             ValueError: it is no unit vector, or the height is not positive.
         """
-        self._newer_gravity = KnownGround(unit_vector(up), camera_height)
+        self._newer_gravity = KnownGround(unit_vector(up), camera_height, up_sigma)
 
     def set_camera(self, position: ArrayLike, rotation: ArrayLike) -> None:
         """Takes the pose of the camera, before the image that it belongs to.
@@ -426,7 +449,7 @@ class Tracker:
                 self._track.carry(motion)
         newer, self._newer_gravity = self._newer_gravity, None
         if newer is not None and newer.up is not None:
-            self._ground.set_gravity(newer.up, newer.camera_height)
+            self._ground.set_gravity(newer.up, newer.camera_height, newer.up_sigma)
         if pose is not None:
             self.silhouettes.see_from(pose, self.camera)
 
@@ -449,6 +472,14 @@ class Tracker:
         """Gravity for a start; None: it is unknown, or not used."""
         weight, known = self.settings.ground.upright_weight, self._ground.vertical_known
         return Gravity(self._ground.plane, weight) if known and weight > 0 else None
+
+    def _stand_upright(self) -> None:
+        """Levels the body by what is known of gravity, before a track starts."""
+        before, body = self.body, self.body.levelled(self._ground.level)
+        if body is not before:
+            self._track = self._new_track(body)
+            if isinstance(self._given, GaussianMixture):
+                self._given = relevelled(before, self._given, body)
 
     def _new_track(self, body: Body) -> MixtureFilter:
         return MixtureFilter(
@@ -549,8 +580,9 @@ class Tracker:
             self._begin(near, arrived, stamp)
         else:
             shown = Shown(
-                view, stamp, self.model, self.body, self.camera, self._gravity, self._given,
-                self._box, prediction, masked, lambda: self._observe(view, None),
+                view, stamp, self.model.levelled(self.body.level), self.body, self.camera,
+                self._gravity, self._given, self._box, prediction, masked,
+                lambda: self._observe(view, None),
             )  # fmt: skip
             beginning = first_start(shown, self._existence)
             if beginning is None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Body
+from hmt_ros.body.mirror import relevelled
 from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import (
@@ -223,7 +224,8 @@ class PoseMixture:
         and those relative to the pelvis, which is the first joint, have J - J_pelvis for J.
 
         Args:
-            mixture: K Gaussians over its poses; None: nobody was seen.
+            mixture: K Gaussians over its poses; None: nobody was seen. Root angles of the message
+                are measured against the camera, whatever the level of the body.
             joint_positions: (K, J, 3) m, of the means; None: computed here.
             kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
                 existence_probability, error_share, error_time, shape_covariance, reason: see the
@@ -243,10 +245,15 @@ class PoseMixture:
         joint_velocities = None
         if velocities is not None:
             joint_velocities = np.einsum('kjad,kd->kja', jacobians, velocities)
+        upright = body.levelled(np.eye(3))
+        placed = relevelled(body, mixture, upright)
+        if shape_covariance is not None and upright is not body:
+            at_best = GaussianMixture(np.ones(1), mixture.means[:1], shape_covariance[None])
+            shape_covariance = relevelled(body, at_best, upright).covariances[0]
         return cls(
             weights=mixture.weights,
-            means=mixture.means,
-            covariances=mixture.covariances,
+            means=placed.means,
+            covariances=placed.covariances,
             body_model=body.name,
             dof_names=body.dof_names,
             joint_names=body.joint_names,

@@ -73,6 +73,41 @@ def test_arrays_become_mixtures_and_a_report(tmp_path):
     assert lift.main([str(path), '-o', str(out), *USUAL, '--overwrite', '--causal']) == 0
 
 
+def upside_down(path):
+    """The keypoints of a camera that hangs, whose centre is that of the image."""
+    pixels, sure = seen(12)
+    pixels[sure > 0] = 2.0 * np.array([CAMERA.cx, CAMERA.cy]) - pixels[sure > 0]
+    np.savez(path, landmark_names=np.array(SCHEME.names), pixels=pixels, visibility=sure)
+    return path
+
+
+def test_a_camera_that_hangs_upside_down(tmp_path, capsys):
+    upright, hanging = tmp_path / 'upright.npz', upside_down(tmp_path / 'hanging.npz')
+    pixels, sure = seen(12)
+    np.savez(upright, landmark_names=np.array(SCHEME.names), pixels=pixels, visibility=sure)
+    joints = []
+    for path, gravity in ((upright, '1'), (hanging, '-1'), (upright, '-1')):
+        out = tmp_path / f'{path.stem}{gravity}'
+        arguments = [str(path), '-o', str(out), *USUAL, '--gravity', '0', gravity, '0']
+        assert lift.main(arguments) == 0
+        joints.append(np.array([one.joint_positions[0] for one in mixtures(out)]))
+    assert joints[1] * [-1, -1, 1] == pytest.approx(joints[0], abs=5e-3)
+    # The reading of an accelerometer is told, and used the other way round.
+    assert joints[2] == pytest.approx(joints[0])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('lift: the gravity that is given points to the head of the person')
+    assert line.endswith('the opposite is used, [0.00, 1.00, 0.00]')
+
+
+@pytest.mark.parametrize('gravity', [('1', '0', '0'), ('0', '0', '9.81')])
+def test_gravity_of_another_frame_is_told(tmp_path, capsys, gravity):
+    path = arrays(tmp_path / 'walk.npz')
+    arguments = [str(path), '-o', str(tmp_path / 'out'), *USUAL, '--gravity', *gravity]
+    assert lift.main(arguments) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'degrees by the gravity that is given: somebody who lies, or --gravity is not in' in line
+
+
 def test_coco_and_stature(tmp_path):
     pixels, sure = seen()
     entries = [

@@ -171,6 +171,26 @@ def test_inputs_do_not_depend_on_where_the_person_is_in_the_image():
     np.testing.assert_allclose(first.values, second.values, atol=0.05)
 
 
+@pytest.mark.parametrize('degrees', [15.0, 90.0, 180.0])
+def test_a_camera_on_its_side_lifts_as_an_upright_one(degrees):
+    """Keypoints of a turned camera with its gravity: the same poses, turned."""
+    shipped, poses = load_lifter(), walking(8)
+    turn = Rotation.from_rotvec([0.0, 0.0, np.radians(degrees)]).as_matrix()
+    middle, up = np.array([CAMERA.cx, CAMERA.cy]), np.array([0.0, -np.cos(0.1), -np.sin(0.1)])
+    seen = detected(poses)
+    moved = [replace(x, pixels=(x.pixels - middle) @ turn[:2, :2].T + middle) for x in seen]
+    stamps, ups = np.arange(8) / 30.0, np.tile(up, (8, 1))
+    upright = lift_poses(shipped, BODY, CAMERA, stamps, seen, ups)
+    found = lift_poses(shipped, BODY, CAMERA, stamps, moved, ups @ turn.T)
+    for one, other in zip(upright, found, strict=True):
+        joints = BODY.joint_positions(one.means[:1]) @ turn.T
+        assert np.abs(BODY.joint_positions(other.means[:1]) - joints).max() < 5e-3
+    # Nothing is turned where gravity is not known, or the camera is level.
+    unknown = lift_poses(shipped, BODY, CAMERA, stamps, seen)
+    level = lift_poses(shipped, BODY, CAMERA, stamps, seen, np.zeros((8, 3)))
+    assert np.array_equal(unknown[0].means, level[0].means)
+
+
 def test_landmarks_have_one_place_whatever_the_scheme():
     of_mediapipe = detected(walking(1))[0]
     places = places_of(of_mediapipe)

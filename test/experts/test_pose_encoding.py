@@ -43,6 +43,27 @@ def test_a_person_off_the_axis_has_the_target_of_one_on_it(encoding: PoseEncodin
     np.testing.assert_allclose(encoding.encode(moved), target, atol=1e-12)
 
 
+def test_a_target_is_that_of_an_upright_camera(encoding: PoseEncoding) -> None:
+    poses = random_poses(encoding.body, 5, 4)
+    level = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    there = PoseEncoding(encoding.body.levelled(level))
+    moved = poses.copy()
+    moved[:, :3] = poses[:, :3] @ level.T
+    targets = encoding.encode(poses)
+    np.testing.assert_allclose(there.encode(moved), targets, atol=1e-12)
+    np.testing.assert_allclose(there.decode(targets, moved[:, :3]), moved, atol=1e-9)
+    # Derivatives by roots and poses turn with the camera.
+    for name, given in (('jacobians', (targets, poses[:, :3])), ('encoding_jacobians', (poses,))):
+        upright = getattr(encoding, name)(*given)
+        turned = getattr(there, name)(*given[:-1], moved if len(given) == 1 else moved[:, :3])
+        if name == 'encoding_jacobians':
+            np.testing.assert_allclose(turned[:, :, :3] @ level, upright[:, :, :3], atol=1e-9)
+            np.testing.assert_allclose(turned[:, :, 3:], upright[:, :, 3:], atol=1e-9)
+        else:
+            np.testing.assert_allclose(turned[0], upright[0], atol=1e-9)
+            np.testing.assert_allclose(turned[1][:, 3:] @ level, upright[1][:, 3:], atol=1e-9)
+
+
 def test_the_ray_frame_looks_at_the_point() -> None:
     points = np.array([[1.0, -2.0, 3.0], [0.0, 0.0, 1.0]])
     rotations = ray_rotations(points)

@@ -73,6 +73,28 @@ def test_poses_of_a_new_walk(
     assert np.abs(depth).mean() < 2.0
 
 
+@pytest.mark.parametrize('quarters', [1, 2])
+def test_a_camera_on_its_side_predicts_as_an_upright_one(
+    predictor: PosePredictor, body: Body, clip: tuple[np.ndarray, np.ndarray], quarters: int
+) -> None:
+    turn = np.linalg.matrix_power(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), quarters)
+    level = body.levelled(turn)
+    width, height = (300, 400) if quarters == 1 else (400, 300)
+    camera = Camera(400.0, 400.0, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
+    index = body.skeleton.joint_index(['pelvis', *EVALUATED_JOINTS])
+    best = []
+    for pose, mask in zip(*clip, strict=True):
+        # The image is turned clockwise, about its centre.
+        seen = np.ascontiguousarray(np.rot90(mask, -quarters))
+        found = predictor.with_body(level).observe(seen, camera).mixture
+        joints = level.joint_positions(found.means)[:, index] @ turn
+        true = body.joint_positions(pose[None])[:, index]
+        away = (joints - joints[:, :1]) - (true - true[:, :1])
+        best.append(np.linalg.norm(away[:, 1:], axis=2).mean(1).min())
+    # As of the upright camera.
+    assert np.mean(best) < 0.09
+
+
 def test_propagation_keeps_what_was_known(
     predictor: PosePredictor, body: Body, clip: tuple[np.ndarray, np.ndarray]
 ) -> None:

@@ -63,6 +63,7 @@ class StubTracker:
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
         self.vertical, self.gravity_contradicted = known_ground.up, False
+        self.gravity_reversed = False
         self.contacts = {'left_foot': 0.75, 'right_foot': 0.0}
         self.gravities: list[Any] = []
         self.poses: list[Any] = []
@@ -77,7 +78,7 @@ class StubTracker:
     def reset(self, start=None, *, box=None):
         self.start, self.box = start, box
 
-    def set_gravity(self, up, camera_height=None):
+    def set_gravity(self, up, camera_height=None, up_sigma=None):
         self.gravities.append(up)
         height = self.ground.height if camera_height is None else camera_height
         self.ground, self.vertical = replace(self.ground, up=up, height=height), up

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_ros.body.camera import roll
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.session import FINISH
@@ -715,6 +716,35 @@ def test_body_in_a_message_leads_to_no_file(session, likelihoods, tmp_path):
     assert one.state.status == 'waiting'
     trusting = session(body_model=str(path))
     assert trusting.take(MIXTURE, message).faults == ()
+
+
+@pytest.mark.parametrize('degrees', [90.0, 180.0])
+def test_a_camera_on_its_side_is_smoothed_as_an_upright_one(session, outputs, likelihoods, degrees):
+    level = roll([np.sin(np.radians(degrees)), -np.cos(np.radians(degrees)), 0.0])
+    body = likelihoods.body.levelled(level)
+    found, trajectories = [], []
+    for one in (likelihoods.body, body):
+        outputs.clear()
+        made = session(dynamics=SmootherDynamics(model='learned'))
+        for index in range(8):
+            mixture = likelihoods.mixture(index)
+            turn = np.where(np.arange(37) == 3, 0.1, 0.0)  # nobody faces the camera exactly
+            mixture = replace(mixture, means=mixture.means + turn)
+            made.take(MIXTURE, likelihoods.message(index, body=one, mixture=mixture))
+        made.finish()
+        found.append([pose_mixture_of(x) for x in read(outputs, 'smoothed_pose_mixture')])
+        trajectories.append(trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1]))
+    upright, turned = found
+    assert len(upright) == len(turned) == 8
+    for one, other in zip(upright, turned, strict=True):
+        relative = [x.joint_positions - x.joint_positions[:, :1] for x in (one, other)]
+        assert relative[1] == pytest.approx(relative[0] @ level.T, abs=1e-6)
+        # Root angles are those against the camera.
+        joints = likelihoods.body.joint_positions(other.means)
+        assert joints == pytest.approx(other.joint_positions, abs=1e-6)
+    last = trajectories[1]
+    joints = likelihoods.body.joint_positions(last.means[0])
+    assert joints == pytest.approx(last.joint_positions[0], abs=1e-6)
 
 
 def test_whole_turns_of_the_heading_are_none(session, outputs, likelihoods):

@@ -123,9 +123,23 @@ def test_contradicted_gravity_is_told_once(one, small_camera, stub_tracker, monk
         told.append(one.take(IMAGE, small_camera.image(index)).warnings)
     assert [len(texts) for texts in told] == [0, 0, 1, 0, 0, 1]
     assert told[2][0].startswith(
-        'the lines of the scene contradict the gravity that is given by more than 10 degrees at '
-        f'the image of {small_camera.stamp(2)} ns: they show ['
+        'the lines of the scene, or the person, contradict the gravity that is given, '
+        f'[0.00, 1.00, 0.00], at the image of {small_camera.stamp(2)} ns; it is used all the same'
     )
+
+
+def test_the_reading_of_an_accelerometer_is_told_once(one, small_camera, stub_tracker, monkeypatch):
+    step, told = stub_tracker.step, []
+    for index, reversed_ in enumerate((False, True, True)):
+
+        def seen(self, *arguments, reversed_=reversed_, **named):
+            self.gravity_reversed = reversed_
+            return step(self, *arguments, **named)
+
+        monkeypatch.setattr(stub_tracker, 'step', seen)
+        told.append(one.take(IMAGE, small_camera.image(index)).warnings)
+    assert [len(texts) for texts in told] == [0, 1, 0]
+    assert 'the opposite is used, [0.00, 1.00, 0.00]' in told[1][0]
 
 
 def test_what_a_dropped_image_waited_for_is_known(stub_tracker, subject_file, small_camera):

@@ -41,6 +41,7 @@ SIDES = ('left', 'top', 'right', 'bottom')
 
 SIDE = 192  # px, of the view
 FILLED = 0.8  # share of the view that the longer side of the person fills, roughly
+UPRIGHT = np.eye(3)
 STRAIGHT = np.radians(2.0)  # angle to the axis below which a rotation moves nothing by a pixel
 
 
@@ -198,15 +199,22 @@ def _smooth(outline: Array) -> Array:
     return result
 
 
-def centred_view(blob: PersonBlob, camera: Camera) -> Bytes:
-    """The person (h, w), 1 inside, seen by the camera turned to the middle of the box."""
+def centred_view(blob: PersonBlob, camera: Camera, level: Array = UPRIGHT) -> Bytes:
+    """The person (h, w), 1 inside, seen by the camera turned to the middle of the box.
+
+    Args:
+        blob: the person.
+        camera: that saw it.
+        level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
+    """
     left, top, right, bottom = blob.box
     middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
     axis = camera.rays(middle)
-    if not camera.distortion and axis[2] > np.cos(STRAIGHT):
+    upright = np.array_equal(level, UPRIGHT)
+    if upright and not camera.distortion and axis[2] > np.cos(STRAIGHT):
         return blob.mask
     corners = np.array([[x, y] for x in (left, middle[0], right) for y in (top, middle[1], bottom)])
-    turn = ray_rotations(axis[None])[0]  # from the view to the camera
+    turn = level @ ray_rotations(axis[None] @ level)[0]  # from the view to the camera
     seen = camera.rays(corners) @ turn
     reach = float(np.abs(seen[:, :2] / np.maximum(seen[:, 2:], 0.1)).max())
     focal = 0.5 * FILLED * SIDE / reach

@@ -114,6 +114,17 @@ class Keypoints:
         """(n,) joints that have a position and are not to be ignored."""
         return np.asarray(np.isfinite(self.pixels).all(1) & (self.confidences > 0), dtype=np.bool_)
 
+    @property
+    def trunk(self) -> Array:
+        """(2,) from the middle of the hips to that of the shoulders, px; NaN: not all are seen."""
+        places = dict(zip(self.names, np.where(self.seen[:, None], self.pixels, np.nan)))
+        unknown = np.full(2, np.nan)
+        middles = [
+            places.get(f'left_{name}', unknown) + places.get(f'right_{name}', unknown)
+            for name in ('shoulder', 'hip')
+        ]
+        return np.asarray(0.5 * (middles[0] - middles[1]))
+
     def __getitem__(self, which: Index) -> Keypoints:
         """Some of them."""
         more = {

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.mirror import reverse_depth
+from hmt_ros.body.mirror import relevelled, reverse_depth
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.hypotheses import Hypotheses
@@ -42,7 +42,7 @@ class PosePrediction:
             raise ValueError('a prediction has no weight')
 
     def seen_as(self, body: Body) -> GaussianMixture:
-        """The same for a person of other lengths, at a distance in proportion to the size.
+        """The same for a person of other lengths or level, at a distance in proportion to the size.
 
         Raises:
             ValueError: a body with other degrees of freedom.
@@ -52,7 +52,7 @@ class PosePrediction:
                 f'a prediction for {self.body.name}, of {self.body.dimension} dimensions, saw the '
                 f'body {body.name}, of {body.dimension}'
             )
-        kept = self.mixture[self.mixture.weights > 0].normalised()
+        kept = relevelled(self.body, self.mixture[self.mixture.weights > 0].normalised(), body)
         means = np.array(kept.means)
         means[:, :3] *= body.scale / self.body.scale
         return GaussianMixture(

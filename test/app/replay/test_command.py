@@ -95,6 +95,7 @@ class StandingStill:
         self.depths = []
         self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
         self.vertical, self.gravity_contradicted = None, False
+        self.gravity_reversed = False
         self.silhouettes = SimpleNamespace(
             doubted=False, known='known', watch=SimpleNamespace(moved=False, shift=0.0)
         )

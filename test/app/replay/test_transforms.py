@@ -6,6 +6,7 @@ import pytest
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.inputs import recorded_input, upright_frame
 from hmt_ros.body.camera import Viewpoint
+from hmt_ros.sessions.camera_frames import UP_SIGMA
 from msg_tools import BagReader, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.ground import ground_of
@@ -76,13 +77,16 @@ def test_ground_is_that_of_the_frame(replayed):
         time_ns(stored.message.header.stamp) for stored in found['/pose_mixture']
     ]
     for ground in grounds:
-        np.testing.assert_allclose(ground.up, VIEW.rotation[:, 2], atol=1e-9)
+        # Lines refine it within the deviation of a sensor.
+        np.testing.assert_allclose(ground.up, VIEW.rotation[:, 2], atol=3e-3)
         assert ground.height == pytest.approx(1.25, abs=0.05)
 
 
 def test_same_numbers_as_with_parameters_of_the_same_gravity(replayed, moving, tmp_path):
     down = [float(x) for x in -VIEW.rotation[:, 2]]
-    settings = ['--set', f'gravity={down}', '--set', 'camera_height=1.25', '--set', 'fixed_frame=']
+    sure = f'gravity_sigma={np.degrees(UP_SIGMA)}'
+    settings = [f'gravity={down}', sure, 'camera_height=1.25', 'fixed_frame=']
+    settings = [x for one in settings for x in ('--set', one)]
     arguments = [str(moving), '-o', str(tmp_path / 'out'), *PERSON, *SMALL, *settings]
     assert main([*arguments, '--no-smoother', '--quiet']) == 0
     other, one = read(tmp_path / 'out'), read(replayed)
@@ -106,12 +110,12 @@ def test_a_frame_with_z_up_is_used_by_itself(moving, entries, tmp_path, capsys):
         assert data(tmp_path / 'by_itself', topic) == data(tmp_path / 'told', topic)
     assert capsys.readouterr().err.count('gravity and the motion of the camera: from world') == 2
     ground = ground_of(read(tmp_path / 'by_itself')['/ground'][0].message)
-    np.testing.assert_allclose(ground.up, VIEW.rotation[:, 2], atol=1e-9)
+    np.testing.assert_allclose(ground.up, VIEW.rotation[:, 2], atol=3e-3)
     # A direction that is given comes first.
     arguments = [str(moving), '-o', str(tmp_path / 'given'), *PERSON, *SMALL]
     assert main([*arguments, '--set', 'gravity=[0, 1, 0]', '--no-smoother', '--quiet']) == 0
     ground = ground_of(read(tmp_path / 'given')['/ground'][0].message)
-    np.testing.assert_allclose(ground.up, [0.0, -1.0, 0.0])
+    np.testing.assert_allclose(ground.up, [0.0, -1.0, 0.0], atol=np.sin(np.radians(2.01)))
 
 
 @pytest.mark.parametrize(
@@ -187,11 +191,6 @@ def test_damaged_transforms_are_told_and_left_out(entries, tmp_path, capsys):
     ('settings', 'line'),
     [
         (['gravity=[0, 0, 0]'], 'gravity must be three finite numbers, not all zero'),
-        (
-            ['gravity=[0, -9.81, 0.5]'],
-            'gravity must be the direction in which things fall, such as [0.0, 1.0, 0.0], saw '
-            '[0.0, -9.81, 0.5], which points up in the image: an accelerometer at rest measures',
-        ),
         (['gravity=down'], "gravity must be a list of numbers, saw 'down'"),
         (
             ['floor_in_gravity_frame=true', 'gravity_frame='],

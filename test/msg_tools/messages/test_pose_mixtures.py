@@ -177,6 +177,29 @@ def test_relative_covariances_are_those_of_samples() -> None:
     assert content.joint_covariances[0, wrist].trace() > 50 * found.trace()
 
 
+def test_messages_measure_root_angles_against_the_camera() -> None:
+    """Whatever the level of the body: readers know no other."""
+    body = load_body('human37')
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    level, pose = body.levelled(turn @ turn), body.prior_mean.copy()
+    pose[:3], pose[3] = (0.3, 0.2, 4.0), 0.7
+    covariance, velocity = np.diag(np.linspace(1e-4, 1e-2, body.dimension)), np.ones((1, 37))
+    mixture = GaussianMixture([1.0], pose[None], covariance[None])
+    content = PoseMixture.of_body(
+        level, mixture, MixtureKind.LIKELIHOOD, 10**18, 'lens', velocities=velocity,
+        shape_covariance=covariance, error_share=0.5, error_time=0.1,
+    )  # fmt: skip
+    assert content.joint_positions == pytest.approx(level.joint_positions(pose[None]))
+    assert body.joint_positions(content.means) == pytest.approx(content.joint_positions, abs=1e-9)
+    slopes = body.joint_jacobians(content.means)[0]
+    wanted = content.joint_covariances[0] - np.square(body.joint_errors)[:, None, None] * np.eye(3)
+    for found in (content.covariances[0], content.shape_covariance):
+        assert slopes @ found @ slopes.transpose(0, 2, 1) == pytest.approx(wanted, abs=1e-9)
+    # At the level of the camera the numbers stay what they are.
+    same = PoseMixture.of_body(body, mixture, MixtureKind.POSTERIOR, 10**18, 'lens')
+    assert np.array_equal(same.means, mixture.means)
+
+
 def test_probability_of_existence(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
     """NaN where it is unknown: in older bags, and of publishers that leave the field alone."""
     content = replace(pose_mixture, state=TrackState.LOST, existence_probability=0.25)
