@@ -185,7 +185,7 @@ def _in_frames(
     found: FoundPersons, chosen: dict[int, Keypoints], fps: float
 ) -> tuple[list[int], list[Keypoints]]:
     """Times, ns, and keypoints of the chosen person, without names where there are none."""
-    keys = sorted(found.frames) if found.timed else list(range(found.last + 1))
+    keys = found.keys if found.timed else list(range(found.last + 1))
     times = keys if found.timed else [round(key * SECOND_NS / fps) for key in keys]
     return times, [chosen.get(key, NO_KEYPOINTS) for key in keys]
 

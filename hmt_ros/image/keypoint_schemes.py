@@ -103,12 +103,12 @@ def unnamed_orders() -> Mapping[int, tuple[str, ...]]:
 
 
 @cache
-def bone_lengths() -> Mapping[tuple[str, str], float]:
-    """Usual distances of two landmarks of a person of 1.7 m, as clips show them, m."""
+def bone_lengths() -> Mapping[tuple[str, str], tuple[float, float]]:
+    """Distances of two landmarks of a person of 1.7 m, m, and the deviation of their logarithm."""
     return {
-        (one.format(side=side), other.format(side=side)): float(length)
+        (one.format(side=side), other.format(side=side)): (float(length), float(sigma))
         for one, others in _table()['bones'].items()
-        for other, length in others.items()
+        for other, (length, sigma) in others.items()
         for side in (SIDES if '{side}' in one else SIDES[:1])
     }
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import pickletools
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,12 +22,11 @@ _VALUES = re.compile(
     r'|BYTEARRAY8|(SHORT_)?BINSTRING'
 )
 _CONSTANTS = {'NONE': None, 'NEWTRUE': True, 'NEWFALSE': False, 'EMPTY_TUPLE': ()}
-_CONTAINERS: dict[str, type[list[Any]] | type[dict[Any, Any]]] = {
-    'EMPTY_LIST': list,
-    'EMPTY_DICT': dict,
+# Number of items that an opcode takes from the stack; None: all above the mark.
+_TAKES = {
+    **{'APPEND': 1, 'SETITEM': 2, 'TUPLE1': 1, 'TUPLE2': 2, 'TUPLE3': 3},
+    **dict.fromkeys(('APPENDS', 'SETITEMS', 'TUPLE')),
 }
-_TUPLES = {'TUPLE1': 1, 'TUPLE2': 2, 'TUPLE3': 3}
-_PUT, _GET = ('BINPUT', 'LONG_BINPUT', 'MEMOIZE'), ('BINGET', 'LONG_BINGET')
 _GLOBAL = re.compile(
     r'numpy(?:\._?core\.(?:multiarray|numeric))? (_reconstruct|ndarray|dtype|scalar|_frombuffer)'
     r'|_codecs (encode)'
@@ -36,30 +35,10 @@ _TYPE = re.compile(r'[<>=|]?[biufOUS]\d{0,6}')
 
 
 @dataclass
-class _Global:
-    """A name of numpy that rebuilds something."""
+class _Held:
+    """A name of numpy, a type or an array, which later opcodes complete."""
 
-    name: str
-
-
-@dataclass
-class _Type:
-    """A type of arrays, whose byte order comes later."""
-
-    code: str
-
-    @property
-    def built(self) -> np.dtype[Any]:
-        if not _TYPE.fullmatch(self.code):
-            raise ValueError(f'arrays of type {self.code[:20]!r}, wanted numbers or text')
-        return np.dtype(self.code)
-
-
-@dataclass
-class _Array:
-    """An array, whose content comes later."""
-
-    built: NDArray[Any] = field(default_factory=lambda: np.zeros(0))
+    built: Any = None
 
 
 def read_plain_pickle(content: bytes) -> Any:
@@ -77,66 +56,57 @@ def read_plain_pickle(content: bytes) -> Any:
         for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
             if count > MOST_OPCODES:
                 raise ValueError(f'the pickle has more than {MOST_OPCODES} opcodes')
-            if opcode.name == 'STOP':
-                return _built(stack.pop())
-            _follow(opcode.name, argument, stack, marks, memo)
+            if opcode.name != 'STOP':
+                _follow(opcode.name, argument, stack, marks, memo)
+        return _built(stack.pop())
     except (IndexError, KeyError, TypeError, AttributeError, OverflowError) as fault:
         raise ValueError('the pickle is damaged') from fault
-    raise ValueError('the pickle has no end')
 
 
 def _follow(
     name: str, argument: Any, stack: list[Any], marks: list[int], memo: dict[int, Any]
 ) -> None:
     """Carries out one opcode."""
-
-    def above_mark() -> list[Any]:
-        at = marks.pop()
+    if name in _TAKES:
+        count = _TAKES[name]
+        at = marks.pop() if count is None else len(stack) - count
         items = [_built(x) for x in stack[at:]]
         del stack[at:]
-        return items
-
-    if _VALUES.fullmatch(name):
+        if name.startswith('TUPLE'):
+            stack.append(tuple(items))
+        elif name.startswith('APPEND'):
+            list.extend(stack[-1], items)
+        elif all(isinstance(x, (str, bytes, int, float)) for x in items[::2]):
+            dict.update(stack[-1], zip(items[::2], items[1::2], strict=True))
+        else:
+            raise ValueError('the pickle has keys that are neither texts nor numbers')
+    elif _VALUES.fullmatch(name):
         stack.append(argument)
     elif name in _CONSTANTS:
         stack.append(_CONSTANTS[name])
-    elif name in _CONTAINERS:
-        stack.append(_CONTAINERS[name]())
-    elif name in _PUT:
+    elif name in ('EMPTY_LIST', 'EMPTY_DICT'):
+        stack.append([] if name == 'EMPTY_LIST' else {})
+    elif name in ('BINPUT', 'LONG_BINPUT', 'MEMOIZE'):
         memo[len(memo) if argument is None else argument] = stack[-1]
-    elif name in _GET:
+    elif name in ('BINGET', 'LONG_BINGET'):
         stack.append(memo[argument])
     elif name == 'MARK':
         marks.append(len(stack))
-    elif name in ('APPENDS', 'APPEND'):
-        items = [_built(stack.pop())] if name == 'APPEND' else above_mark()
-        list.extend(stack[-1], items)
-    elif name in ('SETITEMS', 'SETITEM'):
-        if name == 'SETITEM':
-            marks.append(len(stack) - 2)
-        items = above_mark()
-        if not all(isinstance(x, (str, bytes, int, float)) for x in items[::2]):
-            raise ValueError('the pickle has keys that are neither texts nor numbers')
-        dict.update(stack[-1], zip(items[::2], items[1::2], strict=True))
-    elif name in _TUPLES or name == 'TUPLE':
-        if name in _TUPLES:
-            marks.append(len(stack) - _TUPLES[name])
-        stack.append(tuple(above_mark()))
     elif name in ('GLOBAL', 'STACK_GLOBAL'):
         text = argument or ' '.join((stack.pop(-2), stack.pop()))
         known = _GLOBAL.fullmatch(text)
         if known is None:
             raise ValueError(f'the pickle wants to use {text[:60]!r}, which is not plain data')
-        stack.append(_Global(known[1] or known[2]))
+        stack.append(_Held(known[1] or known[2]))
     elif name == 'REDUCE':
         arguments = stack.pop()
-        stack.append(_called(stack.pop().name, *arguments))
+        stack.append(_called(stack.pop().built, *arguments))
     elif name == 'BUILD':
-        state = stack.pop()
-        if isinstance(stack[-1], _Type):
-            stack[-1].code = state[1] + stack[-1].code.lstrip('<>=|')
+        state, held = stack.pop(), stack[-1]
+        if isinstance(held.built, np.dtype):
+            held.built = held.built.newbyteorder(state[1])
         else:
-            stack[-1].built = _array(state[4], state[2], state[1], 'F' if state[3] else 'C')
+            held.built = _array(state[4], state[2], state[1], 'F' if state[3] else 'C')
     elif name not in ('PROTO', 'FRAME'):
         raise ValueError(f'the pickle has the opcode {name}, which plain data does not need')
 
@@ -144,30 +114,27 @@ def _follow(
 def _called(name: str, *arguments: Any) -> Any:
     """What a function of numpy would give."""
     if name == '_reconstruct':
-        return _Array()
-    if name == 'dtype':
-        return _Type(str(arguments[0]))
+        return _Held()
+    if name == 'dtype' and _TYPE.fullmatch(arguments[0]):
+        return _Held(np.dtype(arguments[0]))
     if name == 'scalar':
         return _array(arguments[1], arguments[0], (), 'C')[()]
     if name == '_frombuffer':
         return _array(*arguments)
     if name == 'encode' and arguments[1:] == ('latin1',):
         return arguments[0].encode('latin1')
-    raise ValueError(f'the pickle wants to call {name}')
+    raise ValueError(f'the pickle has a {name} of {str(arguments[0])[:20]!r}, wanted plain data')
 
 
-def _array(content: Any, kind: Any, shape: tuple[int, ...], order: Any) -> NDArray[Any]:
+def _array(content: Any, held: _Held, shape: tuple[int, ...], order: Any) -> NDArray[Any]:
     """An array of the content that is there: bytes, or a list of objects."""
-    dtype = _built(kind)
+    dtype, objects = held.built, isinstance(content, list)
     if isinstance(content, str):  # of Python 2
         content = content.encode('latin1')
-    if not all(isinstance(n, int) and n >= 0 for n in shape):
-        raise ValueError('the pickle has an array of a negative shape')
-    objects = isinstance(content, list)
-    if objects != dtype.hasobject or math.prod(shape) * (1 if objects else dtype.itemsize) != len(
-        content
-    ):
-        raise ValueError(f'the pickle has an array of {shape} with {len(content)} bytes or objects')
+    there = len(content) * (dtype.itemsize if objects else 1)
+    wanted = math.prod(shape) * dtype.itemsize
+    if objects != dtype.hasobject or there != wanted or min(shape, default=0) < 0:
+        raise ValueError(f'the pickle has an array of {wanted} bytes, but there are {there}')
     if not objects:
         return np.frombuffer(bytes(content), dtype).reshape(shape, order=order)
     flat = np.empty(len(content), dtype=object)
@@ -177,5 +144,6 @@ def _array(content: Any, kind: Any, shape: tuple[int, ...], order: Any) -> NDArr
 
 
 def _built(value: Any) -> Any:
-    """An array or a type in place of what stood for it."""
-    return value.built if isinstance(value, (_Array, _Type)) else value
+    """An array in place of what stood for it."""
+    held = isinstance(value, _Held) and isinstance(value.built, np.ndarray)
+    return value.built if held else value

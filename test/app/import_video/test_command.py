@@ -222,7 +222,7 @@ def test_memory_does_not_grow_with_the_video(tmp_path, monkeypatch):
         (['--keypoints', '{}/far.npz'], '27 of 27 keypoints lie outside of the images'),
         (
             ['--keypoints', '{}/ten.npz', '--person', 'index:3'],
-            'none of the 10 imported frames has',
+            'no frame has a person 3: the last is --person index:0',
         ),
         (['--keypoints', '{}/ten.npz', '--person', 'tall'], '--person: wanted largest, nearest,'),
         (['--keypoints', 'k', '--detector', 'mediapipe'], '--detector: not allowed with argument'),

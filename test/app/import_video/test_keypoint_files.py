@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hmt_ros.app.import_video.frames import Frame, FrameSource
-from hmt_ros.app.import_video.keypoint_files import read_keypoints
+from hmt_ros.app.import_video.keypoint_files.persons import landmark_name
+from hmt_ros.app.import_video.keypoint_files.reading import read_keypoints
 from hmt_ros.image.keypoint_schemes import schemes
 
 START = 1_000_000_000_000
@@ -30,7 +31,9 @@ def flat(n, number, sure=0.5):
 def found_in(path, number=2, source=None, time_ns=None):
     source = source or Numbered(path.parent / 'walk.mp4')
     frame = Frame(number, 40_000_000 * number if time_ns is None else time_ns, '', IMAGE)
-    return read_keypoints(path, source, START).of(frame)
+    found = read_keypoints(path, source, START)
+    key = found.key_of(frame)
+    return [] if key is None else found.frames[key]
 
 
 def write(path, content):
@@ -86,9 +89,7 @@ def test_coco_annotations(tmp_path):
     assert list(seen.keypoints.confidences) == [1.0, 0.5, 0.0]
     assert np.array_equal(seen.keypoints.pixels[:2], [[5, 6], [7, 8]])
     found = read_keypoints(tmp_path / 'walk.json', source, START)
-    found.check_size(Frame(0, 0, '', np.zeros((4, 8, 3), np.uint8)))
-    with pytest.raises(ValueError, match='in images of 8x4 pixels, but the frames have 4x4'):
-        found.check_size(Frame(0, 0, '', IMAGE))
+    assert found.size == (8, 4)
 
 
 def test_openpose(tmp_path):
@@ -174,14 +175,15 @@ def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
     ('name', 'content', 'message'),
     [
         ('a.json', '{', 'not JSON'),
-        ('a.json', {'people': []}, 'no list images'),
-        ('a.json', [1], 'not COCO: wanted a list of'),
+        ('a.json', {'people': []}, 'entry 0 has no image_id or no keypoints: a file for each fr'),
+        ('a.json', {'annotations': []}, 'no list images'),
+        ('a.json', [1], 'entry 0 has no image_id or no keypoints'),
+        ('a.json', {'a': 1}, 'no known layout of JSON; wanted a list of'),
         ('a.json', [{'keypoints': []}], 'entry 0 has no image_id or no keypoints'),
         ('a.json', [{'image_id': 0, 'keypoints': [1, 2]}], 'entry 0 has 2 numbers'),
         ('a.json', [{'image_id': 0, 'keypoints': ['x'] * 3}], 'keypoints are not numbers'),
         ('a.json', [{'image_id': 0, 'keypoints': [5.0] * 30}], '10 keypoints without names'),
         ('a.json', [{'image_id': 'walk', 'keypoints': [5.0] * 51}], 'walk is not the name of a fr'),
-        ('a.json', [{'image_id': 0, 'keypoints': [0.5] * 51}], 'they are fractions of the image'),
         ('a.json', [{'image_id': 0, 'keypoints': [1e9] * 51}], r'a keypoint lies 1e\+09 px away'),
         ('a.json', [{'image_id': 0, 'keypoints': [10**400] * 51}], 'keypoints are not numbers'),
         (
@@ -193,17 +195,20 @@ def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
             },
             'entry 0 has 2 keypoints, but 3 are named in categories',
         ),
-        ('a.json', [], 'no keypoint was seen in any frame'),
+        ('a.json', [{'image_id': 0, 'keypoints': [5.0] * 102}], 'of two persons, 17 each?'),
+        ('a.json', [{'image_id': 10**9, 'keypoints': [5.0] * 51}], 'wanted at most 10000000 fr'),
+        ('a.json', {'images': [{'id': {}}], 'annotations': []}, 'an image has no id'),
+        ('a.json', {'a': {'b': 1}, 'c': [{}]}, 'entry 0 has no number|c is not the name'),
         ('a.csv', 'u,v\n1,2\n', 'wanted a column frame, time_s or stamp_ns'),
         ('a.csv', 'frame,nose\n1,2\n', 'wanted columns NAME_u and NAME_v, or name, u and v'),
         ('a.csv', 'frame,nose_u\n1,2\n', 'no column nose_v'),
-        ('a.csv', 'frame,a_u,a_v\n1,x,3\n', "line 2: a_u is 'x', wanted a number"),
-        ('a.csv', 'time_s,a_u,a_v\nx,1,3\n', "time_s is 'x', wanted a number"),
+        ('a.csv', 'frame,a_u,a_v\n1,x,3\n', "line 2: 'x', wanted a number"),
+        ('a.csv', 'time_s,a_u,a_v\nx,1,3\n', 'time_s has could not convert'),
         ('a.csv', 'frame,name,u,v\n1,a,1,3\n1,a,1,3\n', 'line 3: a twice in frame 1'),
         ('a.csv', 'frame,name,u,v\n1,,1,3\n', 'line 2: no name'),
         ('a.csv', 'name,u,v,frame\na,1,3\n', 'line 2: no frame'),
         ('a.npz', 'no archive', 'not a zip file'),
-        ('a.txt', 'words', '.txt is not known; wanted COCO'),
+        ('a.txt', 'words', '.txt is not known; wanted a detector'),
     ],
 )
 def test_bad_files(name, content, message, tmp_path):
@@ -235,10 +240,10 @@ def test_bad_folders(tmp_path):
     with pytest.raises(ValueError, match=r'no \.json files in this folder'):
         found_in(folder)
     write(folder / 'walk_1_keypoints.json', {'people': [{'pose_keypoints_2d': [1.0] * 4}]})
-    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json has 4 numbers'):
+    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json: a person has 4 numbers'):
         found_in(folder)
     write(folder / 'walk_1_keypoints.json', {'persons': []})
-    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json is not of OpenPose'):
+    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json: an object without people'):
         found_in(folder)
     with pytest.raises(ValueError, match='no such file'):
         found_in(tmp_path / 'missing.json')

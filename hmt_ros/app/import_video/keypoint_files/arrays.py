@@ -89,39 +89,22 @@ def _object(array: Any) -> dict[Any, Any]:
 
 def _clips(subjects: dict[Any, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
     """Names of clips and their arrays (T, n, 2 or 3)."""
-    count = 0
     for subject, actions in subjects.items():
-        for action, cameras in (actions if isinstance(actions, dict) else {'': actions}).items():
-            several = isinstance(cameras, (list, tuple)) or (
-                isinstance(cameras, np.ndarray) and cameras.dtype.hasobject
-            )
-            for i, points in enumerate(cameras if several else [cameras]):
-                count += 1
-                if not _is_clip(points) or count > _MOST_CLIPS:
-                    raise ValueError(
-                        f'positions_2d of {str(subject)[:40]} holds no array (T, n, 2) of numbers'
-                    )
-                name = '/'.join(str(x)[:40] for x in (subject, action) if x != '')
-                yield f'{name}/{i}', points
-
-
-def _is_clip(points: Any) -> bool:
-    return (
-        isinstance(points, np.ndarray)
-        and points.dtype.kind in 'fiu'
-        and points.ndim == 3
-        and points.size > 0
-        and points.shape[2] in (2, 3)
-    )
+        named = actions.items() if isinstance(actions, dict) else [('', actions)]
+        for (action, cameras), _ in zip(named, range(_MOST_CLIPS), strict=False):
+            alone = isinstance(cameras, np.ndarray) and cameras.ndim == 3
+            for i, points in enumerate([cameras] if alone else [*cameras][:_MOST_CLIPS]):
+                name = f'{str(subject)[:40]}/{str(action)[:40]}/{i}'
+                numbers = isinstance(points, np.ndarray) and points.dtype.kind in 'fiu'
+                if not (numbers and points.size and points.ndim == 3 and points.shape[2] in (2, 3)):
+                    raise ValueError(f'positions_2d of {name} is no array (T, n, 2) of numbers')
+                yield name, points
 
 
 def _size(about: dict[Any, Any]) -> tuple[int, int] | None:
     """Width and height of the images in metadata of one video; None: not known."""
     videos = about.get('video_metadata')
-    sizes = [
-        (one.get('w'), one.get('h'))
-        for one in (videos.values() if isinstance(videos, dict) else [])
-        if isinstance(one, dict)
-    ]
-    width, height = sizes[0] if len(sizes) == 1 else (None, None)
+    one = [*videos.values()] if isinstance(videos, dict) else []
+    known = len(one) == 1 and isinstance(one[0], dict)
+    width, height = (one[0].get(x) if known else None for x in 'wh')
     return (width, height) if isinstance(width, int) and isinstance(height, int) else None

@@ -88,7 +88,7 @@ def chosen_person(
         most = max(map(len, found.frames.values()), default=0)
         if most and not there:
             raise ValueError(
-                f'no frame has a person {value}: --person index:{most - 1} is the last'
+                f'no frame has a person {value}: the last is --person index:{most - 1}'
             )
         return there
     likely = found.likely()
@@ -96,9 +96,8 @@ def chosen_person(
         return {}
     if kind == TRACK:
         return _called(found, value)
-    unit = 1.0
-    if found.timed and len(likely) > 1:
-        unit = float(np.median(np.diff([*likely])))
+    many = found.timed and len(likely) > 1
+    unit = float(np.median(np.diff([*likely]))) if many else 1.0
     if kind == LONGEST:
         tracks = sorted(tracks_of(likely, unit), key=len, reverse=True)
         if int(value) > len(tracks):
@@ -135,17 +134,11 @@ def _largest(persons: Sequence[Person]) -> Person:
 def _called(found: FoundPersons, name: str) -> dict[int, Person]:
     """The person of a name."""
     likely = found.likely()
-    there = {
-        key: next(x for x in persons if x.track == name)
-        for key, persons in likely.items()
-        if any(x.track == name for x in persons)
-    }
-    if there:
-        return there
-    names = _names_in(found)
-    if not names:
-        raise ValueError(f'no person {name}: the file has no ids; see --person at:X,Y or track:1')
-    raise ValueError(f'no person {name}: the ids are {names}; see --person id:NAME')
+    there = {key: x for key, persons in likely.items() for x in persons if x.track == name}
+    if not there:
+        names = _names_in(found) or 'none in the file, see --person at:X,Y or track:1'
+        raise ValueError(f'no person {name}; the ids (--person id:NAME) are {names}')
+    return there
 
 
 def _names_in(found: FoundPersons) -> str:
@@ -196,14 +189,13 @@ def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dic
             if i not in of_person and j not in of_person.values():
                 of_person[i] = j
         for i, x in enumerate(persons):
-            if i in of_person:
-                track = going[of_person[i]][2]
-                going[of_person[i]] = key, x, track
-            else:
-                track = {}
-                tracks.append(track)
-                going.append((key, x, track))
+            if i not in of_person:
+                of_person[i] = len(going)
+                going.append((key, x, {}))
+                tracks.append(going[-1][2])
+            track = going[of_person[i]][2]
             track[key] = x
+            going[of_person[i]] = key, x, track
     return tracks
 
 

@@ -1,4 +1,4 @@
-"""Folders with a file for each frame: JSON of OpenPose, MMPose and others, labels of Ultralytics."""
+"""Folders with a file for each frame: JSON of OpenPose and others, labels of Ultralytics."""
 
 from __future__ import annotations
 

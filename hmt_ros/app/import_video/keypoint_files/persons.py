@@ -7,6 +7,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -153,9 +154,6 @@ class FoundPersons:
     fractions: bool = False
     clips: int = 1
 
-    def __post_init__(self) -> None:
-        self._keys: list[int] = []
-
     def add(self, key: int, seen: Person | None) -> None:
         """Adds a person to a frame; None: the frame was looked at.
 
@@ -165,6 +163,11 @@ class FoundPersons:
         if not self.timed and key >= MOST_FRAMES:
             raise ValueError(f'frame {key}, wanted at most {MOST_FRAMES} frames')
         self.frames[key] += [] if seen is None else [seen]
+
+    @cached_property
+    def keys(self) -> list[int]:
+        """The keys in order, once all persons are there."""
+        return sorted(self.frames)
 
     @property
     def last(self) -> int:
@@ -178,19 +181,10 @@ class FoundPersons:
 
     def key_of(self, frame: Frame) -> int | None:
         """Key of a frame; None: the file does not have it."""
-        if not self.timed:
-            return frame.number if frame.number in self.frames else None
-        if len(self._keys) != len(self.frames):
-            self._keys = sorted(self.frames)
-        at = bisect_left(self._keys, frame.time_ns)
-        near = self._keys[max(at - 1, 0) : at + 1]
-        key = min(near, key=lambda t: abs(t - frame.time_ns), default=None)
-        return None if key is None or abs(key - frame.time_ns) > _MATCHING_NS else key
-
-    def of(self, frame: Frame) -> list[Person]:
-        """Persons in a frame."""
-        key = self.key_of(frame)
-        return [] if key is None else self.frames[key]
+        wanted, apart = (frame.time_ns, _MATCHING_NS) if self.timed else (frame.number, 0)
+        at = bisect_left(self.keys, wanted)
+        near = [x for x in self.keys[max(at - 1, 0) : at + 1] if abs(x - wanted) <= apart]
+        return min(near, key=lambda x: abs(x - wanted), default=None)
 
     def persons(self) -> Iterator[Person]:
         """All persons of all frames."""
