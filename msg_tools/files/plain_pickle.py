@@ -23,9 +23,12 @@ _VALUES = re.compile(
 )
 _CONSTANTS = {'NONE': None, 'NEWTRUE': True, 'NEWFALSE': False, 'EMPTY_TUPLE': ()}
 # Number of items that an opcode takes from the stack; None: all above the mark.
-_TAKES = {
-    **{'APPEND': 1, 'SETITEM': 2, 'TUPLE1': 1, 'TUPLE2': 2, 'TUPLE3': 3},
-    **dict.fromkeys(('APPENDS', 'SETITEMS', 'TUPLE')),
+_TAKES = dict.fromkeys(('APPENDS', 'SETITEMS', 'TUPLE')) | {
+    'APPEND': 1,
+    'SETITEM': 2,
+    'TUPLE1': 1,
+    'TUPLE2': 2,
+    'TUPLE3': 3,
 }
 _GLOBAL = re.compile(
     r'numpy(?:\._?core\.(?:multiarray|numeric))? (_reconstruct|ndarray|dtype|scalar|_frombuffer)'

@@ -247,3 +247,214 @@ def test_bad_folders(tmp_path):
         found_in(folder)
     with pytest.raises(ValueError, match='no such file'):
         found_in(tmp_path / 'missing.json')
+
+
+def rows(n=17, number=2):
+    """(n, 3) column, row and confidence as JSON has them."""
+    return np.column_stack([pixels(n, number), np.full(n, 0.5)]).tolist()
+
+
+def places(number=2):
+    return [list(map(float, x)) for x in pixels(17, number)]
+
+
+def instance(number=2, **more):
+    return {'keypoints': places(number), 'keypoint_scores': [0.5] * 17, **more}
+
+
+ULTRALYTICS = {
+    'name': 'person', 'class': 0, 'confidence': 0.8, 'track_id': 4,
+    'keypoints': {
+        'x': [x for x, _ in places()], 'y': [y for _, y in places()], 'visible': [0.5] * 17
+    },
+}  # fmt: skip
+NAMES = {str(i): name for i, name in enumerate(schemes()['coco17'].names)}
+LAYOUTS = {
+    'mmpose inferencer': [
+        {'frame_id': i, 'instances': [instance(i, bbox=[[1, 2, 3, 4]], bbox_score=0.8)]}
+        for i in range(3)
+    ],
+    'mmpose demo, which counts from 1': {
+        'meta_info': {'keypoint_id2name': NAMES},
+        'instance_info': [
+            {'frame_id': i + 1, 'instances': [instance(i, bbox_score=0.8)]} for i in range(3)
+        ],
+    },
+    'mmpose test': [
+        {'preds': [rows(number=i)], 'boxes': [[1, 2, 3, 4, 5, 0.8]], 'image_paths': [f'a/{i}.jpg']}
+        for i in range(3)
+    ],
+    'mmpose before 1': {
+        str(i): [{'bbox': [1, 2, 3, 4, 0.8], 'keypoints': rows(number=i)}] for i in range(3)
+    },
+    'alphapose': [
+        {'image_id': '2.jpg', 'keypoints': flat(17, 2), 'score': 0.8, 'idx': [4.0]},
+        {'image_id': '1.jpg', 'keypoints': flat(17, 1), 'score': 0.8, 'idx': [5.0]},
+    ],
+    'alphapose cmu': {
+        f'{i}.jpg': {'version': 'AlphaPose v0.3', 'bodies': [{'joints': flat(17, i)}]}
+        for i in range(3)
+    },
+    'alphapose tracked': {'4': {'2': {'keypoints': flat(17, 2), 'scores': 0.8}}},
+    'ultralytics': [[], [], [ULTRALYTICS]],
+    'ultralytics as texts': ['[]', '[]', json.dumps([ULTRALYTICS])],
+}
+
+
+@pytest.mark.parametrize('layout', LAYOUTS)
+def test_layouts_of_json(layout, tmp_path):
+    (seen,) = found_in(write(tmp_path / 'walk.json', LAYOUTS[layout]))
+    assert seen.keypoints.names == schemes()['coco17'].names
+    assert np.array_equal(seen.keypoints.pixels, pixels(17, 2))
+    assert (seen.keypoints.confidences == 0.5).all()
+    assert seen.score == (1.0 if layout == 'alphapose cmu' else 0.8)
+    tracked = layout in ('alphapose', 'alphapose tracked') or 'ultra' in layout
+    assert seen.track == ('4' if tracked else '')
+
+
+@pytest.mark.parametrize(
+    ('n', 'scheme'), [(133, 'wholebody23'), (135, 'body25b'), (136, 'halpe26')]
+)
+def test_bodies_of_lists_with_faces_and_hands(n, scheme, tmp_path):
+    entries = [{'image_id': 2, 'keypoints': flat(n, 2)}]
+    (seen,) = found_in(write(tmp_path / 'walk.json', entries))
+    names = schemes()[scheme].names
+    assert seen.keypoints.names == names
+    assert np.array_equal(seen.keypoints.pixels, pixels(n, 2)[: len(names)])
+
+
+@pytest.mark.parametrize(
+    ('sure', 'tail', 'track', 'score'),
+    [
+        (True, '', '', 1.0),
+        (True, ' 0.8', '', 0.8),
+        (False, ' 0.8 4', '4', 0.8),
+        (True, ' 4', '4', 1),
+    ],
+)
+def test_labels_of_ultralytics(sure, tail, track, score, tmp_path):
+    """Fractions of the image; frames of a video count from 1, and other classes are no persons."""
+    folder = tmp_path / 'labels'
+    folder.mkdir()
+    for i in (1, 2):
+        values = np.array(rows(number=i)) / (64, 48, 1)
+        text = ' '.join(str(x) for x in values[:, : 3 if sure else 2].ravel())
+        write(folder / f'walk_{i + 1}.txt', f'0 .5 .5 .2 .3 {text}{tail}\n7 .5 .5 .2 .3\n')
+    (seen,) = found_in(folder)
+    np.testing.assert_allclose(seen.keypoints.pixels * (64, 48), pixels(17, 2))
+    assert (seen.keypoints.confidences == (0.5 if sure else 1.0)).all()
+    assert (seen.track, seen.score) == (track, score)
+    write(folder / 'walk_9.txt', '0 .5 .5 .2 .3\n')
+    with pytest.raises(
+        ValueError, match=r'walk_9\.txt: line 1 has 5 numbers, wanted class, box and'
+    ):
+        found_in(folder)
+
+
+def test_frames_of_json_files_in_a_folder(tmp_path):
+    folder = tmp_path / 'predictions'
+    folder.mkdir()
+    for i in range(3):
+        write(folder / f'{i:06d}.json', [instance(i, bbox_score=0.8)])
+    (seen,) = found_in(folder)
+    assert np.array_equal(seen.keypoints.pixels, pixels(17, 2))
+
+
+def test_arrays_of_videopose3d(tmp_path):
+    clip = np.stack([pixels(17, i) for i in range(4)])
+    about = {
+        'layout_name': 'h36m', 'num_joints': 17, 'keypoints_symmetry': [[4, 5], [1, 2]],
+        'video_metadata': {'walk.mp4': {'w': 64, 'h': 48}},
+    }  # fmt: skip
+    path = tmp_path / 'walk.npz'
+    np.savez_compressed(path, positions_2d={'walk.mp4': {'custom': [clip]}}, metadata=about)
+    (seen,) = found_in(path)
+    assert seen.keypoints.names == schemes()['h36m17'].names
+    assert np.array_equal(seen.keypoints.pixels, pixels(17, 2))
+    found = read_keypoints(path, Numbered(tmp_path), START)
+    assert (found.size, found.rows, found.clips) == ((64, 48), 4, 1)
+    np.savez(path, positions_2d={'S1': {'Walk': [clip, clip + 1]}})
+    assert [x.track for x in found_in(path)] == ['S1/Walk/0', 'S1/Walk/1']
+    for bad in ([[clip.tolist()]], [clip[0]], ['x'], [np.array(['a'])]):
+        np.savez(path, positions_2d={'S1': {'Walk': bad}})
+        with pytest.raises(ValueError, match=r'positions_2d of S1/Walk/0 is no array \(T, n, 2\)'):
+            found_in(path)
+
+
+def test_arrays_without_names(tmp_path):
+    content = arrays()
+    del content['landmark_names']
+    np.savez(tmp_path / 'walk.npz', **content)
+    (seen,) = found_in(tmp_path / 'walk.npz')
+    assert seen.keypoints.names == schemes()['mediapipe33'].names
+
+
+DEEPLABCUT = """\
+scorer,net,net,net,net,net,net
+individuals,one,one,one,two,two,two
+bodyparts,LHip,LHip,LHip,tail,tail,tail
+coords,x,y,likelihood,x,y,likelihood
+1,1,2,0.5,,,
+2,3,4,0.5,9,9,0.9
+"""
+
+
+@pytest.mark.parametrize('several', [True, False])
+def test_deeplabcut(several, tmp_path):
+    lines = DEEPLABCUT.splitlines(keepends=True)
+    text = ''.join(x for x in lines if several or not x.startswith('individuals'))
+    (seen,) = found_in(write(tmp_path / 'walk.csv', text))
+    assert seen.keypoints.names == ('left_hip',)
+    assert list(seen.keypoints.pixels[0]) == [3, 4]
+    assert seen.keypoints.confidences[0] == 0.5
+    assert seen.track == ('one' if several else '')
+    with pytest.raises(ValueError, match='wanted names such as left_hip or LHip'):
+        found_in(write(tmp_path / 'tail.csv', text.replace('LHip', 'paw')))
+
+
+MARKERS = """\
+PathFileType\t4\t(X/Y/Z)\twalk.trc
+DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits
+25\t25\t2\t2\tm
+Frame#\tTime\tRBigToe\t\t\tNeck\t\t
+\t\tX1\tY1\tZ1\tX2\tY2\tZ2
+0\t3.0\t31\t32\t0\t41\t42\t0
+2\t3.08\t51\t52\t0\t\t\t
+"""
+
+
+def test_markers(tmp_path):
+    """Times count from the first row as they are; a Y that points up is turned."""
+    for text in (MARKERS, MARKERS.replace('\t32', '\t-32').replace('\t52', '\t-52')):
+        text = text if '-32' not in text else text.replace('\t42', '\t-42')
+        (seen,) = found_in(write(tmp_path / 'walk.trc', text), time_ns=3_080_000_000)
+        assert seen.keypoints.names == ('right_big_toe', 'neck')
+        assert list(seen.keypoints.pixels[0]) == [51, 52]
+        assert list(seen.keypoints.seen) == [True, False]
+    for bad in (MARKERS.replace('32\t0', '32\t7'), MARKERS.replace('\t5', '\t0.5')):
+        bad = bad.replace('\t31\t32', '\t.31\t.32').replace('\t41\t42', '\t.41\t.42')
+        with pytest.raises(ValueError, match=r'three coordinates or metres; wanted .* _px_'):
+            found_in(write(tmp_path / 'walk.trc', bad))
+    with pytest.raises(ValueError, match='no line Frame#'):
+        found_in(write(tmp_path / 'walk.trc', 'x\ty\n'))
+
+
+@pytest.mark.parametrize('unit', [1, 1000, 10**9])
+def test_unix_times_count_from_the_first_row(unit, tmp_path):
+    times = [round(x * unit, 4) for x in (1_700_000_000.25, 1_700_000_000.33)]
+    text = f'time_s,a_u,a_v\n{times[0]},5,6\n{times[1]},7,8\n'
+    (seen,) = found_in(write(tmp_path / 'walk.csv', text), time_ns=80_000_000)
+    assert list(seen.keypoints.pixels[0]) == [7, 8]
+    text = 'time_s,a_u,a_v\n0,5,6\n1e10,7,8\n'
+    with pytest.raises(ValueError, match='times that are years apart'):
+        found_in(write(tmp_path / 'walk.csv', text))
+
+
+def test_names_of_markers():
+    wanted = {
+        'RHip': 'right_hip', 'LBigToe': 'left_big_toe', 'left-ankle': 'left_ankle',
+        'Left Shoulder': 'left_shoulder', 'LEFT_KNEE': 'left_knee', 'Ankle_L': 'left_ankle',
+        'rankle': 'right_ankle', 'MidHip': 'hip', 'Head': 'head', 'nose': 'nose', 'tail': 'tail',
+        'mid_hip': 'mid_hip', 'rib': 'rib',
+    }  # fmt: skip
+    assert {x: landmark_name(x) for x in wanted} == wanted

@@ -53,7 +53,7 @@ def test_nothing_is_called(tmp_path):
         inside,
         {'a': [Calls(eval, f'open({str(mark)!r}, "w")')]},
     ):
-        with pytest.raises(ValueError, match='wants to use .*, which is not plain data'):
+        with pytest.raises(ValueError, match=r'wants to use .*, which is not plain data'):
             read_plain_pickle(pickle.dumps(bad))
         np.savez(tmp_path / 'bad.npz', bad=np.array(bad, dtype=object))
         with pytest.raises(ValueError, match='not plain data'):
@@ -81,7 +81,7 @@ def test_claims_are_compared_with_what_is_there():
         read_plain_pickle(good.replace(b'K\x04\x85', b'K\xc8\x85', 1))
     assert read_plain_pickle(b'\x80\x04]r\xff\xff\xff\x7f.') == []
     for end in range(1, len(good)):
-        with pytest.raises(ValueError, match='.'):
+        with pytest.raises(ValueError, match=r'.'):
             read_plain_pickle(good[:end])
     with pytest.raises(ValueError, match='more than 1000000 opcodes'):
         read_plain_pickle(b'\x80\x04' + b']' * 1_100_000 + b'.')
