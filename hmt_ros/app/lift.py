@@ -53,6 +53,8 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 LIFTED, REPORT = 'lifted', 'report'
+# Frames without an entry get an empty mixture, unless they are so many for each with one.
+_GAPS = 1000
 
 EPILOG = """\
 KEYPOINTS is what import-video takes: .json, .npz, .csv, .trc, or a folder.
@@ -185,7 +187,8 @@ def _in_frames(
     found: FoundPersons, chosen: dict[int, Keypoints], fps: float
 ) -> tuple[list[int], list[Keypoints]]:
     """Times, ns, and keypoints of the chosen person, without names where there are none."""
-    keys = found.keys if found.timed else list(range(found.last + 1))
+    sparse = found.timed or found.last > _GAPS * len(found.frames)
+    keys = found.keys if sparse else list(range(found.last + 1))
     times = keys if found.timed else [round(key * SECOND_NS / fps) for key in keys]
     return times, [chosen.get(key, NO_KEYPOINTS) for key in keys]
 

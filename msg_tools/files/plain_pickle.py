@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Opcodes of a pickle; one of plain arrays has a few hundred.
-MOST_OPCODES = 1_000_000
+MOST_OPCODES = 200_000
 _VALUES = re.compile(
     r'BININT[12]?|LONG[14]|BINFLOAT|(SHORT_)?BINUNICODE|BINUNICODE8|(SHORT_)?BINBYTES|BINBYTES8'
     r'|BYTEARRAY8|(SHORT_)?BINSTRING'

@@ -30,10 +30,10 @@ def read_arrays(path: Path) -> FoundPersons:
         return _positions(path, content)
     if 'pixels' not in content:
         raise ValueError('no array pixels; wanted pixels and landmark_names, or positions_2d')
-    rows = len(content['pixels'])
     given = content.get('landmark_names')
-    n = content['pixels'].size // max(2 * rows, 1) if given is None else len(given)
-    names = None if given is None else tuple(str(x) for x in given)
+    rows, n = (*content['pixels'].shape, 0, 0)[:2]
+    n = n if given is None else given.size
+    names = None if given is None else tuple(str(x) for x in given.flat)
     shapes = {
         'pixels': (rows, n, 2),
         'visibility': (rows, n),
@@ -92,8 +92,8 @@ def _clips(subjects: dict[Any, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
     for subject, actions in subjects.items():
         named = actions.items() if isinstance(actions, dict) else [('', actions)]
         for (action, cameras), _ in zip(named, range(_MOST_CLIPS), strict=False):
-            alone = isinstance(cameras, np.ndarray) and cameras.ndim == 3
-            for i, points in enumerate([cameras] if alone else [*cameras][:_MOST_CLIPS]):
+            several = isinstance(cameras, (list, tuple)) or np.ndim(cameras) == 1
+            for i, points in enumerate(cameras[:_MOST_CLIPS] if several else [cameras]):
                 name = f'{str(subject)[:40]}/{str(action)[:40]}/{i}'
                 numbers = isinstance(points, np.ndarray) and points.dtype.kind in 'fiu'
                 if not (numbers and points.size and points.ndim == 3 and points.shape[2] in (2, 3)):

@@ -105,10 +105,10 @@ def _of_deeplabcut(table: list[list[str]]) -> Iterator[Cells]:
     heads = {x[0]: x for x in table[: depth + 1] if x}
     coordinates = heads['coords']
     parts = heads.get('bodyparts', [])
-    whose = heads.get('individuals', [''] * len(parts))
+    whose = heads.get('individuals', []) + [''] * len(parts)
     names = _landmarks(parts[1:])
     first = next((i for i, x in enumerate(coordinates) if x == 'x'), 0)
-    places = [i for i, x in enumerate(coordinates) if x == 'x' and i < len(parts)]
+    places = [i for i in range(len(parts)) if coordinates[i : i + 2] == ['x', 'y']]
     for number, row in enumerate(table[depth + 1 :], depth + 2):
         cells = row + [''] * (len(coordinates) - len(row))
         for i in places:
