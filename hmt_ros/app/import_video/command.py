@@ -35,7 +35,7 @@ from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.body import Camera
 from hmt_ros.detectors.blazepose import BlazePose
-from hmt_ros.image.keypoint_schemes import AUTO, scheme_of
+from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_file import camera_of_view, read_camera
@@ -235,22 +235,13 @@ def add_keypoint_arguments(parser: argparse._ActionsContainer) -> None:
         'that of the images)',
     )  # fmt: skip
     parser.add_argument(
-        '--scheme', type=scheme_name, default=AUTO,
+        '--scheme', default=AUTO,
         help='names or order of the keypoints, see docs/keypoints.md (auto)',
     )  # fmt: skip
     parser.add_argument(
         '--mirror', action='store_true',
         help='undo a mirrored recording, of a selfie camera: frames, keypoints, masks, sides',
     )  # fmt: skip
-
-
-def scheme_name(text: str) -> str:
-    """Reads --scheme."""
-    try:
-        scheme_of((), text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-    return text
 
 
 def person_choice(text: str) -> Choice:

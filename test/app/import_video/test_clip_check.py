@@ -81,7 +81,7 @@ def test_bones_tell_the_order(scheme, usual, tmp_path):
 def test_points_in_no_order_are_refused(tmp_path):
     points = walker('coco17')[:, np.random.default_rng(1).permutation(17)]
     with pytest.raises(
-        ValueError, match=r'17 points are in none of the orders .* --scheme coco17 '
+        ValueError, match=r'17 points are not in the order of coco17 .* --scheme coco17 '
     ):
         read(tmp_path, points)
     assert len(read(tmp_path, points, scheme='coco17')[0]) == 30

@@ -98,9 +98,9 @@ def test_names_keep_persons_apart_where_they_meet():
 
 def test_an_id_that_does_not_exist():
     frames = [[at(10.0, track='10'), at(60.0, track='9')]]
-    with pytest.raises(ValueError, match=r'no person 7; the ids \(--person id:NAME\) are 9, 10'):
+    with pytest.raises(ValueError, match=r'no person 7: the ids are 9, 10; --person id:NAME'):
         chosen('id:7', frames)
-    with pytest.raises(ValueError, match='none in the file, see --person at:X,Y or track:1'):
+    with pytest.raises(ValueError, match='there are no ids; or --person at:X,Y or track:1'):
         chosen('id:7', [[at(10.0)]])
     with pytest.raises(ValueError, match='2 clips, 9, 10; choose one by --person id:NAME'):
         chosen('nearest', frames, clips=2)

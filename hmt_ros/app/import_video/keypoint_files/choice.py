@@ -136,8 +136,9 @@ def _called(found: FoundPersons, name: str) -> dict[int, Person]:
     likely = found.likely()
     there = {key: x for key, persons in likely.items() for x in persons if x.track == name}
     if not there:
-        names = _names_in(found) or 'none in the file, see --person at:X,Y or track:1'
-        raise ValueError(f'no person {name}; the ids (--person id:NAME) are {names}')
+        names = _names_in(found)
+        those = f'the ids are {names}; --person id:NAME' if names else 'there are no ids'
+        raise ValueError(f'no person {name}: {those}; or --person at:X,Y or track:1')
     return there
 
 

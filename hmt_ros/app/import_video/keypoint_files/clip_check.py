@@ -31,6 +31,7 @@ from hmt_ros.image.keypoint_schemes import (
     bone_lengths,
     landmarks_of,
     recognised,
+    scheme_of,
     schemes,
     unnamed_orders,
 )
@@ -79,8 +80,9 @@ def check_clip(
         points_size: of the images that the points were found in; None: not known.
 
     Raises:
-        ValueError: no reading fits; the line names the option to use.
+        ValueError: no reading fits; the line names the option to use. Or there is no such scheme.
     """
+    scheme_of((), scheme)
     if not any(found.persons()):
         return
     try:
@@ -110,12 +112,8 @@ def _scale_confidences(found: FoundPersons, tell: Tell) -> None:
     if equal:
         tell(f'{found.path}: all confidences are {largest:g}: they tell nothing, and count as 1')
 
-    def scaled(one: Person) -> Person:
-        points = one.keypoints
-        confidences = np.clip(points.confidences / (largest if equal else scale), 0.0, 1.0)
-        return replace(one, keypoints=replace(points, confidences=confidences))
-
-    found.change(scaled)
+    divisor = largest if equal else scale
+    found.change(lambda x: replace(x, confidences=np.clip(x.confidences / divisor, 0.0, 1.0)))
 
 
 def _scale_places(
@@ -141,14 +139,7 @@ def _scale_places(
             tell(f'{found.path}: places are scaled from {given[0]}x{given[1]} to {width}x{height}')
     else:
         _check_places(points, width, height)
-    if (factor == 1.0).all():
-        return
-
-    def scaled(one: Person) -> Person:
-        pixels = one.keypoints.pixels * factor + shift
-        return replace(one, keypoints=replace(one.keypoints, pixels=pixels))
-
-    found.change(scaled)
+    found.change(lambda x: replace(x, pixels=x.pixels * factor + shift))
 
 
 def _check_places(points: Array, width: int, height: int) -> None:
@@ -176,42 +167,36 @@ def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
     alike = [x.keypoints for x in persons if len(x.keypoints.names) == len(names)]
     pixels = np.stack([np.where(x.confidences[:, None] < _SURE, np.nan, x.pixels) for x in alike])
     orders = unnamed_orders().get(found.unnamed, ())
-    if scheme != AUTO and scheme not in orders:
-        return
     if scheme != AUTO:
-        _rename(found, scheme)
+        if found.unnamed and scheme != JOINTS and len(schemes()[scheme].names) == len(names):
+            _rename(found, scheme)
         return
     tried = {x: bone_deviation(schemes()[x].names, pixels, x) for x in orders}
     usual = next(iter(tried), '')
     if not tried:
         tried[usual] = bone_deviation(names, pixels)
     best = min(tried, key=lambda x: tried[x])
-    if best != usual and tried[usual] > _DOUBTED and tried[best] < _BETTER * tried[usual]:
-        tell(
-            f'{found.path}: bones have the lengths of people in the order of {best}, not in that '
-            f'of {usual}; --scheme {usual} takes that one'
-        )
-        _rename(found, best)
-        usual = best
-    if tried[usual] > (_REFUSED if orders else _NAMES_REFUSED):
-        what = f'{found.unnamed} points are in none of the orders {", ".join(orders)}'
+    if tried[best] > (_REFUSED if orders else _NAMES_REFUSED):
         own = recognised(names)
+        what = f'{found.unnamed} points are not in the order of {" or ".join(orders)}'
         raise ValueError(
             f'bones do not have the lengths of people: {what if orders else "the names are wrong"}'
             ', or points of two people are in one list; '
             f'--scheme {usual or (own.name if own else JOINTS)} takes them as they are'
         )
+    doubted = tried[usual] > _DOUBTED and tried[best] < _BETTER * tried[usual]
+    if best != usual and (doubted or tried[usual] > _REFUSED):
+        tell(
+            f'{found.path}: bones have the lengths of people in the order of {best}, not in that '
+            f'of {usual}; --scheme {usual} takes that one'
+        )
+        _rename(found, best)
 
 
 def _rename(found: FoundPersons, scheme: str) -> None:
     """Gives unnamed points the names of a scheme with as many."""
     names = schemes()[scheme].names
-
-    def renamed(one: Person) -> Person:
-        fits = len(one.keypoints.names) == len(names)
-        return replace(one, keypoints=replace(one.keypoints, names=names)) if fits else one
-
-    found.change(renamed)
+    found.change(lambda x: replace(x, names=names) if len(x.names) == len(names) else x)
 
 
 def bone_deviation(names: Sequence[str], pixels: Array, scheme: str = AUTO) -> float:

@@ -6,7 +6,7 @@ import re
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -199,10 +199,10 @@ class FoundPersons:
             for key, found in sorted(self.frames.items())
         }
 
-    def change(self, changed: Callable[[Person], Person]) -> None:
-        """Replaces each person."""
+    def change(self, changed: Callable[[Keypoints], Keypoints]) -> None:
+        """Replaces the keypoints of each person."""
         for key, found in self.frames.items():
-            self.frames[key] = [changed(x) for x in found]
+            self.frames[key] = [replace(x, keypoints=changed(x.keypoints)) for x in found]
 
 
 def numbers_of(labels: Sequence[str | int], source: FrameSource, *, from_one: bool) -> list[int]:

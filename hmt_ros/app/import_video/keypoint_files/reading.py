@@ -99,16 +99,19 @@ def keypoints_of_person(
     Raises:
         ValueError: the clip contradicts itself, or has no such person; the line says what to do.
     """
-    check_clip(found, size, tell, scheme=reading.scheme, points_size=reading.points_size)
+    told: list[str] = []
+    check_clip(found, size, told.append, scheme=reading.scheme, points_size=reading.points_size)
     try:
         chosen = chosen_person(found, reading.person, first, rate)
         check_steps([chosen[key] for key in sorted(chosen)])
     except ValueError as error:
         raise ValueError(f'{found.path}: {error}') from error
-    keypoints = {key: one.keypoints for key, one in chosen.items()}
-    if reading.mirror:
-        return {key: mirrored(one, size[0]) for key, one in keypoints.items()}
-    return keypoints
+    for text in told:
+        tell(text)
+    return {
+        key: mirrored(one.keypoints, size[0]) if reading.mirror else one.keypoints
+        for key, one in chosen.items()
+    }
 
 
 def mirrored(keypoints: Keypoints, width: int) -> Keypoints:
