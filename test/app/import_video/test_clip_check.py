@@ -98,6 +98,20 @@ def test_bones_of_people_have_small_deviations():
     assert right < 2.2
     assert bone_deviation(names, 0.1 * points) == pytest.approx(right)
     assert bone_deviation(names, points[:, ::-1]) > 4.0
+    # Of few images, or of few bones, one can not tell.
+    assert np.isnan(bone_deviation(names, points[:9]))
+    assert np.isnan(bone_deviation(names, np.where(np.arange(17)[:, None] < 7, points, np.nan)))
+
+
+@pytest.mark.parametrize('scheme', ['coco17', 'body25', 'halpe26'])
+@pytest.mark.parametrize('hidden', [('ankle', 'heel', 'toe'), ('knee', 'ankle', 'heel', 'toe')])
+def test_half_a_person_keeps_the_usual_order(scheme, hidden, tmp_path):
+    points = walker(scheme)
+    names = schemes()[scheme].names
+    points[:, [any(x in name for x in hidden) for name in names]] = 0.0
+    chosen, told = read(tmp_path, points)
+    assert told == ''
+    assert chosen[0].names == names
 
 
 def test_two_people_in_one_list(tmp_path):
@@ -148,7 +162,10 @@ def test_points_of_smaller_images(tmp_path):
     ):
         read(tmp_path, points, points_size=(300, 300))
     with pytest.raises(ValueError, match=r'lie outside of the images, .* --keypoints-size WxH'):
-        read(tmp_path, points * (3, 3, 1))
+        read(tmp_path, points * (2, 2, 1))
+    # Feet below the image that the detector guesses are no reason.
+    points[:, 13:, 1:] = 600.0, 0.1
+    assert read(tmp_path, points)[1] == ''
 
 
 def test_fractions(tmp_path):

@@ -18,6 +18,7 @@ above 4.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -35,7 +36,7 @@ from hmt_ros.image.keypoint_schemes import (
     schemes,
     unnamed_orders,
 )
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Mask
 
 Tell = Callable[[str], None]
 
@@ -46,8 +47,9 @@ _FRACTIONS = 1.5
 _SMALLEST_SCALE = 10.0
 # px, or fractions of the image where all places are within.
 _FRACTION = 2.0
-# Least share of the points that lies in the image, or near it.
-_INSIDE, _NEAR = 0.5, 0.25
+# Least share of the points of at least a confidence that lies in the image, or near it: detectors
+# guess where hidden points are, but are not sure of those that no image shows.
+_INSIDE, _CONFIDENT, _NEAR = 0.7, 0.5, 0.05
 # Share of the image, from its upper left corner, that points of larger images never keep to.
 _QUARTER = 0.5
 _SAME_SHAPE = 0.02
@@ -56,9 +58,9 @@ _ENOUGH = 100  # points of a clip that are all alike for a reason
 _SURE, _BONES = 0.3, 6
 _FEWEST, _MOST = 10, 2000  # persons that the check looks at
 _QUANTILE, _USUAL, _BELOW = 0.9, 1.18, 1.67
-# An order is doubted above the first, and taken for another where that has less than this part;
-# none above the third is believed, nor names above the fourth.
-_DOUBTED, _BETTER, _REFUSED, _NAMES_REFUSED = 1.5, 0.6, 2.75, 3.5
+# An order is refused above the first, unless another has less than this part of its z; names, which
+# are told, above the third.
+_REFUSED, _BETTER, _NAMES_REFUSED = 2.75, 0.6, 3.5
 # A person leaps where all points move by this much of the diagonal of their box, and is back within
 # this much of the leap in one of the next frames; so many leaps, and so many of all steps.
 _LEAP, _BACK, _SOON, _LEAPS, _OFTEN = 0.2, 0.4, 10, 3, 0.1
@@ -121,7 +123,8 @@ def _scale_places(
 ) -> None:
     """Brings places to pixels of the images."""
     (width, height), given = size, points_size or found.size
-    points = np.concatenate([x.keypoints.pixels[x.keypoints.seen] for x in _likely(found)])
+    persons = _likely(found)
+    points = np.concatenate([x.keypoints.pixels[x.keypoints.seen] for x in persons])
     factor, shift = np.ones(2), np.zeros(2)
     if found.fractions or np.abs(points).max() <= _FRACTION:
         factor = np.array(size, dtype=np.float64)
@@ -138,17 +141,18 @@ def _scale_places(
         if (factor != 1.0).any():
             tell(f'{found.path}: places are scaled from {given[0]}x{given[1]} to {width}x{height}')
     else:
-        _check_places(points, width, height)
+        sure = np.concatenate([x.keypoints.confidences[x.keypoints.seen] for x in persons])
+        _check_places(points, sure >= min(_CONFIDENT, sure.max()), size)
     found.change(lambda x: replace(x, pixels=x.pixels * factor + shift))
 
 
-def _check_places(points: Array, width: int, height: int) -> None:
+def _check_places(points: Array, sure: Mask, size: tuple[int, int]) -> None:
     """Raises ValueError where points (n, 2) seem to be those of images of another size."""
-    shares = points / (width, height)
-    outside = ((shares < -_NEAR) | (shares > 1 + _NEAR)).any(1)
-    if outside.mean() > 1 - _INSIDE:
+    (width, height), shares = size, points / size
+    outside = ((shares < -_NEAR) | (shares > 1 + _NEAR)).any(1) & sure
+    if outside.sum() > (1 - _INSIDE) * sure.sum():
         raise ValueError(
-            f'{outside.sum()} of {len(points)} keypoints lie outside of the images, of '
+            f'{outside.sum()} of {sure.sum()} keypoints lie outside of the images, of '
             f'{width}x{height}: found in larger images, or not upright? --keypoints-size WxH tells '
             'the size of those images'
         )
@@ -175,8 +179,10 @@ def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
     usual = next(iter(tried), '')
     if not tried:
         tried[usual] = bone_deviation(names, pixels)
-    best = min(tried, key=lambda x: tried[x])
-    if tried[best] > (_REFUSED if orders else _NAMES_REFUSED):
+    if not tried[usual] > (_REFUSED if orders else _NAMES_REFUSED):
+        return
+    best = min(tried, key=lambda x: np.nan_to_num(tried[x], nan=math.inf))
+    if tried[best] > min(_REFUSED, _BETTER * tried[usual]):
         own = recognised(names)
         what = f'{found.unnamed} points are not in the order of {" or ".join(orders)}'
         raise ValueError(
@@ -184,13 +190,11 @@ def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
             ', or points of two people are in one list; '
             f'--scheme {usual or (own.name if own else JOINTS)} takes them as they are'
         )
-    doubted = tried[usual] > _DOUBTED and tried[best] < _BETTER * tried[usual]
-    if best != usual and (doubted or tried[usual] > _REFUSED):
-        tell(
-            f'{found.path}: bones have the lengths of people in the order of {best}, not in that '
-            f'of {usual}; --scheme {usual} takes that one'
-        )
-        _rename(found, best)
+    tell(
+        f'{found.path}: bones have the lengths of people in the order of {best}, not in that '
+        f'of {usual}; --scheme {usual} takes that one'
+    )
+    _rename(found, best)
 
 
 def _rename(found: FoundPersons, scheme: str) -> None:
@@ -200,7 +204,7 @@ def _rename(found: FoundPersons, scheme: str) -> None:
 
 
 def bone_deviation(names: Sequence[str], pixels: Array, scheme: str = AUTO) -> float:
-    """How far lengths of bones are from those of people, in standard deviations; 0: unknown.
+    """How far lengths of bones are from those of people, in standard deviations; NaN: unknown.
 
     Args:
         names: (n,) of the points.
@@ -211,14 +215,14 @@ def bone_deviation(names: Sequence[str], pixels: Array, scheme: str = AUTO) -> f
              for i, x in enumerate(marks)}  # fmt: skip
     bones = [(where[a], where[b], *x) for (a, b), x in bone_lengths().items() if {a, b} <= {*where}]
     if len(bones) < _BONES:
-        return 0.0
+        return math.nan
     one, other, usual, sigma = (np.array(x) for x in zip(*bones, strict=True))
     lengths = np.linalg.norm(pixels[:, one] - pixels[:, other], axis=2)
     seen = np.isfinite(lengths)
     kept = seen.sum(1) >= _BONES
     lengths, seen = lengths[kept], seen[kept]
     if len(lengths) < _FEWEST:
-        return 0.0
+        return math.nan
     scale = np.where(seen, lengths, 0.0).sum(1) / (seen * usual).sum(1)
     ratios = lengths / usual / np.maximum(scale, 1e-6)[:, None]
     ratios, sigma = ratios[:, seen.any(0)], sigma[seen.any(0)]

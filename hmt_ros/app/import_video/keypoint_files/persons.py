@@ -193,9 +193,9 @@ class FoundPersons:
 
     def likely(self) -> dict[int, list[Person]]:
         """The persons whose score does not say that they are none, by frame in order."""
-        least = _LIKELY * max((x.score for x in self.persons()), default=0.0)
+        best = max((x.score for x in self.persons()), default=0.0)
         return {
-            key: [x for x in found if x.score >= least]
+            key: [x for x in found if x.score >= _LIKELY * best or best <= 0.0]
             for key, found in sorted(self.frames.items())
         }
 
