@@ -150,19 +150,15 @@ def _names_in(found: FoundPersons) -> str:
 
 def _person_at(persons: Sequence[Person], column: float, row: float) -> Person:
     """The person at a point of the image."""
-
-    def outside(one: Person) -> tuple[float, float]:
-        low, high = one.box
-        point = np.array([column, row])
-        apart = np.maximum(0.0, np.maximum(low - point, point - high))
-        return float(np.linalg.norm(apart)), float(np.linalg.norm(point - one.box.mean(0)))
-
-    best = min(persons, key=outside)
-    if outside(best)[0] > _AROUND * best.size:
-        middles = [x.box.mean(0) for x in persons[:_LISTED]]
-        text = ' and '.join(f'at:{x:.0f},{y:.0f}' for x, y in middles)
+    point = np.array([column, row])
+    low, high = (np.array([x.box[i] for x in persons]) for i in range(2))
+    middles = (low + high) / 2
+    outside = np.linalg.norm(np.maximum(0.0, np.maximum(low - point, point - high)), axis=1)
+    best = np.lexsort((np.linalg.norm(middles - point, axis=1), outside))[0]
+    if outside[best] > _AROUND * persons[best].size:
+        text = ' and '.join(f'at:{x:.0f},{y:.0f}' for x, y in middles[:_LISTED])
         raise ValueError(f'nobody at {column:g},{row:g}: in this frame they are --person {text}')
-    return best
+    return persons[best]
 
 
 def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dict[int, Person]]:
