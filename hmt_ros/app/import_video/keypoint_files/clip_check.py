@@ -243,6 +243,6 @@ def check_steps(persons: Sequence[Person]) -> None:
         leaps += any(x.distance(before) < _BACK * step for x in soon)
     if leaps >= _LEAPS and leaps > _OFTEN * len(persons):
         raise ValueError(
-            f'{leaps} times the person is elsewhere in the next frame, and back: points of two people '
-            'under one name? Write a list for each; --person at:X,Y or track:1 follows one'
+            f'{leaps} times the person is elsewhere in the next frame, and back: points of two '
+            'people under one name? Write a list for each; --person at:X,Y or track:1 follows one'
         )
