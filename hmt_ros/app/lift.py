@@ -22,16 +22,24 @@ from hmt_ros.app.command_line import (
     run_command,
     whole_number,
 )
-from hmt_ros.app.import_video.command import add_camera_arguments, camera_of, person_choice
+from hmt_ros.app.import_video.command import (
+    add_camera_arguments,
+    add_keypoint_arguments,
+    camera_of,
+)
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection
-from hmt_ros.app.import_video.keypoint_files import Choice, Chooser, FoundPersons, read_keypoints
+from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons
+from hmt_ros.app.import_video.keypoint_files.reading import (
+    ClipReading,
+    keypoints_of_person,
+    read_keypoints,
+)
 from hmt_ros.app.progress import show_progress, tell_user
 from hmt_ros.app.rendered_bag import START_NS
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.experts.lifted_fit import lift_poses
 from hmt_ros.experts.lifter import SHIPPED, load_lifter
-from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
@@ -55,9 +63,11 @@ LIFTED, REPORT = 'lifted', 'report'
 STEEP = 0.8
 # Lean of the trunk above which a person lies, rad.
 LYING = np.radians(55.0)
+# Frames without an entry get an empty mixture, unless they are so many for each with one.
+_GAPS = 1000
 
 EPILOG = """\
-KEYPOINTS is what import-video takes: COCO (.json), a folder of OpenPose, .npz or .csv.
+KEYPOINTS is what import-video takes: .json, .npz, .csv, .trc, or a folder.
 
 DIR gets
   lifted/             a bag with pose_prediction: a mixture over poses for each image
@@ -101,10 +111,7 @@ def _parser() -> CommandParser:
         '--first-number', type=whole_number(0), default=0, metavar='N',
         help='number of the first image (default: 0)',
     )  # fmt: skip
-    parser.add_argument(
-        '--person', type=person_choice, default=Choice(), metavar='WHICH',
-        help='person among several, see import-video (default: nearest)',
-    )  # fmt: skip
+    add_keypoint_arguments(parser)
     person = parser.add_mutually_exclusive_group()
     person.add_argument(
         '--stature', type=number(0.3, 3), help='stature of the person, m (default: not known)'
@@ -116,9 +123,6 @@ def _parser() -> CommandParser:
     parser.add_gravity()
     parser.add_argument(
         '--causal', action='store_true', help='as a camera sees it: later images do not count'
-    )
-    parser.add_argument(
-        '--scheme', default=AUTO, help='names of the keypoints, see docs/keypoints.md (auto)'
     )
     parser.add_argument(
         '--lifter', default=SHIPPED, metavar='MODEL',
@@ -146,8 +150,13 @@ def _lift(arguments: argparse.Namespace) -> int:
     size = arguments.size or found.size
     if size is None:
         raise ValueError('the size of the images is unknown: --size WxH')
-    camera = camera_of(arguments, size, partial(tell_user, 'lift'))
-    times, seen = _chosen(found, arguments.person, arguments.fps)
+    tell = partial(tell_user, 'lift')
+    camera = camera_of(arguments, size, tell)
+    reading = ClipReading(
+        arguments.person, arguments.scheme, arguments.keypoints_size, arguments.mirror
+    )
+    chosen = keypoints_of_person(found, reading, size, tell, rate=arguments.fps)
+    times, seen = _in_frames(found, chosen, arguments.fps)
     stamps = [arguments.first_stamp + time for time in times]
     nobody = not any(len(one.names) for one in seen)
     if nobody and (not seen or any(found.persons())):
@@ -169,7 +178,7 @@ def _lift(arguments: argparse.Namespace) -> int:
         raise ValueError(
             f'{arguments.keypoints}: no image shows five landmarks that are known; see --scheme'
         )
-    if up is not None:
+    if up is not None and not nobody:
         checked = mixtures if abs(up[2]) < STEEP else lifted(None)
         _check_gravity(up, body, [one for one in checked if one is not None])
     folder.mkdir(parents=True, exist_ok=True)
@@ -196,22 +205,14 @@ def _lift(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _chosen(found: FoundPersons, choice: Choice, fps: float) -> tuple[list[int], list[Keypoints]]:
+def _in_frames(
+    found: FoundPersons, chosen: dict[int, Keypoints], fps: float
+) -> tuple[list[int], list[Keypoints]]:
     """Times, ns, and keypoints of the chosen person, without names where there are none."""
-    chooser = Chooser(choice)
-    if found.by_time:
-        frames = sorted(found.by_time)
-        persons = [found.by_time[time] for time in frames]
-        times = frames
-    else:
-        frames = list(range(found.last + 1))
-        persons = [found.by_number.get(frame, []) for frame in frames]
-        times = [round(frame * SECOND_NS / fps) for frame in frames]
-    seen = []
-    for i, those in enumerate(persons):
-        chosen = chooser.of(i, those)
-        seen.append(NO_KEYPOINTS if chosen is None else chosen.keypoints)
-    return times, seen
+    sparse = found.timed or found.last > _GAPS * len(found.frames)
+    keys = found.keys if sparse else list(range(found.last + 1))
+    times = keys if found.timed else [round(key * SECOND_NS / fps) for key in keys]
+    return times, [chosen.get(key, NO_KEYPOINTS) for key in keys]
 
 
 def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) -> Array | None:

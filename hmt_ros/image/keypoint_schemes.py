@@ -93,6 +93,26 @@ def schemes() -> Mapping[str, Scheme]:
     return result
 
 
+@cache
+def unnamed_orders() -> Mapping[int, tuple[str, ...]]:
+    """Schemes that lists without names may have, the usual one first, by their number of points.
+
+    Those of fewer names are the beginning of the list.
+    """
+    return {int(count): tuple(names) for count, names in _table()['unnamed'].items()}
+
+
+@cache
+def bone_lengths() -> Mapping[tuple[str, str], tuple[float, float]]:
+    """Distances of two landmarks of a person of 1.7 m, m, and the deviation of their logarithm."""
+    return {
+        (one.format(side=side), other.format(side=side)): (float(length), float(sigma))
+        for one, others in _table()['bones'].items()
+        for other, (length, sigma) in others.items()
+        for side in (SIDES if '{side}' in one else SIDES[:1])
+    }
+
+
 def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
     """The scheme of keypoints; None: their names are those of joints.
 

@@ -189,7 +189,8 @@ class CameraNodeParameters(ImageNodeParameters):
             at first, then the one nearest to where this person was.
         keypoint_scheme: Scheme of keypoints, 'auto' (recognised by their names; the order of
             'coco17' for 'yolo' and 'floats'), 'joints' (those of the body itself), 'coco17',
-            'halpe26', 'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
+            'halpe26', 'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24', 'mhr70', or
+            another name of docs/keypoints.md.
         input_timeout: Maximum time that an image waits for each input of its stamp, by the stamps
             of later messages, s. A later input of the kind ends the wait.
     """

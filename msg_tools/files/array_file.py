@@ -1,7 +1,8 @@
 """Reads archives of plain arrays (.npz) from outside, up to an agreed size.
 
 Nothing is unpickled. A compressed archive could expand to any size, and the header of an array
-could claim any size: both are checked before memory is allocated.
+could claim any size: both are checked before memory is allocated. Arrays of objects are refused, or
+read by `plain_pickle`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.lib import format as array_format
 from numpy.typing import NDArray
 
 from msg_tools.files.error_line import error_line
+from msg_tools.files.plain_pickle import read_plain_pickle
 
 # Bytes of all arrays of an archive together.
 LARGEST_ARCHIVE = 2**31
@@ -43,11 +45,14 @@ _FAULTS = (
 )
 
 
-def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, NDArray[Any]]:
+def read_archive(
+    path: str | Path, largest: int = LARGEST_ARCHIVE, *, with_objects: bool = False
+) -> dict[str, NDArray[Any]]:
     """The arrays of an archive by name.
 
     Args:
         largest: bytes that they may have together.
+        with_objects: whether arrays of plain data (`read_plain_pickle`) are read too.
 
     Raises:
         OSError: a file that can not be read.
@@ -56,14 +61,21 @@ def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, 
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            _check_sizes(archive, largest)
+            pickles = _check_sizes(archive, largest)
+            if pickles and not with_objects:
+                raise ValueError(f'the array {next(iter(pickles))} holds Python objects')
+            plain = {
+                name.removesuffix('.npy'): read_plain_pickle(archive.read(name)[start:])
+                for name, start in pickles.items()
+            }
         with np.load(path, allow_pickle=False) as content:
-            return {name: content[name] for name in content.files}
+            return plain | {name: content[name] for name in content.files if name not in plain}
     except _FAULTS as fault:
         raise ValueError(error_line(fault)) from fault
 
 
-def _check_sizes(archive: zipfile.ZipFile, largest: int) -> None:
+def _check_sizes(archive: zipfile.ZipFile, largest: int) -> dict[str, int]:
+    """Raises ValueError if arrays are too large; where the pickles of arrays of objects begin."""
     members = archive.infolist()
     total = sum(member.file_size for member in members)
     if total > largest or len(members) > _MOST_ARRAYS:
@@ -71,15 +83,19 @@ def _check_sizes(archive: zipfile.ZipFile, largest: int) -> None:
             f'its {len(members)} arrays have {total} bytes, wanted at most {_MOST_ARRAYS} arrays '
             f'and {largest} bytes'
         )
-    for name, claimed, there in _claims(archive, members):
-        if claimed > there:
+    pickles = {}
+    for name, claimed, there, start in _claims(archive, members):
+        if claimed is None:
+            pickles[name] = start
+        elif claimed > there:
             raise ValueError(f'the array {name} claims {claimed} bytes, but has {there}')
+    return pickles
 
 
 def _claims(
     archive: zipfile.ZipFile, members: list[zipfile.ZipInfo]
-) -> Iterator[tuple[str, int, int]]:
-    """Name, claimed size and size of each array, bytes."""
+) -> Iterator[tuple[str, int | None, int, int]]:
+    """Name, claimed size (None: of objects), size and length of the header of each, bytes."""
     for member in members:
         with archive.open(member) as file:
             version = array_format.read_magic(file)
@@ -89,6 +105,5 @@ def _claims(
                 shape, _, dtype = array_format.read_array_header_2_0(file)
             else:
                 raise ValueError(f'the array {member.filename} has the version {version}')
-            if dtype.hasobject:
-                raise ValueError(f'the array {member.filename} holds Python objects')
-            yield member.filename, math.prod(shape) * dtype.itemsize, member.file_size
+            claimed = None if dtype.hasobject else math.prod(shape) * dtype.itemsize
+            yield member.filename, claimed, member.file_size, file.tell()

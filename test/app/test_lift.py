@@ -31,7 +31,7 @@ def seen(count=6):
     for i, mark in enumerate(SCHEME.landmarks):
         if mark.joint and 'ear' not in mark.name:
             result[:, i] = pixels[:, BODY.joint_names.index(mark.joint)]
-            sure[:, i] = 0.9
+            sure[:, i] = 1.0
     return result, sure
 
 
@@ -147,7 +147,10 @@ def test_a_subject_file_tells_the_lengths(tmp_path):
     [
         (['--fov', '60'], 'the size of the images is unknown: --size WxH'),
         ([*USUAL, '--lifter', 'none.npz'], 'none.npz'),
-        ([*USUAL, '--person', 'index:3'], 'no keypoints of the chosen person'),
+        (
+            [*USUAL, '--person', 'index:3'],
+            'no frame has a person 3: the last is --person index:0',
+        ),
         ([*USUAL, '--scheme', 'none'], "there is no keypoint scheme 'none'"),
         (
             [*USUAL, '--gravity', '0', '0', '0'],

@@ -20,7 +20,8 @@ from hmt_ros.image.terms.keypoints import Keypoints
 
 COUNTS = {
     'coco17': 17, 'halpe26': 26, 'body25': 25, 'mediapipe33': 33, 'h36m17': 17, 'skeleton2d': 18,
-    'smpl24': 24, 'mhr70': 70,
+    'smpl24': 24, 'mhr70': 70, 'wholebody23': 23, 'body25b': 25, 'kinect25': 25, 'mpi17': 17,
+    'mpii16': 16,
 }  # fmt: skip
 
 

@@ -17,20 +17,26 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
+from hmt_ros.app.command_line import (
+    CommandParser,
+    image_size,
+    number,
+    run_command,
+    whole_number,
+)
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Masks, Selection, open_source
-from hmt_ros.app.import_video.keypoint_files import (
-    LARGEST,
-    NEAREST,
-    Choice,
-    Chooser,
-    FoundPersons,
+from hmt_ros.app.import_video.keypoint_files.choice import LARGEST, NEAREST, Choice
+from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons
+from hmt_ros.app.import_video.keypoint_files.reading import (
+    ClipReading,
+    keypoints_of_person,
     read_keypoints,
 )
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.body import Camera
 from hmt_ros.detectors.blazepose import BlazePose
+from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_file import camera_of_view, read_camera
@@ -43,8 +49,6 @@ from msg_tools.messages.keypoints import keypoints_message, positions_message
 IMAGE, CAMERA_INFO, MASK = 'image/compressed', 'camera_info', 'mask'
 KEYPOINTS, KEYPOINTS_3D = 'keypoints', 'keypoints_3d'
 MEDIAPIPE = 'mediapipe'
-# Least part of the keypoints that lies in the frames, or near them.
-_INSIDE, _NEAR = 0.5, 0.25
 
 EPILOG = """\
 SOURCE is any video file that OpenCV reads, or a folder of images in the order of the numbers in
@@ -52,17 +56,20 @@ their names. Images that are JPEG files are copied as they are. Stamps are the t
 file, counted from --first-stamp. Phones write how they were held: the frames are turned upright.
 
 --keypoints takes, under the names of the detector and in pixels of the upright frames,
-  FILE.json  COCO: results [{image_id, keypoints, score}], or annotations; without names 17
-             keypoints are those of COCO, 18 and 25 of OpenPose, 26 of Halpe, 33 of MediaPipe
-  FOLDER     OpenPose: a file such as walk_000000000012_keypoints.json for each frame
-  FILE.npz   landmark_names (n,), pixels (T, n, 2), optionally visibility (T, n), detected (T,) and
-             world (T, n, 3), the positions in m; row t is frame t
+  FILE.json  COCO results [{image_id, keypoints, score}] or annotations, MMPose, AlphaPose, a list
+             of what Ultralytics' to_json gives for each frame
+  FOLDER     a file for each frame: JSON of OpenPose, MMPose or Ultralytics, such as
+             walk_000000000012_keypoints.json, or labels (.txt) of Ultralytics (save_txt)
+  FILE.npz   pixels (T, n, 2), optionally landmark_names (n,), visibility (T, n), detected (T,) and
+             world (T, n, 3), the positions in m; row t is frame t; or positions_2d of VideoPose3D
   FILE.csv   a row for each person: frame, NAME_u, NAME_v, NAME_confidence, ...; or for each
-             keypoint: frame, name, u, v, confidence; time_s, in the video, or stamp_ns may replace
-             frame, and a column person keeps several persons apart
+             keypoint: frame, name, u, v, confidence; time_s, in the video or of Unix, or stamp_ns
+             may replace frame, and a column person keeps several persons apart; or DeepLabCut
+  FILE.trc   markers in pixels, as Sports2D writes them
 An image_id, or the name of a file of keypoints or of a mask, is the name of the frame's file, or
 its last number is that of the frame, from --first-number on. What has confidence 0, or lies at
-(0, 0) or NaN, was not seen.
+(0, 0) or NaN, was not seen. Points without names have the order of --scheme, or the one of those
+of as many points in which bones have the lengths of people: see docs/video.md.
 
 examples:
   import-video walk.mp4 -o walk --fov 60 --keypoints walk.json
@@ -96,6 +103,9 @@ class ImportOptions:
     keypoints: Path | None = None
     detector: str | None = None
     person: Choice = Choice()  # noqa: RUF009 - frozen
+    scheme: str = AUTO
+    keypoints_size: tuple[int, int] | None = None
+    mirror: bool = False
     masks: Path | None = None
     detector_masks: bool = False
 
@@ -113,14 +123,11 @@ class Imported:
     Attributes:
         with_keypoints: number of images in which keypoints were seen; None: none were given.
         with_masks: number of images with a mask; None: none were given.
-        inside, outside: number of keypoints that lie in or near the frame, and farther out.
     """
 
     images: int = 0
     with_keypoints: int | None = None
     with_masks: int | None = None
-    inside: int = 0
-    outside: int = 0
 
     def __str__(self) -> str:
         counts = (('keypoints', self.with_keypoints), ('masks', self.with_masks))
@@ -201,12 +208,7 @@ def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) 
         '--detector', choices=[MEDIAPIPE],
         help='find keypoints with MediaPipe Pose, where it is installed',
     )  # fmt: skip
-    person.add_argument(
-        '--person', type=person_choice, default=Choice(), metavar='WHICH',
-        help='person to import if there are several: largest in each frame; nearest to the one '
-        'before, from the largest on; index:N, the N-th in the list of each frame, from 0; or '
-        'id:NAME, as the detector tracks them (default: nearest)',
-    )  # fmt: skip
+    add_keypoint_arguments(person)
     person.add_argument(
         '--masks', type=Path, metavar='PATH',
         help='masks of the person, bright on black: a folder of images, or a video',
@@ -217,6 +219,30 @@ def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) 
     person.add_argument(
         '--first-number', type=whole_number(0), default=0, metavar='N',
         help='number of the first frame for keypoints and masks (default: 0)',
+    )  # fmt: skip
+
+
+def add_keypoint_arguments(parser: argparse._ActionsContainer) -> None:
+    """Adds the arguments that say how keypoints are read."""
+    parser.add_argument(
+        '--person', type=person_choice, default=Choice(), metavar='WHICH',
+        help='person to import if there are several: largest in each frame; nearest to the one '
+        'before, from the largest on; at:X,Y or at:X,Y,T, who is there, px, at that time, s; '
+        'track:N, the N-th longest track, from 1; id:NAME, as the detector tracks them; or index:N,'
+        ' the N-th in the list of each frame, from 0 (default: nearest)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--keypoints-size', type=image_size, metavar='WxH',
+        help='size of the images that the keypoints were found in (default: that in their file, or '
+        'that of the images)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--scheme', default=AUTO,
+        help='names or order of the keypoints, see docs/keypoints.md (auto)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--mirror', action='store_true',
+        help='undo a mirrored recording, of a selfie camera: frames, keypoints, masks, sides',
     )  # fmt: skip
 
 
@@ -244,6 +270,8 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
     """
     if options.detector_masks and (options.detector is None or options.masks is not None):
         raise ValueError('--detector-masks goes with --detector, and not with --masks')
+    if options.detector is not None and options.person != Choice():
+        raise ValueError('MediaPipe finds one person: --person goes with --keypoints')
     selection = Selection(options.start, options.end, options.every)
     source = open_source(options.source, options.fps, options.first_number)
     for note in source.notes:
@@ -253,9 +281,9 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
     if options.keypoints is not None:
         found = read_keypoints(options.keypoints, source, options.first_stamp)
     with ExitStack() as opened:
-        see = _seer(options, found, masks)
+        see = _seer(options, source, found, masks, tell)
         writer = opened.enter_context(BagWriter(options.output, overwrite=options.overwrite))
-        frames = opened.enter_context(closing(_same_size(source, selection)))
+        frames = opened.enter_context(closing(_same_size(source, selection, options.mirror)))
         counted = with_progress(
             frames, str(options.output), 'images', _expected(source, selection), quiet=options.quiet
         )
@@ -288,15 +316,25 @@ def _expected(source: FrameSource, selection: Selection) -> int | None:
 Seer = Callable[[Frame, int], tuple[Keypoints | None, Mask | None]]
 
 
-def _seer(options: ImportOptions, found: FoundPersons | None, masks: Masks | None) -> Seer:
+def _seer(
+    options: ImportOptions,
+    source: FrameSource,
+    found: FoundPersons | None,
+    masks: Masks | None,
+    tell: Tell,
+) -> Seer:
     """The function that gives keypoints and mask of a frame with a stamp."""
-    chooser = Chooser(options.person)
+    chosen: dict[int, Keypoints] | None = None
+    reading = ClipReading(options.person, options.scheme, options.keypoints_size, options.mirror)
     detector = None
     if options.detector is not None:
         detector = BlazePose(with_mask=options.detector_masks)
 
     def see(frame: Frame, stamp_ns: int) -> tuple[Keypoints | None, Mask | None]:
+        nonlocal chosen
         mask = None if masks is None else masks.of(frame)
+        if mask is not None and options.mirror:
+            mask = np.ascontiguousarray(mask[:, ::-1])
         if detector is not None:
             keypoints = _detected(detector, frame, stamp_ns)
             if options.detector_masks and detector.mask is not None:
@@ -304,9 +342,12 @@ def _seer(options: ImportOptions, found: FoundPersons | None, masks: Masks | Non
             return keypoints, mask
         if found is None:
             return None, mask
-        found.check_size(frame)
-        chosen = chooser.of(frame.number, found.of(frame))
-        return None if chosen is None else chosen.keypoints, mask
+        if chosen is None:
+            height, width = frame.image.shape[:2]
+            first = frame.time_ns if found.timed else frame.number
+            chosen = keypoints_of_person(found, reading, (width, height), tell, first, source.rate)
+        key = found.key_of(frame)
+        return None if key is None else chosen.get(key), mask
 
     return see
 
@@ -332,8 +373,10 @@ def _in_pixels_of(frame: Frame, mask: Mask) -> Mask:
     return np.asarray(resized).view(np.bool_)
 
 
-def _same_size(source: FrameSource, selection: Selection) -> Generator[Frame, None, None]:
-    """The frames; one camera_info is for images of one size."""
+def _same_size(
+    source: FrameSource, selection: Selection, mirror: bool
+) -> Generator[Frame, None, None]:
+    """The frames, of mirror images if they are; one camera_info is for images of one size."""
     size: tuple[int, ...] | None = None
     for frame in source.frames(selection):
         if size is not None and frame.image.shape != size:
@@ -343,6 +386,8 @@ def _same_size(source: FrameSource, selection: Selection) -> Generator[Frame, No
                 f'pixels, the frames before it {columns}x{rows}; wanted one size'
             )
         size = frame.image.shape
+        if mirror:
+            frame = replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), jpeg=None)
         yield frame
 
 
@@ -388,21 +433,12 @@ def _write(
             if lifts:
                 lifted = positions_message(messages, content, stamp, FRAME_ID)
                 bag.write(KEYPOINTS_3D, stamp, lifted)
-            near = _are_near(content.pixels[content.seen], width, height)
-            result.inside += int(near.sum())
-            result.outside += int((~near).sum())
         if mask is not None and result.with_masks is not None:
             result.with_masks += 1
             picture = mask.astype(np.uint8) * 255
             bag.write(MASK, stamp, image_message(messages, picture, stamp, FRAME_ID))
         result.images += 1
     return result
-
-
-def _are_near(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Whether pixels (n, 2) lie within an image that is enlarged by a quarter of its size."""
-    size = np.array([width, height])
-    return np.all((pixels > -_NEAR * size) & (pixels < (1 + _NEAR) * size), axis=1)
 
 
 def _check_ends(
@@ -453,8 +489,3 @@ def _check_keypoints(
         if options.person.kind not in (LARGEST, NEAREST):
             raise ValueError(text)
         tell(text)
-    if result.inside < _INSIDE * (result.inside + result.outside):
-        raise ValueError(
-            f'{options.keypoints}: {result.outside} of {result.inside + result.outside} keypoints '
-            'lie outside of the images; were they found in images of another size, or not upright?'
-        )

@@ -99,7 +99,10 @@ class FrameSource(ABC):
         count: number of frames that were passed so far, wanted or not.
         ended: whether the last frame was passed.
         notes: lines on how frames are shown.
+        rate: frames per second; None: not known, or not the same throughout.
     """
+
+    rate: float | None = None
 
     def __init__(self, path: Path, names: tuple[str, ...] = (), first_number: int = 0) -> None:
         self.path = path
@@ -108,7 +111,7 @@ class FrameSource(ABC):
         self.count = 0
         self.ended = False
         self.notes: list[str] = []
-        self._first_number = first_number
+        self.first_number = first_number
         self._by_name = {Path(x).stem: i for i, x in reversed([*enumerate(names)])}
         self._by_name |= {x: i for i, x in enumerate(names)}
 
@@ -137,10 +140,10 @@ class FrameSource(ABC):
         digits = re.findall(r'\d+', name.stem)
         if not digits:
             raise ValueError(f'{label} is not the name of a frame and has no number')
-        number = int(digits[-1]) - self._first_number
+        number = int(digits[-1]) - self.first_number
         if number < 0:
             raise ValueError(
-                f'{label} is before the first frame, which has the number {self._first_number}'
+                f'{label} is before the first frame, which has the number {self.first_number}'
             )
         return number
 
@@ -201,6 +204,7 @@ class VideoFile(FrameSource):
                 'are stored, and a field of view is that of the picture as players show it'
             )
         self._fps = fps
+        self.rate = fps or self._capture.get(cv2.CAP_PROP_FPS) or None
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.claimed = int(count) if 0 < count < MOST else 0
 
@@ -259,7 +263,7 @@ class ImageFolder(FrameSource):
             raise ValueError(f'{path} has no images, wanted files {" ".join(IMAGE_SUFFIXES)}')
         self._files = sorted(files, key=lambda x: natural_order(x.name))
         super().__init__(path, tuple(x.name for x in self._files), first_number)
-        self._fps = fps
+        self._fps = self.rate = fps
 
     def frames(self, selection: Selection) -> Iterator[Frame]:
         """See `FrameSource`."""

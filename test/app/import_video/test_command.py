@@ -266,7 +266,7 @@ def test_memory_does_not_grow_with_the_video(tmp_path, monkeypatch):
         (['--keypoints', '{}/far.npz'], '27 of 27 keypoints lie outside of the images'),
         (
             ['--keypoints', '{}/ten.npz', '--person', 'index:3'],
-            'none of the 10 imported frames has',
+            'no frame has a person 3: the last is --person index:0',
         ),
         (['--keypoints', '{}/ten.npz', '--person', 'tall'], '--person: wanted largest, nearest,'),
         (['--keypoints', 'k', '--detector', 'mediapipe'], '--detector: not allowed with argument'),
@@ -320,3 +320,32 @@ def test_images_of_several_sizes(folder, tmp_path, capsys):
     (line,) = capsys.readouterr().err.splitlines()
     assert 'img_5.jpg has 64x40 pixels, the frames before it 64x48; wanted one size' in line
     assert not (tmp_path / 'bag').exists()
+
+
+def test_a_mirrored_recording(video, tmp_path):
+    """Frames, keypoints, positions and masks are turned; sides have each other's names."""
+    (tmp_path / 'masks').mkdir()
+    picture = np.zeros((48, 64), np.uint8)
+    picture[:, :10] = 255
+    for i in range(10):
+        assert cv2.imwrite(str(tmp_path / 'masks' / f'{i}.png'), picture)
+    options = ['--keypoints', arrays(tmp_path / 'k.npz', 10), '--masks', tmp_path / 'masks']
+    for name, more in (('plain', []), ('turned', ['--mirror'])):
+        assert run(video, tmp_path / name, *options, *more) == 0
+    plain, turned = content(tmp_path / 'plain'), content(tmp_path / 'turned')
+    before, after = (decode_image(x['/image/compressed'][3][1]) for x in (plain, turned))
+    assert np.abs(before[:, ::-1].astype(int) - after).mean() < 2.0
+    assert np.array_equal(
+        decode_mask(turned['/mask'][3][1]), decode_mask(plain['/mask'][3][1])[:, ::-1]
+    )
+    one, other = plain['/keypoints'][3][1], turned['/keypoints'][3][1]
+    assert tuple(other.names) == ('right_hip', 'left_hip', 'right_knee')
+    assert list(other.u) == [63 - x for x in one.u]
+    assert list(other.v) == list(one.v)
+    assert list(turned['/keypoints_3d'][3][1].x) == [-1.0] * 3
+
+
+def test_person_of_a_detector_that_finds_one(video, tmp_path, capfd):
+    options = ['--detector', 'mediapipe', '--person', 'track:1']
+    assert run(video, tmp_path / 'bag', *options) == 1
+    assert '--person goes with --keypoints' in capfd.readouterr().err

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hmt_ros.app.import_video.frames import Frame, FrameSource
-from hmt_ros.app.import_video.keypoint_files import read_keypoints
+from hmt_ros.app.import_video.keypoint_files.persons import landmark_name
+from hmt_ros.app.import_video.keypoint_files.reading import read_keypoints
 from hmt_ros.image.keypoint_schemes import schemes
 
 START = 1_000_000_000_000
@@ -30,7 +31,9 @@ def flat(n, number, sure=0.5):
 def found_in(path, number=2, source=None, time_ns=None):
     source = source or Numbered(path.parent / 'walk.mp4')
     frame = Frame(number, 40_000_000 * number if time_ns is None else time_ns, '', IMAGE)
-    return read_keypoints(path, source, START).of(frame)
+    found = read_keypoints(path, source, START)
+    key = found.key_of(frame)
+    return [] if key is None else found.frames[key]
 
 
 def write(path, content):
@@ -86,9 +89,7 @@ def test_coco_annotations(tmp_path):
     assert list(seen.keypoints.confidences) == [1.0, 0.5, 0.0]
     assert np.array_equal(seen.keypoints.pixels[:2], [[5, 6], [7, 8]])
     found = read_keypoints(tmp_path / 'walk.json', source, START)
-    found.check_size(Frame(0, 0, '', np.zeros((4, 8, 3), np.uint8)))
-    with pytest.raises(ValueError, match='in images of 8x4 pixels, but the frames have 4x4'):
-        found.check_size(Frame(0, 0, '', IMAGE))
+    assert found.size == (8, 4)
 
 
 def test_openpose(tmp_path):
@@ -174,14 +175,15 @@ def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
     ('name', 'content', 'message'),
     [
         ('a.json', '{', 'not JSON'),
-        ('a.json', {'people': []}, 'no list images'),
-        ('a.json', [1], 'not COCO: wanted a list of'),
+        ('a.json', {'people': []}, 'entry 0 has no image_id or no keypoints: a file for each fr'),
+        ('a.json', {'annotations': []}, 'no list images'),
+        ('a.json', [1], 'entry 0 has no image_id or no keypoints'),
+        ('a.json', {'a': 1}, 'no known layout of JSON; wanted a list of'),
         ('a.json', [{'keypoints': []}], 'entry 0 has no image_id or no keypoints'),
         ('a.json', [{'image_id': 0, 'keypoints': [1, 2]}], 'entry 0 has 2 numbers'),
         ('a.json', [{'image_id': 0, 'keypoints': ['x'] * 3}], 'keypoints are not numbers'),
         ('a.json', [{'image_id': 0, 'keypoints': [5.0] * 30}], '10 keypoints without names'),
         ('a.json', [{'image_id': 'walk', 'keypoints': [5.0] * 51}], 'walk is not the name of a fr'),
-        ('a.json', [{'image_id': 0, 'keypoints': [0.5] * 51}], 'they are fractions of the image'),
         ('a.json', [{'image_id': 0, 'keypoints': [1e9] * 51}], r'a keypoint lies 1e\+09 px away'),
         ('a.json', [{'image_id': 0, 'keypoints': [10**400] * 51}], 'keypoints are not numbers'),
         (
@@ -193,16 +195,20 @@ def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
             },
             'entry 0 has 2 keypoints, but 3 are named in categories',
         ),
+        ('a.json', [{'image_id': 0, 'keypoints': [5.0] * 102}], 'of two persons, 17 each?'),
+        ('a.json', [{'image_id': 10**9, 'keypoints': [5.0] * 51}], 'wanted at most 10000000 fr'),
+        ('a.json', {'images': [{'id': {}}], 'annotations': []}, 'an image has no id'),
+        ('a.json', {'a': {'b': 1}, 'c': [{}]}, 'entry 0 has no number|c is not the name'),
         ('a.csv', 'u,v\n1,2\n', 'wanted a column frame, time_s or stamp_ns'),
         ('a.csv', 'frame,nose\n1,2\n', 'wanted columns NAME_u and NAME_v, or name, u and v'),
         ('a.csv', 'frame,nose_u\n1,2\n', 'no column nose_v'),
-        ('a.csv', 'frame,a_u,a_v\n1,x,3\n', "line 2: a_u is 'x', wanted a number"),
-        ('a.csv', 'time_s,a_u,a_v\nx,1,3\n', "time_s is 'x', wanted a number"),
+        ('a.csv', 'frame,a_u,a_v\n1,x,3\n', "line 2: 'x', wanted a number"),
+        ('a.csv', 'time_s,a_u,a_v\nx,1,3\n', 'time_s has could not convert'),
         ('a.csv', 'frame,name,u,v\n1,a,1,3\n1,a,1,3\n', 'line 3: a twice in frame 1'),
         ('a.csv', 'frame,name,u,v\n1,,1,3\n', 'line 2: no name'),
         ('a.csv', 'name,u,v,frame\na,1,3\n', 'line 2: no frame'),
         ('a.npz', 'no archive', 'not a zip file'),
-        ('a.txt', 'words', '.txt is not known; wanted COCO'),
+        ('a.txt', 'words', '.txt is not known; wanted a detector'),
     ],
 )
 def test_bad_files(name, content, message, tmp_path):
@@ -234,10 +240,221 @@ def test_bad_folders(tmp_path):
     with pytest.raises(ValueError, match=r'no \.json files in this folder'):
         found_in(folder)
     write(folder / 'walk_1_keypoints.json', {'people': [{'pose_keypoints_2d': [1.0] * 4}]})
-    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json has 4 numbers'):
+    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json: a person has 4 numbers'):
         found_in(folder)
     write(folder / 'walk_1_keypoints.json', {'persons': []})
-    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json is not of OpenPose'):
+    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json: an object without people'):
         found_in(folder)
     with pytest.raises(ValueError, match='no such file'):
         found_in(tmp_path / 'missing.json')
+
+
+def rows(n=17, number=2):
+    """(n, 3) column, row and confidence as JSON has them."""
+    return np.column_stack([pixels(n, number), np.full(n, 0.5)]).tolist()
+
+
+def places(number=2):
+    return [list(map(float, x)) for x in pixels(17, number)]
+
+
+def instance(number=2, **more):
+    return {'keypoints': places(number), 'keypoint_scores': [0.5] * 17, **more}
+
+
+ULTRALYTICS = {
+    'name': 'person', 'class': 0, 'confidence': 0.8, 'track_id': 4,
+    'keypoints': {
+        'x': [x for x, _ in places()], 'y': [y for _, y in places()], 'visible': [0.5] * 17
+    },
+}  # fmt: skip
+NAMES = {str(i): name for i, name in enumerate(schemes()['coco17'].names)}
+LAYOUTS = {
+    'mmpose inferencer': [
+        {'frame_id': i, 'instances': [instance(i, bbox=[[1, 2, 3, 4]], bbox_score=0.8)]}
+        for i in range(3)
+    ],
+    'mmpose demo, which counts from 1': {
+        'meta_info': {'keypoint_id2name': NAMES},
+        'instance_info': [
+            {'frame_id': i + 1, 'instances': [instance(i, bbox_score=0.8)]} for i in range(3)
+        ],
+    },
+    'mmpose test': [
+        {'preds': [rows(number=i)], 'boxes': [[1, 2, 3, 4, 5, 0.8]], 'image_paths': [f'a/{i}.jpg']}
+        for i in range(3)
+    ],
+    'mmpose before 1': {
+        str(i): [{'bbox': [1, 2, 3, 4, 0.8], 'keypoints': rows(number=i)}] for i in range(3)
+    },
+    'alphapose': [
+        {'image_id': '2.jpg', 'keypoints': flat(17, 2), 'score': 0.8, 'idx': [4.0]},
+        {'image_id': '1.jpg', 'keypoints': flat(17, 1), 'score': 0.8, 'idx': [5.0]},
+    ],
+    'alphapose cmu': {
+        f'{i}.jpg': {'version': 'AlphaPose v0.3', 'bodies': [{'joints': flat(17, i)}]}
+        for i in range(3)
+    },
+    'alphapose tracked': {'4': {'2': {'keypoints': flat(17, 2), 'scores': 0.8}}},
+    'ultralytics': [[], [], [ULTRALYTICS]],
+    'ultralytics as texts': ['[]', '[]', json.dumps([ULTRALYTICS])],
+}
+
+
+@pytest.mark.parametrize('layout', LAYOUTS)
+def test_layouts_of_json(layout, tmp_path):
+    (seen,) = found_in(write(tmp_path / 'walk.json', LAYOUTS[layout]))
+    assert seen.keypoints.names == schemes()['coco17'].names
+    assert np.array_equal(seen.keypoints.pixels, pixels(17, 2))
+    assert (seen.keypoints.confidences == 0.5).all()
+    assert seen.score == (1.0 if layout == 'alphapose cmu' else 0.8)
+    tracked = layout in ('alphapose', 'alphapose tracked') or 'ultra' in layout
+    assert seen.track == ('4' if tracked else '')
+
+
+@pytest.mark.parametrize(
+    ('n', 'scheme'), [(133, 'wholebody23'), (135, 'body25b'), (136, 'halpe26')]
+)
+def test_bodies_of_lists_with_faces_and_hands(n, scheme, tmp_path):
+    entries = [{'image_id': 2, 'keypoints': flat(n, 2)}]
+    (seen,) = found_in(write(tmp_path / 'walk.json', entries))
+    names = schemes()[scheme].names
+    assert seen.keypoints.names == names
+    assert np.array_equal(seen.keypoints.pixels, pixels(n, 2)[: len(names)])
+
+
+@pytest.mark.parametrize(
+    ('sure', 'tail', 'track', 'score'),
+    [
+        (True, '', '', 1.0),
+        (True, ' 0.8', '', 0.8),
+        (False, ' 0.8 4', '4', 0.8),
+        (True, ' 4', '4', 1),
+    ],
+)
+def test_labels_of_ultralytics(sure, tail, track, score, tmp_path):
+    """Fractions of the image; frames of a video count from 1, and other classes are no persons."""
+    folder = tmp_path / 'labels'
+    folder.mkdir()
+    for i in (1, 2):
+        values = np.array(rows(number=i)) / (64, 48, 1)
+        text = ' '.join(str(x) for x in values[:, : 3 if sure else 2].ravel())
+        write(folder / f'walk_{i + 1}.txt', f'0 .5 .5 .2 .3 {text}{tail}\n7 .5 .5 .2 .3\n')
+    (seen,) = found_in(folder)
+    np.testing.assert_allclose(seen.keypoints.pixels * (64, 48), pixels(17, 2))
+    assert (seen.keypoints.confidences == (0.5 if sure else 1.0)).all()
+    assert (seen.track, seen.score) == (track, score)
+    write(folder / 'walk_9.txt', '0 .5 .5 .2 .3\n')
+    with pytest.raises(
+        ValueError, match=r'walk_9\.txt: line 1 has 5 numbers, wanted class, box and'
+    ):
+        found_in(folder)
+
+
+def test_frames_of_json_files_in_a_folder(tmp_path):
+    folder = tmp_path / 'predictions'
+    folder.mkdir()
+    for i in range(3):
+        write(folder / f'{i:06d}.json', [instance(i, bbox_score=0.8)])
+    (seen,) = found_in(folder)
+    assert np.array_equal(seen.keypoints.pixels, pixels(17, 2))
+
+
+def test_arrays_of_videopose3d(tmp_path):
+    clip = np.stack([pixels(17, i) for i in range(4)])
+    about = {
+        'layout_name': 'h36m', 'num_joints': 17, 'keypoints_symmetry': [[4, 5], [1, 2]],
+        'video_metadata': {'walk.mp4': {'w': 64, 'h': 48}},
+    }  # fmt: skip
+    path = tmp_path / 'walk.npz'
+    np.savez_compressed(path, positions_2d={'walk.mp4': {'custom': [clip]}}, metadata=about)
+    (seen,) = found_in(path)
+    assert seen.keypoints.names == schemes()['h36m17'].names
+    assert np.array_equal(seen.keypoints.pixels, pixels(17, 2))
+    found = read_keypoints(path, Numbered(tmp_path), START)
+    assert (found.size, found.rows, found.clips) == ((64, 48), 4, 1)
+    np.savez(path, positions_2d={'S1': {'Walk': [clip, clip + 1]}})
+    assert [x.track for x in found_in(path)] == ['S1/Walk/0', 'S1/Walk/1']
+    for bad in ([[clip.tolist()]], [clip[0]], ['x'], [np.array(['a'])]):
+        np.savez(path, positions_2d={'S1': {'Walk': bad}})
+        with pytest.raises(ValueError, match=r'positions_2d of S1/Walk/0 is no array \(T, n, 2\)'):
+            found_in(path)
+
+
+def test_arrays_without_names(tmp_path):
+    content = arrays()
+    del content['landmark_names']
+    np.savez(tmp_path / 'walk.npz', **content)
+    (seen,) = found_in(tmp_path / 'walk.npz')
+    assert seen.keypoints.names == schemes()['mediapipe33'].names
+
+
+DEEPLABCUT = """\
+scorer,net,net,net,net,net,net
+individuals,one,one,one,two,two,two
+bodyparts,LHip,LHip,LHip,tail,tail,tail
+coords,x,y,likelihood,x,y,likelihood
+1,1,2,0.5,,,
+2,3,4,0.5,9,9,0.9
+"""
+
+
+@pytest.mark.parametrize('several', [True, False])
+def test_deeplabcut(several, tmp_path):
+    lines = DEEPLABCUT.splitlines(keepends=True)
+    text = ''.join(x for x in lines if several or not x.startswith('individuals'))
+    (seen,) = found_in(write(tmp_path / 'walk.csv', text))
+    assert seen.keypoints.names == ('left_hip',)
+    assert list(seen.keypoints.pixels[0]) == [3, 4]
+    assert seen.keypoints.confidences[0] == 0.5
+    assert seen.track == ('one' if several else '')
+    with pytest.raises(ValueError, match='wanted names such as left_hip or LHip'):
+        found_in(write(tmp_path / 'tail.csv', text.replace('LHip', 'paw')))
+
+
+MARKERS = """\
+PathFileType\t4\t(X/Y/Z)\twalk.trc
+DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits
+25\t25\t2\t2\tm
+Frame#\tTime\tRBigToe\t\t\tNeck\t\t
+\t\tX1\tY1\tZ1\tX2\tY2\tZ2
+0\t3.0\t31\t32\t0\t41\t42\t0
+2\t3.08\t51\t52\t0\t\t\t
+"""
+
+
+def test_markers(tmp_path):
+    """Times count from the first row as they are; a Y that points up is turned."""
+    for text in (MARKERS, MARKERS.replace('\t32', '\t-32').replace('\t52', '\t-52')):
+        text = text if '-32' not in text else text.replace('\t42', '\t-42')
+        (seen,) = found_in(write(tmp_path / 'walk.trc', text), time_ns=3_080_000_000)
+        assert seen.keypoints.names == ('right_big_toe', 'neck')
+        assert list(seen.keypoints.pixels[0]) == [51, 52]
+        assert list(seen.keypoints.seen) == [True, False]
+    for bad in (MARKERS.replace('32\t0', '32\t7'), MARKERS.replace('\t5', '\t0.5')):
+        bad = bad.replace('\t31\t32', '\t.31\t.32').replace('\t41\t42', '\t.41\t.42')
+        with pytest.raises(ValueError, match=r'three coordinates or metres; wanted .* _px_'):
+            found_in(write(tmp_path / 'walk.trc', bad))
+    with pytest.raises(ValueError, match='no line Frame#'):
+        found_in(write(tmp_path / 'walk.trc', 'x\ty\n'))
+
+
+@pytest.mark.parametrize('unit', [1, 1000, 10**9])
+def test_unix_times_count_from_the_first_row(unit, tmp_path):
+    times = [round(x * unit, 4) for x in (1_700_000_000.25, 1_700_000_000.33)]
+    text = f'time_s,a_u,a_v\n{times[0]},5,6\n{times[1]},7,8\n'
+    (seen,) = found_in(write(tmp_path / 'walk.csv', text), time_ns=80_000_000)
+    assert list(seen.keypoints.pixels[0]) == [7, 8]
+    text = 'time_s,a_u,a_v\n0,5,6\n1e10,7,8\n'
+    with pytest.raises(ValueError, match='times that are years apart'):
+        found_in(write(tmp_path / 'walk.csv', text))
+
+
+def test_names_of_markers():
+    wanted = {
+        'RHip': 'right_hip', 'LBigToe': 'left_big_toe', 'left-ankle': 'left_ankle',
+        'Left Shoulder': 'left_shoulder', 'LEFT_KNEE': 'left_knee', 'Ankle_L': 'left_ankle',
+        'rankle': 'right_ankle', 'MidHip': 'hip', 'Head': 'head', 'nose': 'nose', 'tail': 'tail',
+        'mid_hip': 'mid_hip', 'rib': 'rib',
+    }  # fmt: skip
+    assert {x: landmark_name(x) for x in wanted} == wanted

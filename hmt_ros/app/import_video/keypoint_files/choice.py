@@ -1,0 +1,217 @@
+"""The choice of one person among those that a detector sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmt_ros.app.import_video.frames import natural_order
+from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, Person
+from msg_tools.messages.headers import SECOND_NS
+
+LARGEST, NEAREST, INDEX, TRACK = 'largest', 'nearest', 'index', 'id'
+AT, LONGEST = 'at', 'track'
+# A person moves at most by this much of the diagonal of their box from frame to frame.
+_FASTEST = 0.5
+# A point names the person whose box, larger by this much of its diagonal, has it.
+_AROUND = 0.15
+# A track ends when nobody was there for so many frames.
+_PATIENCE = 30
+_LISTED = 8  # names in an error
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How the person to track is chosen among several.
+
+    Attributes:
+        kind: `LARGEST`: box in each frame. `NEAREST`: to the person chosen before; the first is
+            the largest. `INDEX`: place in the list of the frame. `TRACK`: name that the detector
+            gives the person. `AT`: at a point of the image at a time, and from there the nearest.
+            `LONGEST`: place among the tracks of the clip, the longest first.
+        value: the place, or the name.
+        point: column and row, px, and time since the first frame, s.
+    """
+
+    kind: str = NEAREST
+    value: str = ''
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def parse(cls, text: str) -> Choice:
+        """A choice as the command line has it, such as largest or index:0.
+
+        Raises:
+            ValueError: another text.
+        """
+        kind, colon, value = text.partition(':')
+        if kind in (LARGEST, NEAREST) and not colon:
+            return cls(kind)
+        if kind == TRACK and value:
+            return cls(kind, value)
+        if value.isdecimal() and (kind == INDEX or (kind == LONGEST and int(value) > 0)):
+            return cls(kind, value)
+        if kind == AT:
+            try:
+                place = [float(x) for x in value.split(',')]
+            except ValueError:
+                place = []
+            if len(place) in (2, 3) and all(map(math.isfinite, place)):
+                x, y, t = [*place, 0.0][:3]
+                return cls(kind, value, (x, y, t))
+        raise ValueError(
+            'wanted largest, nearest, index:N, id:NAME, track:N from 1, or at:X,Y or at:X,Y,T in '
+            f'px and s, saw {text!r}'
+        )
+
+
+def chosen_person(
+    found: FoundPersons, choice: Choice, first: int = 0, rate: float | None = None
+) -> dict[int, Person]:
+    """The chosen person in the frames that have them, by key of the frame.
+
+    Args:
+        first: key of the frame from which on the person is looked for.
+        rate: frames per second, for a choice at a time among frames that have numbers.
+
+    Raises:
+        ValueError: nobody is so; the line names those that are there.
+    """
+    kind, value = choice.kind, choice.value
+    if found.clips > 1 and kind != TRACK:
+        raise ValueError(f'{found.clips} clips, {_names_in(found)}; choose one by --person id:NAME')
+    if kind == INDEX:
+        there = {k: x[int(value)] for k, x in found.frames.items() if int(value) < len(x)}
+        most = max(map(len, found.frames.values()), default=0)
+        if most and not there:
+            raise ValueError(
+                f'no frame has a person {value}: the last is --person index:{most - 1}'
+            )
+        return there
+    likely = found.likely()
+    if not any(likely.values()):
+        return {}
+    if kind == TRACK:
+        return _called(found, value)
+    many = found.timed and len(likely) > 1
+    unit = float(np.median(np.diff([*likely]))) if many else 1.0
+    if kind == LONGEST:
+        tracks = sorted(tracks_of(likely, unit), key=len, reverse=True)
+        if int(value) > len(tracks):
+            text = ', '.join(str(len(x)) for x in tracks[:_LISTED])
+            raise ValueError(
+                f'no track {value}: the clip has {len(tracks)}, of {text} frames; '
+                '--person track:1 is the longest'
+            )
+        return tracks[int(value) - 1]
+    if kind == LARGEST:
+        return {key: _largest(persons) for key, persons in likely.items() if persons}
+    keys = [key for key, persons in likely.items() if persons]
+    if kind == NEAREST:
+        keys = [key for key in keys if key >= first]
+        if not keys:
+            return {}
+        seen = _largest(likely[keys[0]])
+        return dict(_followed(((key, likely[key]) for key in keys), seen, unit))
+    column, row, time = choice.point
+    if time > 0 and rate is None and not found.timed:
+        raise ValueError('the rate of the frames is unknown: give --fps, or --person at:X,Y')
+    wanted = time * (SECOND_NS if found.timed else rate or 0.0)
+    start = min(keys, key=lambda key: abs(key - wanted))
+    seen = _person_at(likely[start], column, row)
+    after = [(key, likely[key]) for key in keys if key >= start]
+    before = [(key, likely[key]) for key in reversed(keys) if key <= start]
+    return dict([*_followed(before, seen, unit), *_followed(after, seen, unit)])
+
+
+def _largest(persons: Sequence[Person]) -> Person:
+    return max(persons, key=lambda x: x.score * float(np.prod(x.box[1] - x.box[0])))
+
+
+def _called(found: FoundPersons, name: str) -> dict[int, Person]:
+    """The person of a name."""
+    likely = found.likely()
+    there = {key: x for key, persons in likely.items() for x in persons if x.track == name}
+    if not there:
+        names = _names_in(found)
+        those = f'the ids are {names}; --person id:NAME' if names else 'there are no ids'
+        raise ValueError(f'no person {name}: {those}; or --person at:X,Y or track:1')
+    return there
+
+
+def _names_in(found: FoundPersons) -> str:
+    """The names of the persons in a file, the first of them if they are many."""
+    names = sorted({x.track for x in found.persons()} - {''}, key=natural_order)
+    return ', '.join(x[:40] for x in names[:_LISTED]) + (', ...' if len(names) > _LISTED else '')
+
+
+def _person_at(persons: Sequence[Person], column: float, row: float) -> Person:
+    """The person at a point of the image."""
+    point = np.array([column, row])
+    low, high = (np.array([x.box[i] for x in persons]) for i in range(2))
+    middles = (low + high) / 2
+    outside = np.linalg.norm(np.maximum(0.0, np.maximum(low - point, point - high)), axis=1)
+    best = np.lexsort((np.linalg.norm(middles - point, axis=1), outside))[0]
+    if outside[best] > _AROUND * persons[best].size:
+        text = ' and '.join(f'at:{x:.0f},{y:.0f}' for x, y in middles[:_LISTED])
+        raise ValueError(f'nobody at {column:g},{row:g}: in this frame they are --person {text}')
+    return persons[best]
+
+
+def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dict[int, Person]]:
+    """The persons of a clip, each in the frames that have them.
+
+    In each frame persons are given to the tracks that are nearest, within reach, pair by pair;
+    a name that the detector gives goes before nearness, and another name is another person.
+
+    Args:
+        unit: difference of keys from frame to frame.
+    """
+    tracks: list[dict[int, Person]] = []
+    going: list[tuple[int, Person, dict[int, Person]]] = []
+    for key, persons in likely.items():
+        going = [x for x in going if key - x[0] <= _PATIENCE * unit]
+        pairs = sorted(
+            (x.track != last.track, x.distance(last), i, j)
+            for j, (before, last, _) in enumerate(going)
+            for i, x in enumerate(persons)
+            if x.track == last.track or not (x.track and last.track)
+            if _in_reach(x, last, (key - before) / unit)
+        )
+        of_person: dict[int, int] = {}
+        for _, _, i, j in pairs:
+            if i not in of_person and j not in of_person.values():
+                of_person[i] = j
+        for i, x in enumerate(persons):
+            if i not in of_person:
+                of_person[i] = len(going)
+                going.append((key, x, {}))
+                tracks.append(going[-1][2])
+            track = going[of_person[i]][2]
+            track[key] = x
+            going[of_person[i]] = key, x, track
+    return tracks
+
+
+def _followed(
+    frames: Iterable[tuple[int, list[Person]]], person: Person, unit: float
+) -> Iterator[tuple[int, Person]]:
+    """The person in frames from theirs on: who is nearest to where they were, within reach."""
+    before: int | None = None
+    for key, persons in frames:
+        if before is not None:
+            named = [x for x in persons if x.track and x.track == person.track]
+            near = min(named or persons, key=person.distance, default=None)
+            if near is None or not _in_reach(near, person, abs(key - before) / unit):
+                continue
+            person = near
+        before = key
+        yield key, person
+
+
+def _in_reach(person: Person, last: Person, gap: float) -> bool:
+    """Whether somebody can have come to a place in so many frames."""
+    return person.distance(last) <= _FASTEST * last.size * gap

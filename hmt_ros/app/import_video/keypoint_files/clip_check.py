@@ -1,0 +1,248 @@
+"""The check of a whole clip before its keypoints are believed.
+
+Detectors write numbers whose meaning their files do not tell: percent or fractions, points of
+smaller images, lists in one of several orders. Each has a reading in which the clip shows people:
+confidences up to 1, points all over the image, bones of people's lengths. A reading that fits is
+told; where none fits, the error names the option that helps.
+
+Bones: with d the length of bone b in an image, L that of people and s = sum d / sum L, the 90 %
+quantile q of d / (s L) over the images is near c = 1.18, because a bone that is turned away from
+the image plane in one image lies in it in another:
+
+    z = (mean_b ((log q_b / c) / sigma_b)^4)^(1/4)
+
+L and sigma are those of `bone_lengths`; sigma is 1.67 times as large where q is below c. In 21
+clips of a detector z is 0.4 to 1.9; in another of the orders of so many points 2 to 14, in most
+above 4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, Person
+from hmt_ros.image.keypoint_schemes import (
+    AUTO,
+    JOINTS,
+    bone_lengths,
+    landmarks_of,
+    recognised,
+    scheme_of,
+    schemes,
+    unnamed_orders,
+)
+from hmt_ros.inference.arrays import Array, Mask
+
+Tell = Callable[[str], None]
+
+# Largest confidences that detectors write for what they are sure of.
+_SCALES = (100.0, 255.0, 1000.0)
+# Half of the confidences of a detector that writes fractions are below this.
+_FRACTIONS = 1.5
+_SMALLEST_SCALE = 10.0
+# px, or fractions of the image where all places are within.
+_FRACTION = 2.0
+# Least share of the points of at least a confidence that lies in the image, or near it: detectors
+# guess where hidden points are, but are not sure of those that no image shows.
+_INSIDE, _CONFIDENT, _NEAR = 0.7, 0.5, 0.05
+# Share of the image, from its upper left corner, that points of larger images never keep to.
+_QUARTER = 0.5
+_SAME_SHAPE = 0.02
+_ENOUGH = 100  # points of a clip that are all alike for a reason
+# A point counts for bones from this confidence on; a check needs so many bones.
+_SURE, _BONES = 0.3, 6
+_FEWEST, _MOST = 10, 2000  # persons that the check looks at
+_QUANTILE, _USUAL, _BELOW = 0.9, 1.18, 1.67
+# An order is refused above the first, unless another has less than this part of its z; names, which
+# are told, above the third.
+_REFUSED, _BETTER, _NAMES_REFUSED = 2.75, 0.6, 3.5
+# A person leaps where all points move by this much of the diagonal of their box, and is back within
+# this much of the leap in one of the next frames; so many leaps, and so many of all steps.
+_LEAP, _BACK, _SOON, _LEAPS, _OFTEN = 0.2, 0.4, 10, 3, 0.1
+
+
+def check_clip(
+    found: FoundPersons,
+    size: tuple[int, int],
+    tell: Tell,
+    *,
+    scheme: str = AUTO,
+    points_size: tuple[int, int] | None = None,
+) -> None:
+    """Brings confidences, places and names of a clip to their meaning.
+
+    Args:
+        size: width and height of the images, px.
+        scheme: order of unnamed points, `AUTO`: the one that fits.
+        points_size: of the images that the points were found in; None: not known.
+
+    Raises:
+        ValueError: no reading fits; the line names the option to use. Or there is no such scheme.
+    """
+    scheme_of((), scheme)
+    if not any(found.persons()):
+        return
+    try:
+        _scale_confidences(found, tell)
+        _scale_places(found, size, tell, points_size)
+        _name_points(found, tell, scheme)
+    except ValueError as error:
+        raise ValueError(f'{found.path}: {error}') from error
+
+
+def _likely(found: FoundPersons) -> list[Person]:
+    """Persons of the clip, evenly over it."""
+    persons = [x for those in found.likely().values() for x in those]
+    return persons[:: -(-len(persons) // _MOST)]
+
+
+def _scale_confidences(found: FoundPersons, tell: Tell) -> None:
+    """Brings confidences to 0 to 1."""
+    persons = [x.keypoints for x in _likely(found)]
+    sure = np.concatenate([x.confidences[x.seen] for x in persons])
+    largest, scale = float(sure.max()), 1.0
+    if np.median(sure) > _FRACTIONS:
+        scale = next((x for x in _SCALES if _SMALLEST_SCALE < largest <= x), 1.0)
+        how = f'read as parts of {scale:g}' if scale > 1.0 else 'those above 1 count as 1'
+        tell(f'{found.path}: confidences up to {largest:g}: {how}')
+    equal = len(sure) >= _ENOUGH and sure.min() == largest != 1.0
+    if equal:
+        tell(f'{found.path}: all confidences are {largest:g}: they tell nothing, and count as 1')
+
+    divisor = largest if equal else scale
+    found.change(lambda x: replace(x, confidences=np.clip(x.confidences / divisor, 0.0, 1.0)))
+
+
+def _scale_places(
+    found: FoundPersons, size: tuple[int, int], tell: Tell, points_size: tuple[int, int] | None
+) -> None:
+    """Brings places to pixels of the images."""
+    (width, height), given = size, points_size or found.size
+    persons = _likely(found)
+    points = np.concatenate([x.keypoints.pixels[x.keypoints.seen] for x in persons])
+    factor, shift = np.ones(2), np.zeros(2)
+    if found.fractions or np.abs(points).max() <= _FRACTION:
+        factor = np.array(size, dtype=np.float64)
+        if points.min() < -1.0 / _FRACTION**2:  # from -1 to 1 over the width
+            factor, shift = np.full(2, width / 2), np.array(size) / 2
+        tell(f'{found.path}: places are fractions of the image, of {width}x{height} pixels')
+    elif given is not None:
+        if given[0] <= 0 or abs(given[1] / given[0] * width / height - 1.0) > _SAME_SHAPE:
+            raise ValueError(
+                f'the keypoints were found in images of {given[0]}x{given[1]} pixels, but the '
+                f'frames have {width}x{height}; --keypoints-size WxH tells another size'
+            )
+        factor = np.array(size) / given
+        if (factor != 1.0).any():
+            tell(f'{found.path}: places are scaled from {given[0]}x{given[1]} to {width}x{height}')
+    else:
+        sure = np.concatenate([x.keypoints.confidences[x.keypoints.seen] for x in persons])
+        _check_places(points, sure >= min(_CONFIDENT, sure.max()), size)
+    found.change(lambda x: replace(x, pixels=x.pixels * factor + shift))
+
+
+def _check_places(points: Array, sure: Mask, size: tuple[int, int]) -> None:
+    """Raises ValueError where points (n, 2) seem to be those of images of another size."""
+    (width, height), shares = size, points / size
+    outside = ((shares < -_NEAR) | (shares > 1 + _NEAR)).any(1) & sure
+    if outside.sum() > (1 - _INSIDE) * sure.sum():
+        raise ValueError(
+            f'{outside.sum()} of {sure.sum()} keypoints lie outside of the images, of '
+            f'{width}x{height}: found in larger images, or not upright? --keypoints-size WxH tells '
+            'the size of those images'
+        )
+    if len(points) >= _ENOUGH and (shares < _QUARTER).all():
+        raise ValueError(
+            f'all keypoints lie in the upper left quarter of {width}x{height}: found in smaller '
+            f'images? --keypoints-size WxH tells their size, such as {width // 2}x{height // 2}, '
+            f'or {width}x{height} where the person is there'
+        )
+
+
+def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
+    """Names points in the order in which they are a person."""
+    persons = _likely(found)
+    names = persons[0].keypoints.names
+    alike = [x.keypoints for x in persons if len(x.keypoints.names) == len(names)]
+    pixels = np.stack([np.where(x.confidences[:, None] < _SURE, np.nan, x.pixels) for x in alike])
+    orders = unnamed_orders().get(found.unnamed, ())
+    if scheme != AUTO:
+        if found.unnamed and scheme != JOINTS and len(schemes()[scheme].names) == len(names):
+            _rename(found, scheme)
+        return
+    tried = {x: bone_deviation(schemes()[x].names, pixels, x) for x in orders}
+    usual = next(iter(tried), '')
+    if not tried:
+        tried[usual] = bone_deviation(names, pixels)
+    if not tried[usual] > (_REFUSED if orders else _NAMES_REFUSED):
+        return
+    best = min(tried, key=lambda x: np.nan_to_num(tried[x], nan=math.inf))
+    if tried[best] > min(_REFUSED, _BETTER * tried[usual]):
+        own = recognised(names)
+        what = f'{found.unnamed} points are not in the order of {" or ".join(orders)}'
+        raise ValueError(
+            f'bones do not have the lengths of people: {what if orders else "the names are wrong"}'
+            ', or points of two people are in one list; '
+            f'--scheme {usual or (own.name if own else JOINTS)} takes them as they are'
+        )
+    tell(
+        f'{found.path}: bones have the lengths of people in the order of {best}, not in that '
+        f'of {usual}; --scheme {usual} takes that one'
+    )
+    _rename(found, best)
+
+
+def _rename(found: FoundPersons, scheme: str) -> None:
+    """Gives unnamed points the names of a scheme with as many."""
+    names = schemes()[scheme].names
+    found.change(lambda x: replace(x, names=names) if len(x.names) == len(names) else x)
+
+
+def bone_deviation(names: Sequence[str], pixels: Array, scheme: str = AUTO) -> float:
+    """How far lengths of bones are from those of people, in standard deviations; NaN: unknown.
+
+    Args:
+        names: (n,) of the points.
+        pixels: (N, n, 2) px of persons; NaN where a point was not seen.
+    """
+    marks = [x.name if x else '' for x in landmarks_of(names, (), scheme)]
+    where = {x.replace('centre_of_left', 'left').replace('centre_of_right', 'right'): i
+             for i, x in enumerate(marks)}  # fmt: skip
+    bones = [(where[a], where[b], *x) for (a, b), x in bone_lengths().items() if {a, b} <= {*where}]
+    if len(bones) < _BONES:
+        return math.nan
+    one, other, usual, sigma = (np.array(x) for x in zip(*bones, strict=True))
+    lengths = np.linalg.norm(pixels[:, one] - pixels[:, other], axis=2)
+    seen = np.isfinite(lengths)
+    kept = seen.sum(1) >= _BONES
+    lengths, seen = lengths[kept], seen[kept]
+    if len(lengths) < _FEWEST:
+        return math.nan
+    scale = np.where(seen, lengths, 0.0).sum(1) / (seen * usual).sum(1)
+    ratios = lengths / usual / np.maximum(scale, 1e-6)[:, None]
+    ratios, sigma = ratios[:, seen.any(0)], sigma[seen.any(0)]
+    logs = np.log(np.maximum(np.nanquantile(ratios, _QUANTILE, axis=0), 1e-3) / _USUAL)
+    return float(np.mean((logs / (sigma * np.where(logs > 0.0, 1.0, _BELOW))) ** 4) ** 0.25)
+
+
+def check_steps(persons: Sequence[Person]) -> None:
+    """Raises ValueError where a person leaps to and fro, as two people in one list do.
+
+    Args:
+        persons: one after the other in time.
+    """
+    leaps = 0
+    for i, (before, one) in enumerate(pairwise(persons)):
+        step = one.distance(before)
+        soon = persons[i + 2 : i + 2 + _SOON] if step > _LEAP * before.size else ()
+        leaps += any(x.distance(before) < _BACK * step for x in soon)
+    if leaps >= _LEAPS and leaps > _OFTEN * len(persons):
+        raise ValueError(
+            f'{leaps} times the person is elsewhere in the next frame, and back: points of two '
+            'people under one name? Write a list for each; --person at:X,Y or track:1 follows one'
+        )

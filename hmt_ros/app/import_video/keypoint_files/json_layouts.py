@@ -1,0 +1,244 @@
+"""JSON of detectors: COCO, MMPose, AlphaPose, OpenPose, Ultralytics.
+
+Their layouts differ in how frames hold persons, and in the names of what a person has.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmt_ros.app.import_video.frames import FrameSource
+from hmt_ros.app.import_video.keypoint_files.persons import (
+    FoundPersons,
+    Person,
+    numbers_of,
+    orders_of,
+    person,
+)
+from hmt_ros.image.keypoint_schemes import recognised
+from hmt_ros.inference.arrays import Array
+from msg_tools.files.bounded_file import read_bytes
+from msg_tools.files.error_line import error_line
+
+LARGEST_FILE = 2**27  # bytes
+# Names of what a person or a frame has, in all layouts.
+_POINTS = ('keypoints', 'pose_keypoints_2d', 'joints')
+_SURE = ('keypoint_scores', 'keypoints_scores', 'keypoint_score')
+_SCORE = ('score', 'bbox_score', 'confidence', 'scores')
+_TRACK = ('track_id', 'idx', 'person_id')
+_FRAME = ('image_id', 'frame_id', 'frame', 'image_name', 'file_name')
+_PERSONS = ('people', 'bodies', 'instances')
+
+Labelled = tuple[Any, list[Any]]
+
+
+def read_json(content: bytes | str | Path) -> Any:
+    """The content of a file, or of a text, of JSON.
+
+    Raises:
+        ValueError: no JSON, or too much.
+    """
+    text = read_bytes(content, LARGEST_FILE) if isinstance(content, Path) else content
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f'not JSON ({error_line(error)})') from error
+
+
+def add_json(found: FoundPersons, content: Any, source: FrameSource) -> None:
+    """Adds the persons of all frames in one file.
+
+    Raises:
+        ValueError: of no known layout.
+    """
+    names: tuple[str, ...] | None = None
+    about = content if isinstance(content, dict) else {}
+    annotated, results = 'annotations' in about, 'instance_info' in about
+    if annotated:
+        names, frames = _annotations(found, about)
+    else:
+        frames = [*frames_in(content, None)]
+        listed = _get(about.get('meta_info'), ('keypoint_id2name',))
+        if isinstance(listed, dict) and recognised([*map(str, listed.values())]):
+            names = tuple(map(str, listed.values()))
+    if not frames and content not in ([], {}):
+        raise ValueError(
+            'no known layout of JSON; wanted a list of {image_id, keypoints, score}, annotations '
+            'of COCO, or what MMPose, AlphaPose or Ultralytics write'
+        )
+    for i, (label, _) in enumerate(frames):
+        if not isinstance(label, (int, str)):
+            raise ValueError(
+                f'entry {i} has no image_id or no keypoints: a file for each frame goes into a '
+                'folder'
+            )
+    # The demos of MMPose count frames from 1, its inferencer from 0.
+    numbers = numbers_of([label for label, _ in frames], source, from_one=results)
+    for i, (number, (_, entries)) in enumerate(zip(numbers, frames, strict=True)):
+        found.add(number, None)
+        for entry in entries:
+            found.add(number, person_in(found, entry, f'entry {i}', names, flags=annotated))
+
+
+def _get(entry: Any, names: Sequence[str], default: Any = None) -> Any:
+    """What an object has under the first of some names that it has."""
+    if not isinstance(entry, dict):
+        return default
+    return next((entry[x] for x in names if entry.get(x) is not None), default)
+
+
+def _annotations(found: FoundPersons, content: dict[str, Any]) -> tuple[Any, list[Labelled]]:
+    """Names and frames of COCO annotations."""
+    labels: dict[Any, str] = {}
+    for image in _list(content, 'images'):
+        if not isinstance(image.get('id'), (int, str)):
+            raise ValueError('an image has no id')
+        labels[image['id']] = str(image.get('file_name') or image['id'])
+        if isinstance(image.get('width'), int) and isinstance(image.get('height'), int):
+            found.size = image['width'], image['height']
+    categories = _get(content, ('categories',))
+    named = [_get(x, ('keypoints',)) for x in categories] if isinstance(categories, list) else []
+    names = next((tuple(map(str, x)) for x in named if isinstance(x, list)), None)
+    frames: list[Labelled] = []
+    for entry in _list(content, 'annotations'):
+        label = entry.get('image_id')
+        known = labels.get(label, label) if isinstance(label, (int, str)) else None
+        frames.append((known, [entry]))
+    return names, frames
+
+
+def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
+    """Labels of frames, and the objects of the persons in them.
+
+    Args:
+        label: of the frame whose file it is; None: of many frames.
+
+    Raises:
+        ValueError: of no known layout.
+    """
+    if isinstance(content, dict):
+        yield from _frames_of_object(content, label)
+    elif isinstance(content, list):
+        for i, entry in enumerate(content):
+            entry = read_json(entry) if isinstance(entry, str) else entry
+            own = _get(entry, _FRAME, label)
+            if isinstance(entry, list):
+                yield i, entry
+            elif isinstance(_get(entry, ('preds',)), list):
+                yield from _predictions(entry)
+            elif isinstance(_get(entry, _PERSONS), list):
+                yield i if own is None else own, _get(entry, _PERSONS)
+            else:
+                yield own, [entry]
+
+
+def _frames_of_object(content: dict[str, Any], label: Any) -> Iterator[Labelled]:
+    """Frames of an object: of one frame, of frames by name, or of the frames of each person."""
+    persons = _get(content, _PERSONS)
+    if 'instance_info' in content:
+        yield from frames_in(content['instance_info'], 0)
+    elif isinstance(persons, list):
+        yield _get(content, _FRAME, label), persons
+    elif label is not None:
+        raise ValueError('an object without people, wanted what a detector writes for a frame')
+    else:
+        for name, value in content.items():
+            if isinstance(value, list):
+                yield name, value
+            elif isinstance(_get(value, _PERSONS), list):
+                yield name, _get(value, _PERSONS)
+            elif isinstance(value, dict):
+                for frame, entry in value.items():
+                    if _get(entry, _POINTS) is not None:
+                        yield frame, [{'track_id': name, **entry}]
+
+
+def _predictions(entry: dict[str, Any]) -> Iterator[Labelled]:
+    """Frames of a batch as the test of MMPose wrote them before version 1."""
+    paths, boxes = entry.get('image_paths'), entry.get('boxes')
+    if not isinstance(paths, list) or len(paths) != len(entry['preds']):
+        raise ValueError('preds and image_paths of MMPose do not fit each other')
+    for i, (path, points) in enumerate(zip(paths, entry['preds'], strict=True)):
+        box = boxes[i] if isinstance(boxes, list) and i < len(boxes) else None
+        score = box[-1] if isinstance(box, list) and box else None
+        yield Path(str(path)).name, [{'keypoints': points, 'score': score}]
+
+
+def person_in(
+    found: FoundPersons,
+    entry: Any,
+    where: str,
+    names: Sequence[str] | None = None,
+    *,
+    flags: bool = False,
+) -> Person | None:
+    """A person as an object of JSON tells it; None if nothing of the person was seen.
+
+    Args:
+        where: name of the object in errors.
+        names: of the points, if the file has them.
+        flags: whether confidences are flags of annotators.
+
+    Raises:
+        ValueError: the object is no person.
+    """
+    points = _get(entry, _POINTS)
+    if points is None:
+        raise ValueError(f'{where} has no image_id or no keypoints')
+    values = _triples(points, _get(entry, _SURE), where)
+    if names is not None and len(names) != len(values):
+        raise ValueError(
+            f'{where} has {len(values)} keypoints, but {len(names)} are named in categories'
+        )
+    confidences = values[:, 2]
+    if np.isin(confidences, (0.0, 1.0, 2.0)).all() and (flags or (confidences == 2.0).any()):
+        confidences = confidences / 2  # flags: 0 not labelled, 1 hidden, 2 visible
+    if names is None:
+        orders_of(len(values))
+        found.unnamed = len(values)
+    track, box = _get(entry, _TRACK), _get(entry, ('bbox',))
+    track = track[0] if isinstance(track, list) and track else track
+    track = int(track) if isinstance(track, float) and track.is_integer() else track
+    told = _get(entry, _SCORE, box[4] if isinstance(box, list) and len(box) > 4 else None)
+    told = told[0] if isinstance(told, list) and told else told
+    return person(
+        names, values[:, :2], confidences,
+        track='' if track in (None, -1, []) else str(track),
+        score=float(told) if isinstance(told, (int, float)) and abs(told) < 1e9 else 1.0,
+    )  # fmt: skip
+
+
+def _list(content: dict[str, Any], name: str) -> list[Any]:
+    """A list of objects in an object."""
+    entries = content.get(name)
+    if not isinstance(entries, list) or not all(isinstance(x, dict) for x in entries):
+        raise ValueError(f'no list {name}')
+    return entries
+
+
+def _triples(points: Any, sure: Any, where: str) -> Array:
+    """(n, 3) column, row and confidence of keypoints: triples in a row, or a list of each."""
+    try:
+        if isinstance(points, dict):  # of Ultralytics
+            sure = points.get('visible') if sure is None else sure
+            points = np.array([points.get('x'), points.get('y')], dtype=np.float64).T
+        values = np.array(points, dtype=np.float64)
+        given = None if sure is None else np.array(sure, dtype=np.float64).reshape(-1, 1)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f'{where}: keypoints are not numbers') from error
+    width = values.shape[-1] if values.ndim > 1 else 3 if given is None else 2
+    if width not in (2, 3) or not values.size or values.size % width:
+        raise ValueError(
+            f'{where} has {values.size} numbers, wanted u, v and confidence for each keypoint'
+        )
+    values = values.reshape(-1, width)
+    given = values[:, 2:] if given is None else given
+    given = np.ones((len(values), 1)) if given.shape[1] == 0 else given
+    if len(given) != len(values):
+        raise ValueError(f'{where} has {len(given)} confidences of {len(values)} keypoints')
+    return np.hstack([values[:, :2], given])

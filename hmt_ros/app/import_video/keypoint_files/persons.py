@@ -1,0 +1,219 @@
+"""Persons as detectors report them, by frame."""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hmt_ros.app.import_video.frames import Frame, FrameSource
+from hmt_ros.image.keypoint_schemes import landmark_called, schemes, unnamed_orders
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array
+
+_MATCHING_NS = 10_000_000  # between the time of a row and that of its frame
+MOST_FRAMES = 10_000_000
+# A person whose score is a smaller part of the best of the clip is none.
+_LIKELY = 0.2
+_SIDES = {'l': 'left', 'r': 'right', 'left': 'left', 'right': 'right'}
+_SAME = {'mid_hip': 'hip', 'c_hip': 'hip', 'head_top': 'head', 'upper_neck': 'neck'}
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """A person in a frame.
+
+    Attributes:
+        keypoints: under the detector's names; their covariances are not known (NaN).
+        track: name that the detector gives the person in all frames; '' if it does not track.
+        score: how sure the detector is of the person, of any scale.
+    """
+
+    keypoints: Keypoints
+    track: str = ''
+    score: float = 1.0
+
+    @property
+    def box(self) -> Array:
+        """(2, 2) least and greatest column and row of the keypoints that were seen."""
+        seen = self.keypoints.pixels[self.keypoints.seen]
+        return np.stack([seen.min(0), seen.max(0)])
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the box, px."""
+        return float(np.linalg.norm(self.box[1] - self.box[0]))
+
+    def distance(self, other: Person) -> float:
+        """Mean distance of the keypoints that both have, px; of the boxes if there is none."""
+        both = self.keypoints.seen & other.keypoints.seen
+        apart = self.keypoints.pixels[both] - other.keypoints.pixels[both]
+        if not both.any():
+            apart = (self.box.mean(0) - other.box.mean(0))[None]
+        return float(np.linalg.norm(apart, axis=1).mean())
+
+
+def person(
+    names: Sequence[str] | None,
+    pixels: ArrayLike,
+    confidences: ArrayLike | None = None,
+    positions: ArrayLike | None = None,
+    track: str = '',
+    score: float = 1.0,
+) -> Person | None:
+    """A person as a detector reports one; None if it sees nothing of the person.
+
+    A keypoint at (0, 0) or at NaN, or without confidence, was not seen.
+
+    Args:
+        names: None: those of the usual order of so many points (`unnamed_orders`).
+        pixels: (n, 2) px.
+        confidences: (n,), of any scale; None: 1.
+        positions: (n, 3) m; None: the detector does not lift.
+
+    Raises:
+        ValueError: no order of so many points is known.
+    """
+    places = np.array(pixels, dtype=np.float64)
+    sure = np.ones(len(places)) if confidences is None else np.array(confidences, dtype=np.float64)
+    if names is None:
+        names = schemes()[orders_of(len(places))[0]].names
+        places, sure = places[: len(names)], sure[: len(names)]
+    sure = np.maximum(np.nan_to_num(sure, nan=0.0), 0.0)
+    unseen = ~np.isfinite(places).all(1) | (places == 0.0).all(1) | (sure == 0.0)
+    if unseen.all():
+        return None
+    places[unseen], sure[unseen] = np.nan, 0.0
+    lifted = None if positions is None else np.array(positions, dtype=np.float64)
+    unknown = np.full((len(names), 2, 2), np.nan)
+    return Person(Keypoints(tuple(names), places, unknown, sure, lifted), track, score)
+
+
+def orders_of(count: int) -> tuple[str, ...]:
+    """The schemes that a list of so many points without names may have, the usual one first.
+
+    Raises:
+        ValueError: none is known.
+    """
+    known = unnamed_orders()
+    if count in known:
+        return known[count]
+    if count % 2 == 0 and count // 2 in known:
+        raise ValueError(
+            f'{count} keypoints without names: of two persons, {count // 2} each? Wanted a list '
+            'for each person'
+        )
+    text = ', '.join(f'{n} ({names[0]})' for n, names in sorted(known.items()))
+    raise ValueError(
+        f'{count} keypoints without names; wanted {text}, or names: a .csv with NAME_u, NAME_v'
+    )
+
+
+def landmark_name(name: str) -> str:
+    """A name of a marker as schemes have it, such as right_big_toe of RBigToe; as it is if none."""
+    text = name.lower() if name.isupper() else name
+    words = [x.lower() for x in re.findall(r'[A-Z]?[a-z]+|[A-Z](?![a-z])|\d+', text)]
+    if words and words[-1] in _SIDES and words[0] not in _SIDES:
+        words = [words[-1], *words[:-1]]
+    if words and len(words[0]) > 1 and words[0][0] in 'lr' and words[0] not in _SIDES:
+        words = [words[0][0], words[0][1:], *words[1:]]
+    tried = '_'.join([_SIDES.get(x, x) for x in words[:1]] + words[1:])
+    tried = _SAME.get(tried, tried)
+    known = landmark_called(name) is None and landmark_called(tried) is not None
+    return tried if known else name
+
+
+@dataclass
+class FoundPersons:
+    """Persons by frame.
+
+    Attributes:
+        path: what the detector wrote, for errors.
+        frames: persons by number of the frame, or by time since the first frame, ns.
+        timed: whether keys are times.
+        rows: number of frames that the file describes one by one; None: it skips frames.
+        size: width and height of the frames that the detector saw, px; None: not known.
+        unnamed: number of points of lists without names; 0: points have names.
+        clips: number of clips in the file, each with the name of a person.
+        fractions: whether places are fractions of the image, not px.
+    """
+
+    path: Any = ''
+    frames: dict[int, list[Person]] = field(default_factory=lambda: defaultdict(list))
+    timed: bool = False
+    rows: int | None = None
+    size: tuple[int, int] | None = None
+    unnamed: int = 0
+    fractions: bool = False
+    clips: int = 1
+
+    def add(self, key: int, seen: Person | None) -> None:
+        """Adds a person to a frame; None: the frame was looked at.
+
+        Raises:
+            ValueError: there can not be so many frames.
+        """
+        if not self.timed and key >= MOST_FRAMES:
+            raise ValueError(f'frame {key}, wanted at most {MOST_FRAMES} frames')
+        self.frames[key] += [] if seen is None else [seen]
+
+    @cached_property
+    def keys(self) -> list[int]:
+        """The keys in order, once all persons are there."""
+        return sorted(self.frames)
+
+    @property
+    def last(self) -> int:
+        """Number of the last frame with an entry; -1: there is none, or only times are known."""
+        return -1 if self.timed else max(self.frames, default=-1)
+
+    @property
+    def lifts(self) -> bool:
+        """Whether the detector has positions in space."""
+        return any(x.keypoints.positions is not None for x in self.persons())
+
+    def key_of(self, frame: Frame) -> int | None:
+        """Key of a frame; None: the file does not have it."""
+        wanted, apart = (frame.time_ns, _MATCHING_NS) if self.timed else (frame.number, 0)
+        at = bisect_left(self.keys, wanted)
+        near = [x for x in self.keys[max(at - 1, 0) : at + 1] if abs(x - wanted) <= apart]
+        return min(near, key=lambda x: abs(x - wanted), default=None)
+
+    def persons(self) -> Iterator[Person]:
+        """All persons of all frames."""
+        for found in self.frames.values():
+            yield from found
+
+    def likely(self) -> dict[int, list[Person]]:
+        """The persons whose score does not say that they are none, by frame in order."""
+        best = max((x.score for x in self.persons()), default=0.0)
+        return {
+            key: [x for x in found if x.score >= _LIKELY * best or best <= 0.0]
+            for key, found in sorted(self.frames.items())
+        }
+
+    def change(self, changed: Callable[[Keypoints], Keypoints]) -> None:
+        """Replaces the keypoints of each person."""
+        for key, found in self.frames.items():
+            self.frames[key] = [replace(x, keypoints=changed(x.keypoints)) for x in found]
+
+
+def numbers_of(labels: Sequence[str | int], source: FrameSource, *, from_one: bool) -> list[int]:
+    """Numbers of frames, from 0, of labels.
+
+    Args:
+        from_one: whether the detector counts frames from 1, unless the source says from where.
+
+    Raises:
+        ValueError: a label means no frame.
+    """
+    numbers = [source.number_of(label) for label in labels]
+    shift = from_one and source.first_number == 0 and not source.names and 0 not in numbers
+    return [number - shift for number in numbers]

@@ -1,0 +1,125 @@
+"""Reads what a detector wrote, whatever the format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hmt_ros.app.import_video.frames import FrameSource
+from hmt_ros.app.import_video.keypoint_files.arrays import read_arrays
+from hmt_ros.app.import_video.keypoint_files.choice import Choice, chosen_person
+from hmt_ros.app.import_video.keypoint_files.clip_check import Tell, check_clip, check_steps
+from hmt_ros.app.import_video.keypoint_files.folders import read_folder
+from hmt_ros.app.import_video.keypoint_files.json_layouts import add_json, read_json
+from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons
+from hmt_ros.app.import_video.keypoint_files.tables import read_table
+from hmt_ros.body.skeleton import other_side
+from hmt_ros.image.keypoint_schemes import AUTO
+from hmt_ros.image.terms.keypoints import Keypoints
+from msg_tools.files.error_line import error_line
+
+_FARTHEST = 1e5  # px; no image is so large
+_LONGEST = 240  # characters of an error
+
+
+@dataclass(frozen=True)
+class ClipReading:
+    """How the keypoints of a clip are to be read, as far as one knows.
+
+    Attributes:
+        person: who is chosen.
+        scheme: order of points without names; `AUTO`: the one in which they are a person.
+        points_size: width and height of the images that the points were found in, px.
+        mirror: whether the images are mirror images.
+    """
+
+    person: Choice = Choice()  # noqa: RUF009 - frozen
+    scheme: str = AUTO
+    points_size: tuple[int, int] | None = None
+    mirror: bool = False
+
+
+def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPersons:
+    """Reads the output of a detector for the frames of a source.
+
+    Args:
+        first_stamp_ns: stamp of the first frame, which stamps in the file refer to.
+
+    Raises:
+        ValueError: the file is missing, unreadable, of no known kind, or contradicts itself.
+    """
+    kind = path.suffix.lower()
+    try:
+        if path.is_dir():
+            found = read_folder(path, source)
+        elif not path.is_file():
+            raise ValueError('no such file')
+        elif kind == '.json':
+            found = FoundPersons(path)
+            add_json(found, read_json(path), source)
+        elif kind == '.npz':
+            found = read_arrays(path)
+        elif kind in ('.csv', '.trc'):
+            found = read_table(path, source, first_stamp_ns)
+        else:
+            raise ValueError(
+                f"{path.suffix or 'a file without suffix'} is not known; wanted a detector's "
+                '.json, .npz, .csv or .trc, or a folder with a file for each frame'
+            )
+        farthest = max((float(np.nanmax(np.abs(x.box))) for x in found.persons()), default=0.0)
+        if farthest > _FARTHEST:
+            raise ValueError(f'a keypoint lies {farthest:g} px away, wanted places in an image')
+        for names in {x.keypoints.names for x in found.persons()}:
+            if len({*names}) < len(names):
+                twice = next(x for x in names if names.count(x) > 1)
+                raise ValueError(f'two keypoints are called {twice}')
+    except (ValueError, RecursionError) as error:
+        text = ''.join(x if x.isprintable() else '?' for x in error_line(error))
+        raise ValueError(f'{path}: {text[:_LONGEST]}') from error
+    return found
+
+
+def keypoints_of_person(
+    found: FoundPersons,
+    reading: ClipReading,
+    size: tuple[int, int],
+    tell: Tell,
+    first: int = 0,
+    rate: float | None = None,
+) -> dict[int, Keypoints]:
+    """Keypoints of the chosen person by key of the frame, in pixels of the images.
+
+    Args:
+        size: width and height of the images, px.
+        first: key of the first frame.
+        rate: frames per second, as far as known.
+
+    Raises:
+        ValueError: the clip contradicts itself, or has no such person; the line says what to do.
+    """
+    told: list[str] = []
+    check_clip(found, size, told.append, scheme=reading.scheme, points_size=reading.points_size)
+    try:
+        chosen = chosen_person(found, reading.person, first, rate)
+        check_steps([chosen[key] for key in sorted(chosen)])
+    except ValueError as error:
+        raise ValueError(f'{found.path}: {error}') from error
+    for text in told:
+        tell(text)
+    return {
+        key: mirrored(one.keypoints, size[0]) if reading.mirror else one.keypoints
+        for key, one in chosen.items()
+    }
+
+
+def mirrored(keypoints: Keypoints, width: int) -> Keypoints:
+    """Keypoints of the image that a mirror image, of a width in px, was made from."""
+    positions = keypoints.positions
+    return replace(
+        keypoints,
+        names=tuple(other_side(x) for x in keypoints.names),
+        pixels=np.array([width - 1.0, 0.0]) + keypoints.pixels * (-1.0, 1.0),
+        positions=None if positions is None else positions * (-1.0, 1.0, 1.0),
+    )

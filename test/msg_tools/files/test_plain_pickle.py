@@ -1,0 +1,94 @@
+"""Pickles as plain data: what is read, and that nothing of them is carried out."""
+
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from msg_tools.files.array_file import read_archive
+from msg_tools.files.plain_pickle import read_plain_pickle
+
+DATA = {
+    'S1': {'Walk 1': [np.arange(12.0).reshape(2, 3, 2), np.ones((2, 3, 2), '>f4')]},
+    'order': np.asfortranarray(np.arange(6).reshape(2, 3)),
+    'names': np.array(['a', 'bc']),
+    'rest': [np.float32(2.5), 3, -(2**40), None, True, 'text', b'bytes', (1, 2), 0.5],
+}
+
+
+@pytest.mark.parametrize('protocol', [2, 3, 4, 5])
+def test_plain_data_comes_back(protocol):
+    found = read_plain_pickle(pickle.dumps(DATA, protocol))
+    assert found['rest'] == DATA['rest']
+    for one, other in (
+        (found['S1']['Walk 1'][0], DATA['S1']['Walk 1'][0]),
+        (found['S1']['Walk 1'][1], DATA['S1']['Walk 1'][1]),
+        (found['order'], DATA['order']),
+        (found['names'], DATA['names']),
+    ):
+        assert one.dtype == other.dtype
+        assert np.array_equal(one, other)
+    mixed = np.empty(3, dtype=object)
+    mixed[:] = [[1], 'x', None]
+    assert list(read_plain_pickle(pickle.dumps(mixed, protocol))) == [[1], 'x', None]
+
+
+class Calls:
+    """An object whose unpickling calls something."""
+
+    def __init__(self, function, *arguments):
+        self.about = function, arguments
+
+    def __reduce__(self):
+        return self.about
+
+
+def test_nothing_is_called(tmp_path):
+    mark = tmp_path / 'called'
+    inside = np.empty(1, dtype=object)
+    inside[0] = Calls(os.mkdir, str(mark))
+    for bad in (
+        Calls(os.mkdir, str(mark)),
+        inside,
+        {'a': [Calls(eval, f'open({str(mark)!r}, "w")')]},
+    ):
+        with pytest.raises(ValueError, match=r'wants to use .*, which is not plain data'):
+            read_plain_pickle(pickle.dumps(bad))
+        np.savez(tmp_path / 'bad.npz', bad=np.array(bad, dtype=object))
+        with pytest.raises(ValueError, match='not plain data'):
+            read_archive(tmp_path / 'bad.npz', with_objects=True)
+    assert not mark.exists()
+
+
+def test_other_data_is_refused():
+    for bad, message in (
+        ({(1, 2): 3}, 'keys that are neither texts nor numbers'),
+        ({1, 2}, 'the opcode EMPTY_SET'),
+        (1j, "'builtins complex'"),
+        (np.datetime64('2020'), 'wanted plain data'),
+        (np.zeros(2, 'f4,i4'), 'wanted plain data'),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_plain_pickle(pickle.dumps(bad))
+
+
+def test_claims_are_compared_with_what_is_there():
+    """An array that claims more than its bytes, memory of a place far away, a cut end."""
+    good = pickle.dumps(np.zeros(4), 4)
+    assert b'K\x04\x85' in good
+    with pytest.raises(ValueError, match='an array of 1600 bytes, but there are 32'):
+        read_plain_pickle(good.replace(b'K\x04\x85', b'K\xc8\x85', 1))
+    assert read_plain_pickle(b'\x80\x04]r\xff\xff\xff\x7f.') == []
+    for end in range(1, len(good)):
+        with pytest.raises(ValueError, match=r'.'):
+            read_plain_pickle(good[:end])
+    with pytest.raises(ValueError, match='more than 200000 opcodes'):
+        read_plain_pickle(b'\x80\x04' + b']' * 210_000 + b'.')
+
+
+def test_a_list_within_itself_ends():
+    held = []
+    held.append(held)
+    found = read_plain_pickle(pickle.dumps(held))
+    assert found[0] is found
