@@ -34,6 +34,7 @@ BENCHMARKS = {
     'rolled': 'what a camera on its side or upside down costs, its gravity given',
     'smoothing': 'exactness, speed and peers of the smoother',
     'soak': 'nodes and files under load and fault',
+    'strangers': 'files of other programs, as their commands take them',
     'tracking': 'accuracy, calibration and speed of the tracker on clips with known truth',
     'vertical': 'how well the lines of a scene tell which way is up, and what a look costs',
     'votes': 'which chain to flip or to search, by the vote that chooses it',
