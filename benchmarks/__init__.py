@@ -30,6 +30,7 @@ BENCHMARKS = {
     'motion_prior': 'how well the motion prior predicts motions of other people',
     'nodes': 'images at the rate of a camera, through DDS',
     'people': 'two people cross: are they told apart afterwards?',
+    'real_clips': 'real people, beside the own 3D of the detector',
     'real_video': 'real videos without truth: keypoints held out, feet, lengths; contact sheets',
     'rolled': 'what a camera on its side or upside down costs, its gravity given',
     'smoothing': 'exactness, speed and peers of the smoother',
