@@ -132,6 +132,14 @@ class Skeleton:
         }
 
     @cached_property
+    def spine(self) -> tuple[int, ...]:
+        """Segments between the pelvis and the neck, from above."""
+        found, at = [], int(self.joint_segments[self.joint_index(('neck',))[0]])
+        while (at := self.parents[at]) > 0:
+            found.append(at)
+        return tuple(found)
+
+    @cached_property
     def chain_joints(self) -> dict[str, Index]:
         """Joints that the segments of each chain carry."""
         return {

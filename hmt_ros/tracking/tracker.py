@@ -207,7 +207,7 @@ class Tracker:
         keypoints = self._lifted(keypoints, stamp)
         near, dt = None, 0.0
         if self._followed is not None and not self._track.lost:
-            near, dt = self.modes.poses, seconds(stamp - self._followed)
+            near, dt = self._track.modes.poses, seconds(stamp - self._followed)
         view = self._observer.view(
             image, keypoints, mask, self.body, near, dt,
             predicted=False if nobody_predicted else True if prediction is not None else None,
@@ -240,7 +240,7 @@ class Tracker:
     @property
     def body(self) -> Body:
         """The person, with the present estimate of lengths and flesh."""
-        return self._track.body
+        return self._track.limbs.told(self._track.body)
 
     @property
     def ground(self) -> Ground:
@@ -315,7 +315,7 @@ class Tracker:
         Raises:
             ValueError: there is no track.
         """
-        return self._track.modes
+        return self._track.published
 
     @property
     def point_estimate(self) -> Array:
@@ -442,7 +442,7 @@ class Tracker:
                 return self._expected(stamp), self._likelihood(Observation())
             if existence.elsewhere:
                 view = self._observer.seen_anywhere(view, mask)
-            observation = self._observe(view, self.modes.poses[0])
+            observation = self._observe(view, self._track.modes.poses[0])
             self._follow(observation, stamp, prediction)
         else:
             begun = self._start_track(view, stamp, prediction, masked=masked)
@@ -450,20 +450,21 @@ class Tracker:
                 return None, None
             observation = begun
         if not masked:
-            likely = self.modes.log_weights > -LIKELY
-            poses = self.modes.poses[likely]
+            likely = self._track.modes.log_weights > -LIKELY
+            poses = self._track.modes.poses[likely]
             self.silhouettes.complete(view.image, self.body, self.camera, poses)
         dt = 0.0 if self._followed is None else seconds(stamp - self._followed)
         if self.settings.ground.on:
             resting = min(self.contacts.values(), default=RESTING)
-            self._ground.update(self.body, self.modes, resting, dt)
-        follows = self.modes.origins.shape[1] > 0
+            self._ground.update(self.body, self._track.modes, resting, dt)
+        follows = self._track.modes.origins.shape[1] > 0
         # The motion takes in one image after another, so each with its own covariance alone.
-        found = replace(self.posterior, covariances=self.modes.covariances / TOGETHER)
+        found = self._track.modes.mixture
+        found = replace(found, covariances=found.covariances / TOGETHER)
         self._point.update(self.body, self._track.dynamics, found, dt if follows else None)
         self._observer.last_image, self._followed = view.image, stamp
         if self._existence.seen:
-            self._existence.learn(view, stamp, self.body, self.camera, self.modes.poses[0])
+            self._existence.learn(view, stamp, self.body, self.camera, self._track.modes.poses[0])
         self.evaluations = self._track.evaluations
         return self.posterior, self._likelihood(observation)
 
@@ -521,7 +522,7 @@ class Tracker:
             if not somebody:
                 # The start itself says that somebody is there.
                 self._existence = Existence(GIVEN)
-                pose = self.modes.poses[0]
+                pose = self._track.modes.poses[0]
                 self._existence.learn(view, stamp, self.body, self.camera, pose)
                 self._existence.look(view, stamp, self.body)
         self.track_id += 1
