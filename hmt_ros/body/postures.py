@@ -22,7 +22,7 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.mixture import GaussianMixture
 
 # A posture of a mode that has less than this share of all is left out, unless it is the likeliest.
-LIGHTEST = 0.005
+LIGHTEST = 0.01
 # Joints that stay where they are as the pelvis turns.
 TOP = ('neck', 'left_shoulder', 'right_shoulder')
 

@@ -19,7 +19,7 @@ from hmt_ros.inference.arrays import Array, Mask
 
 # Confidence below which a keypoint is a guess.
 GUESSED = 0.1
-# Error of an unseen joint for each bone of its limb, as a share of the bone's length: by the lengths
+# Error of an unseen joint for each bone of its limb, as a share of its length: by the lengths
 # of people, and by what a linear map misses within a posture.
 ALONG_LIMB = 0.08
 
@@ -33,12 +33,16 @@ class UnseenLimbs:
     """
 
     def __init__(self, body: Body) -> None:
-        self.times: Array = np.full(len(body.skeleton.parents), np.inf)
+        self.times: Array = np.zeros(len(body.skeleton.parents))
 
     def look(
         self, body: Body, camera: Camera, observation: Observation, pose: Array, dt: float
     ) -> None:
-        """Takes in an image, dt s after the one before, and the likeliest pose (d,) in it."""
+        """Takes in an image and the likeliest pose (d,) in it.
+
+        Args:
+            dt: time since the image before, s; inf: there is none.
+        """
         shown = shown_segments(body, camera, observation, pose)
         self.times = np.where(shown, 0.0, self.times + dt)
 

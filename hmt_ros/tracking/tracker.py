@@ -209,7 +209,7 @@ class Tracker:
         if self._followed is not None and not self._track.lost:
             near, dt = self._track.modes.poses, seconds(stamp - self._followed)
         view = self._observer.view(
-            image, keypoints, mask, self.body, near, dt,
+            image, keypoints, mask, self._track.body, near, dt,
             predicted=False if nobody_predicted else True if prediction is not None else None,
             others=others, depth=depth,
         )  # fmt: skip
@@ -382,7 +382,7 @@ class Tracker:
         if motion is not None:
             self._ground.carry(motion)
             self._seen.carry(motion.rotation)
-            self._point.carry(self.body, motion)
+            self._point.carry(self._track.body, motion)
             if self._track.begun:
                 self._track.carry(motion)
         newer, self._newer_gravity = self._newer_gravity, None
@@ -399,7 +399,7 @@ class Tracker:
         if self._lifter is not None:
             self._seen.add(keypoints, seconds(stamp))
             begun = self._track.begun
-            person = self._lifter.proportions(self.body) if begun else None
+            person = self._lifter.proportions(self._track.body) if begun else None
             opinions.append(self._seen.lift(self._lifter, self.vertical, person))
         if keypoints.positions is not None:
             opinions.append(lifted_positions(self.camera, keypoints))
@@ -419,7 +419,7 @@ class Tracker:
 
     def _drop_track(self) -> None:
         """Keeps nothing but the body."""
-        self._track = self._new_track(self.body)
+        self._track = self._new_track(self._track.body)
         self._point = PointEstimate()
         self._ground.reset()
         self._observer.last_image, self._followed = None, None
@@ -431,7 +431,7 @@ class Tracker:
         """See `step`."""
         masked, existence, self._foreseen = mask is not None, self._existence, False
         if self._track.begun:
-            existence.look(view, stamp, self.body)
+            existence.look(view, stamp, self._track.body)
             if existence.nobody:
                 self._nobody = True
                 self._drop_track()
@@ -452,19 +452,21 @@ class Tracker:
         if not masked:
             likely = self._track.modes.log_weights > -LIKELY
             poses = self._track.modes.poses[likely]
-            self.silhouettes.complete(view.image, self.body, self.camera, poses)
+            self.silhouettes.complete(view.image, self._track.body, self.camera, poses)
         dt = 0.0 if self._followed is None else seconds(stamp - self._followed)
         if self.settings.ground.on:
             resting = min(self.contacts.values(), default=RESTING)
-            self._ground.update(self.body, self._track.modes, resting, dt)
+            self._ground.update(self._track.body, self._track.modes, resting, dt)
         follows = self._track.modes.origins.shape[1] > 0
         # The motion takes in one image after another, so each with its own covariance alone.
         found = self._track.modes.mixture
         found = replace(found, covariances=found.covariances / TOGETHER)
-        self._point.update(self.body, self._track.dynamics, found, dt if follows else None)
+        self._point.update(self._track.body, self._track.dynamics, found, dt if follows else None)
         self._observer.last_image, self._followed = view.image, stamp
         if self._existence.seen:
-            self._existence.learn(view, stamp, self.body, self.camera, self._track.modes.poses[0])
+            self._existence.learn(
+                view, stamp, self._track.body, self.camera, self._track.modes.poses[0]
+            )
         self.evaluations = self._track.evaluations
         return self.posterior, self._likelihood(observation)
 
@@ -483,7 +485,7 @@ class Tracker:
         self._existence.look(
             view if known else view._replace(anywhere=None, silhouette=None),
             stamp,
-            self.body,
+            self._track.body,
             waiting=True,
         )
         somebody = self._existence.somebody and self._existence.llr > 0.0
@@ -495,11 +497,11 @@ class Tracker:
             near = replace(
                 observation, magnification=self.camera.magnification(float(np.median(poses[:, 2])))
             )
-            arrived = Beginning(Source.ARRIVAL, self.body, poses)
+            arrived = Beginning(Source.ARRIVAL, self._track.body, poses)
             self._begin(near, arrived, stamp)
         else:
             beginning = self._starts.first(
-                view, stamp, self.body, self._gravity, prediction,
+                view, stamp, self._track.body, self._gravity, prediction,
                 lambda: self._observe(view, None), masked=masked, somebody=somebody,
             )  # fmt: skip
             if beginning is None:
@@ -523,8 +525,8 @@ class Tracker:
                 # The start itself says that somebody is there.
                 self._existence = Existence(GIVEN)
                 pose = self._track.modes.poses[0]
-                self._existence.learn(view, stamp, self.body, self.camera, pose)
-                self._existence.look(view, stamp, self.body)
+                self._existence.learn(view, stamp, self._track.body, self.camera, pose)
+                self._existence.look(view, stamp, self._track.body)
         self.track_id += 1
         self._starts.box, self._nobody = None, False
         return observation
@@ -532,7 +534,7 @@ class Tracker:
     def _expected(self, stamp: int) -> GaussianMixture:
         """The posterior of a time at which nothing is seen."""
         assert self._followed is not None
-        self._point.expect(self.body, self._track.dynamics, seconds(stamp - self._followed))
+        self._point.expect(self._track.body, self._track.dynamics, seconds(stamp - self._followed))
         return self.forecaster.at(stamp)
 
     def _begin(self, observation: Observation, beginning: Beginning, stamp: int) -> None:
@@ -557,7 +559,9 @@ class Tracker:
         self, observation: Observation, prediction: PosePrediction | None
     ) -> Array | None:
         """See `poses_to_search`."""
-        return poses_to_search(self.body, self.camera, observation, prediction, self._gravity)
+        return poses_to_search(
+            self._track.body, self.camera, observation, prediction, self._gravity
+        )
 
     def _observe(self, view: View, pose: Array | None) -> Observation:
         """The evidence of an image about a person near a pose (d,), if the pose is known."""
