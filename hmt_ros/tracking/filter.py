@@ -109,7 +109,7 @@ class MixtureFilter:
         self._rng = np.random.default_rng(seed)
         self._modes: Modes | None = None
         # The modes that are published, and the mode that each comes from.
-        self._published: Modes | None = None
+        self._shown: Modes | None = None
         self._sources: Index = np.empty(0, dtype=np.intp)
         self.limbs = UnseenLimbs(body)
         self._identities = Identities()
@@ -152,9 +152,7 @@ class MixtureFilter:
         Raises:
             ValueError: there is no track.
         """
-        if self._published is None:
-            raise ValueError('there is no track yet')
-        return self._published
+        return self._shown or self.modes
 
     @property
     def dynamics(self) -> LinearGaussianDynamics:
@@ -252,7 +250,7 @@ class MixtureFilter:
     def carry(self, motion: CameraMotion) -> None:
         """Takes everything that has a place into the camera frame of the next image."""
         self._modes = motion.modes(self.body, self.modes)
-        self._published = motion.modes(self.body, self.published)
+        self._shown = motion.modes(self.body, self.published)
         self._facing.carry(self.body, self._modes.poses)
         if self._by_keypoints.pose is not None:
             self._by_keypoints.pose = motion.poses(self.body, self._by_keypoints.pose)
@@ -428,21 +426,20 @@ class MixtureFilter:
 
     def _publish(self, modes: Modes) -> None:
         """Makes the modes that are published, and what they come from in the image before."""
-        before, sources = self._published, self._sources
-        self._sources, unseen = np.arange(len(modes)), self.limbs.of_dofs(self.body)
+        before, self._sources = self._sources, np.arange(len(modes))
+        weights = np.exp(self._shown.log_weights) if self._shown else np.ones(len(before))
+        unseen = self.limbs.of_dofs(self.body)
         if unseen.any():
-            spread, rows, postures = postures_of(self.body).spread(modes.mixture, unseen)
-            self._sources = rows
+            spread, self._sources, postures = postures_of(self.body).spread(modes.mixture, unseen)
             modes = replace(
-                modes[rows], poses=spread.means, covariances=spread.covariances,
+                modes[self._sources], poses=spread.means, covariances=spread.covariances,
                 log_weights=np.log(spread.weights),
-                identities=modes.identities[rows] + (postures << OF_POSTURE),
+                identities=modes.identities[self._sources] + (postures << OF_POSTURE),
             )  # fmt: skip
-        if before is not None and modes.origins.shape[1]:
-            weights = np.exp(before.log_weights)
-            share = weights / np.bincount(sources, weights)[sources]
-            modes = replace(modes, origins=modes.origins[:, sources] * share)
-        self._published = modes
+        if modes.origins.shape[1]:
+            share = weights / np.bincount(before, weights)[before]
+            modes = replace(modes, origins=modes.origins[:, before] * share)
+        self._shown = modes
 
     def _best_of_the_other_way(self, poses: Array, log_weights: Array) -> list[int]:
         """The heaviest of poses (N, d) that faces the other way than the heaviest of all, if any.

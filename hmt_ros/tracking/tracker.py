@@ -207,9 +207,9 @@ class Tracker:
         keypoints = self._lifted(keypoints, stamp)
         near, dt = None, 0.0
         if self._followed is not None and not self._track.lost:
-            near, dt = self._track.modes.poses, seconds(stamp - self._followed)
+            near, dt = self.modes.poses, seconds(stamp - self._followed)
         view = self._observer.view(
-            image, keypoints, mask, self._track.body, near, dt,
+            image, keypoints, mask, self.body, near, dt,
             predicted=False if nobody_predicted else True if prediction is not None else None,
             others=others, depth=depth,
         )  # fmt: skip
@@ -315,6 +315,15 @@ class Tracker:
         Raises:
             ValueError: there is no track.
         """
+        return self._track.modes
+
+    @property
+    def published(self) -> Modes:
+        """The modes of the posterior: limbs that no image shows are as people hold them.
+
+        Raises:
+            ValueError: there is no track.
+        """
         return self._track.published
 
     @property
@@ -347,7 +356,7 @@ class Tracker:
         """
         assert self._followed is not None
         weights = self.posterior.weights
-        return Forecaster(self.modes, weights, self.body, self.settings.motion, self._followed)
+        return Forecaster(self.published, weights, self.body, self.settings.motion, self._followed)
 
     @property
     def origins(self) -> Array:
@@ -359,7 +368,8 @@ class Tracker:
         Raises:
             ValueError: there is no track.
         """
-        return np.eye(len(self.modes)) if self._foreseen else self.modes.origins
+        modes = self.published
+        return np.eye(len(modes)) if self._foreseen else modes.origins
 
     @property
     def velocities(self) -> Array | None:
@@ -367,13 +377,13 @@ class Tracker:
 
         They are unknown in the first image of a track, and where poses walk randomly.
         """
-        velocities = self.modes.velocities
+        velocities = self.published.velocities
         return velocities if velocities.any() else None
 
     @property
     def posterior(self) -> GaussianMixture:
         """The present posterior."""
-        return self.modes.mixture
+        return self.published.mixture
 
     def _move_camera(self, stamp: int) -> None:
         """Carries the estimates into the camera frame of the next image; takes newer gravity."""
@@ -382,7 +392,7 @@ class Tracker:
         if motion is not None:
             self._ground.carry(motion)
             self._seen.carry(motion.rotation)
-            self._point.carry(self._track.body, motion)
+            self._point.carry(self.body, motion)
             if self._track.begun:
                 self._track.carry(motion)
         newer, self._newer_gravity = self._newer_gravity, None
@@ -399,7 +409,7 @@ class Tracker:
         if self._lifter is not None:
             self._seen.add(keypoints, seconds(stamp))
             begun = self._track.begun
-            person = self._lifter.proportions(self._track.body) if begun else None
+            person = self._lifter.proportions(self.body) if begun else None
             opinions.append(self._seen.lift(self._lifter, self.vertical, person))
         if keypoints.positions is not None:
             opinions.append(lifted_positions(self.camera, keypoints))
@@ -431,7 +441,7 @@ class Tracker:
         """See `step`."""
         masked, existence, self._foreseen = mask is not None, self._existence, False
         if self._track.begun:
-            existence.look(view, stamp, self._track.body)
+            existence.look(view, stamp, self.body)
             if existence.nobody:
                 self._nobody = True
                 self._drop_track()
@@ -442,7 +452,7 @@ class Tracker:
                 return self._expected(stamp), self._likelihood(Observation())
             if existence.elsewhere:
                 view = self._observer.seen_anywhere(view, mask)
-            observation = self._observe(view, self._track.modes.poses[0])
+            observation = self._observe(view, self.modes.poses[0])
             self._follow(observation, stamp, prediction)
         else:
             begun = self._start_track(view, stamp, prediction, masked=masked)
@@ -450,23 +460,21 @@ class Tracker:
                 return None, None
             observation = begun
         if not masked:
-            likely = self._track.modes.log_weights > -LIKELY
-            poses = self._track.modes.poses[likely]
-            self.silhouettes.complete(view.image, self._track.body, self.camera, poses)
+            likely = self.modes.log_weights > -LIKELY
+            poses = self.modes.poses[likely]
+            self.silhouettes.complete(view.image, self.body, self.camera, poses)
         dt = 0.0 if self._followed is None else seconds(stamp - self._followed)
         if self.settings.ground.on:
             resting = min(self.contacts.values(), default=RESTING)
-            self._ground.update(self._track.body, self._track.modes, resting, dt)
-        follows = self._track.modes.origins.shape[1] > 0
+            self._ground.update(self.body, self.modes, resting, dt)
+        follows = self.modes.origins.shape[1] > 0
         # The motion takes in one image after another, so each with its own covariance alone.
-        found = self._track.modes.mixture
+        found = self.modes.mixture
         found = replace(found, covariances=found.covariances / TOGETHER)
-        self._point.update(self._track.body, self._track.dynamics, found, dt if follows else None)
+        self._point.update(self.body, self._track.dynamics, found, dt if follows else None)
         self._observer.last_image, self._followed = view.image, stamp
         if self._existence.seen:
-            self._existence.learn(
-                view, stamp, self._track.body, self.camera, self._track.modes.poses[0]
-            )
+            self._existence.learn(view, stamp, self.body, self.camera, self.modes.poses[0])
         self.evaluations = self._track.evaluations
         return self.posterior, self._likelihood(observation)
 
@@ -485,7 +493,7 @@ class Tracker:
         self._existence.look(
             view if known else view._replace(anywhere=None, silhouette=None),
             stamp,
-            self._track.body,
+            self.body,
             waiting=True,
         )
         somebody = self._existence.somebody and self._existence.llr > 0.0
@@ -501,7 +509,7 @@ class Tracker:
             self._begin(near, arrived, stamp)
         else:
             beginning = self._starts.first(
-                view, stamp, self._track.body, self._gravity, prediction,
+                view, stamp, self.body, self._gravity, prediction,
                 lambda: self._observe(view, None), masked=masked, somebody=somebody,
             )  # fmt: skip
             if beginning is None:
@@ -524,9 +532,9 @@ class Tracker:
             if not somebody:
                 # The start itself says that somebody is there.
                 self._existence = Existence(GIVEN)
-                pose = self._track.modes.poses[0]
-                self._existence.learn(view, stamp, self._track.body, self.camera, pose)
-                self._existence.look(view, stamp, self._track.body)
+                pose = self.modes.poses[0]
+                self._existence.learn(view, stamp, self.body, self.camera, pose)
+                self._existence.look(view, stamp, self.body)
         self.track_id += 1
         self._starts.box, self._nobody = None, False
         return observation
@@ -534,7 +542,7 @@ class Tracker:
     def _expected(self, stamp: int) -> GaussianMixture:
         """The posterior of a time at which nothing is seen."""
         assert self._followed is not None
-        self._point.expect(self._track.body, self._track.dynamics, seconds(stamp - self._followed))
+        self._point.expect(self.body, self._track.dynamics, seconds(stamp - self._followed))
         return self.forecaster.at(stamp)
 
     def _begin(self, observation: Observation, beginning: Beginning, stamp: int) -> None:
@@ -559,9 +567,7 @@ class Tracker:
         self, observation: Observation, prediction: PosePrediction | None
     ) -> Array | None:
         """See `poses_to_search`."""
-        return poses_to_search(
-            self._track.body, self.camera, observation, prediction, self._gravity
-        )
+        return poses_to_search(self.body, self.camera, observation, prediction, self._gravity)
 
     def _observe(self, view: View, pose: Array | None) -> Observation:
         """The evidence of an image about a person near a pose (d,), if the pose is known."""
