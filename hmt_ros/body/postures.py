@@ -63,10 +63,12 @@ class Postures:
         log_shares = np.log(self.shares) - 0.5 * (offsets**2 / total + np.log(total)).sum(2)
         if not differs[hidden].any():
             log_shares[:, 1:] = -np.inf
-        shares = np.exp(log_shares - np.logaddexp.reduce(log_shares, axis=1)[:, None])
-        weights = modes.normalised().weights[:, None] * shares
-        likeliest = np.arange(len(self.shares)) == shares.argmax(1)[:, None]
-        rows, postures = np.nonzero((weights >= LIGHTEST) | likeliest)
+        shares = np.exp(log_shares - log_shares.max(1)[:, None])
+        weights = modes.normalised().weights[:, None]
+        kept = weights * shares >= LIGHTEST * shares.sum(1)[:, None]
+        shares[~kept & (shares < 1.0)] = 0.0
+        weights = weights * shares / shares.sum(1)[:, None]
+        rows, postures = np.nonzero(weights)
         order = np.argsort(-weights[rows, postures], kind='stable')
         rows, postures = rows[order], postures[order]
         means, covariances = modes.means[rows], modes.covariances[rows]
@@ -78,8 +80,7 @@ class Postures:
         covariances[:, hidden, :] = covariances[:, :, hidden] = 0.0
         covariances[:, hidden, hidden] = own * (1.0 - left)
         covariances += self._swaying(means, np.where(spine, unseen, 0.0))
-        found = GaussianMixture(weights[rows, postures], means, covariances)
-        return found.normalised(), rows, postures
+        return GaussianMixture(weights[rows, postures], means, covariances), rows, postures
 
     def _swaying(self, poses: Array, unseen: Array) -> Array:
         """Covariances (N, d, d) of a pelvis that turns below a trunk that stays where it is.
