@@ -334,7 +334,7 @@ def test_command_line(capsys, tmp_path, monkeypatch, timed_flips):
         'error_model, experts, flips, forecast, gate, hypotheses, joint_errors, keep_out, '
         'keypoint_noise, '
         'kernels, kjs, lifting, live, motion_prior, nodes, people, real_video, smoothing, soak, '
-        'tracking, vertical, votes'
+        'tracking, unseen, vertical, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -21,7 +21,9 @@ from hmt_ros.body.model_file import usual_postures
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.mixture import GaussianMixture
 
-# A posture of a mode that has less than this share of all is left out, unless it is the likeliest.
+# Share of the mode's own guess, which goes on from what is seen of the person; chosen on clips.
+SUPPOSED = 0.38
+# A posture in which a mode has less than this share of all is left out.
 LIGHTEST = 0.01
 # Joints that stay where they are as the pelvis turns.
 TOP = ('neck', 'left_shoulder', 'right_shoulder')
@@ -50,8 +52,8 @@ class Postures:
             unseen: (d,) time since an image has shown each angle, s; 0: this one does; inf: none.
 
         Returns:
-            A component for each mode and posture that it may be in, heaviest first, and (N,) the
-            mode and (N,) the posture of each.
+            A component for each mode, and for each posture that it may be in instead, heaviest
+            first; (N,) the mode of each, and (N,) the number of the posture, 0 for the mode's own.
         """
         spine = np.isin(self.body.skeleton.dof_segments, self.body.skeleton.spine)
         hidden, variances = np.flatnonzero((unseen > 0.0) & ~spine), self.sigmas**2
@@ -63,22 +65,23 @@ class Postures:
         log_shares = np.log(self.shares) - 0.5 * (offsets**2 / total + np.log(total)).sum(2)
         if not differs[hidden].any():
             log_shares[:, 1:] = -np.inf
-        shares = np.exp(log_shares - log_shares.max(1)[:, None])
+        shares = np.exp(log_shares - np.logaddexp.reduce(log_shares, axis=1)[:, None])
+        shares = np.insert((1.0 - SUPPOSED) * shares, 0, SUPPOSED, axis=1)
         weights = modes.normalised().weights[:, None]
-        kept = weights * shares >= LIGHTEST * shares.sum(1)[:, None]
-        shares[~kept & (shares < 1.0)] = 0.0
+        shares[(weights * shares < LIGHTEST) & (np.arange(shares.shape[1]) > 0)] = 0.0
         weights = weights * shares / shares.sum(1)[:, None]
         rows, postures = np.nonzero(weights)
         order = np.argsort(-weights[rows, postures], kind='stable')
         rows, postures = rows[order], postures[order]
         means, covariances = modes.means[rows], modes.covariances[rows]
-        middle, own = self.means[postures][:, hidden], variances[postures][:, hidden]
-        left = own / (own + noise[rows][:, hidden])
-        moved = middle + left * (means[:, hidden] - middle)
-        limits = self.body.lower[hidden], self.body.upper[hidden]
-        means[:, hidden] = np.clip(moved, *limits)
-        covariances[:, hidden, :] = covariances[:, :, hidden] = 0.0
-        covariances[:, hidden, hidden] = own * (1.0 - left)
+        others = np.flatnonzero(postures)
+        place, at = np.ix_(others, hidden), postures[others] - 1
+        middle, own = self.means[at][:, hidden], variances[at][:, hidden]
+        left = own / (own + noise[rows[others]][:, hidden])
+        moved = middle + left * (means[place] - middle)
+        means[place] = np.clip(moved, self.body.lower[hidden], self.body.upper[hidden])
+        covariances[place] = covariances.swapaxes(1, 2)[place] = 0.0
+        covariances[others[:, None], hidden, hidden] = own * (1.0 - left)
         covariances += self._swaying(means, np.where(spine, unseen, 0.0))
         return GaussianMixture(weights[rows, postures], means, covariances), rows, postures
 
