@@ -38,9 +38,9 @@ from hmt_ros.tracking.keep_out import keep_out_capsules
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-CLIPS = ('walk', 'charleston', 'signals', 'wander', 'laugh', 'window')
-WAIST, KNEES, PILLAR, WHOLE = 'waist', 'knees', 'pillar', 'whole'
-CUTS = (WAIST, KNEES, PILLAR, WHOLE)
+CLIPS = ('walk', 'signals', 'wander', 'laugh', 'window')
+WAIST, KNEES, PILLAR = 'waist', 'knees', 'pillar'
+CUTS = (WAIST, KNEES, PILLAR)
 JOINTS_AT = {WAIST: ('left_hip', 'right_hip'), KNEES: ('left_knee', 'right_knee')}
 RATE, SEED, SAMPLES, HELD = 8.0, 0, 200, 0.9
 # Images after the start that are not scored, half width of the pillar against the height of the
@@ -71,7 +71,7 @@ def hidden_area(clip: Clip, cut: str) -> Mask:
         middle = float(np.median(side))
         first, last = (int(middle + s * HALF * extent) for s in (-1, 1))
         area[:, max(first, 0) : max(last, 0)] = True
-    elif cut != WHOLE:
+    else:
         rows = every[:, [names.index(x) for x in JOINTS_AT[cut]], 1]
         area[max(int(np.median(rows)), 0) :] = True
     return area

@@ -21,8 +21,9 @@ from hmt_ros.body.model_file import usual_postures
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Share of the mode's own guess, which goes on from what is seen of the person; chosen on clips.
-SUPPOSED = 0.38
+# Share of the mode's own guess, which goes on from what is seen of the person, where a limb has not
+# been seen for much longer than the time, s; before it is larger. Chosen on clips.
+SUPPOSED, FORGOTTEN = 0.5, 1.0
 # A posture in which a mode has less than this share of all is left out.
 LIGHTEST = 0.01
 # Joints that stay where they are as the pelvis turns.
@@ -66,7 +67,8 @@ class Postures:
         if not differs[hidden].any():
             log_shares[:, 1:] = -np.inf
         shares = np.exp(log_shares - np.logaddexp.reduce(log_shares, axis=1)[:, None])
-        shares = np.insert((1.0 - SUPPOSED) * shares, 0, SUPPOSED, axis=1)
+        other = (1.0 - SUPPOSED) * -np.expm1(-unseen.max() / FORGOTTEN)
+        shares = np.insert(other * shares, 0, 1.0 - other, axis=1)
         weights = modes.normalised().weights[:, None]
         shares[(weights * shares < LIGHTEST) & (np.arange(shares.shape[1]) > 0)] = 0.0
         weights = weights * shares / shares.sum(1)[:, None]

@@ -55,6 +55,10 @@ class UnseenLimbs:
         times[list(body.skeleton.spine)], times[0] = self.times[0], 0.0
         return times[body.skeleton.dof_segments]
 
+    def shown_joints(self, body: Body) -> Mask:
+        """Joints (J,) that the last image shows."""
+        return np.asarray(self.times[body.skeleton.joint_segments] == 0.0)
+
     def told(self, body: Body) -> Body:
         """The body, whose unseen joints err more: bones may be longer, and joints move on arcs."""
         hidden = self.times > 0.0

@@ -395,8 +395,7 @@ class MixtureFilter:
         poses = optimised.minima.x
         best = poses[int(np.argmax(log_weights))]
         self.limbs.look(self.body, self.camera, observation, best, self._dt)
-        shown = self.limbs.times[self.body.skeleton.joint_segments] == 0.0
-        joints = self.body.relative_joints(poses)[:, shown]
+        joints = self.body.relative_joints(poses)[:, self.limbs.shown_joints(self.body)]
         kept = choose_hypotheses(
             joints,
             log_weights,

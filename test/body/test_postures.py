@@ -101,7 +101,9 @@ def test_knees_that_are_seen_tell_who_sits(body, modes):
     assert spread.weights[which == sitting + 1].sum() > 0.9 * spread.weights[which > 0].sum()
 
 
-@pytest.mark.parametrize(('seconds', 'least', 'most'), [(1e-4, 0.03, 0.05), (0.1, 0.1, 0.3)])
+@pytest.mark.parametrize(
+    ('seconds', 'least', 'most'), [(1e-4, 0.03, 0.04), (0.1, 0.05, 0.2), (9.0, 0.2, 0.8)]
+)
 def test_what_was_seen_a_moment_ago_is_known_still(body, modes, seconds, least, most):
     knee = body.dof_names.index('left_knee')
     spread, _, _ = postures_of(body).spread(modes, times(body, ('left_knee',), seconds))

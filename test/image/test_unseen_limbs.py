@@ -50,7 +50,7 @@ SHINS = ('left_knee', 'right_knee', 'left_ankle', 'right_ankle')
     ('without', 'names'),
     [
         ((), set()),
-        (('ankle', 'toe'), {x for x in SHINS}),
+        (('ankle', 'toe'), set(SHINS)),
         (('left_wrist', 'left_hand'), {'left_elbow', 'left_wrist'}),
         (('toe', 'hand'), set()),
         (('elbow',), set()),
