@@ -25,7 +25,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 # been seen for much longer than the time, s; before it is larger. Chosen on clips.
 SUPPOSED, FORGOTTEN = 0.5, 1.0
 # A posture in which a mode has less than this share of all is left out.
-LIGHTEST = 0.01
+LIGHTEST = 0.006
 # Joints that stay where they are as the pelvis turns.
 TOP = ('neck', 'left_shoulder', 'right_shoulder')
 
