@@ -18,7 +18,9 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Mask
 
 # Confidence below which a keypoint is a guess.
-GUESSED = 0.1
+GUESSED = 0.02
+# Time for which it still matters where an unseen limb may be, s.
+SHORT = 1.0
 # Error of an unseen joint for each bone of its limb, as a share of its length: by the lengths
 # of people, and by what a linear map misses within a posture.
 ALONG_LIMB = 0.08
@@ -56,8 +58,8 @@ class UnseenLimbs:
         return times[body.skeleton.dof_segments]
 
     def shown_joints(self, body: Body) -> Mask:
-        """Joints (J,) that the last image shows."""
-        return np.asarray(self.times[body.skeleton.joint_segments] == 0.0)
+        """Joints (J,) that an image has shown a short time ago."""
+        return np.asarray(self.times[body.skeleton.joint_segments] < SHORT)
 
     def told(self, body: Body) -> Body:
         """The body, whose unseen joints err more: bones may be longer, and joints move on arcs."""

@@ -76,7 +76,7 @@ def test_keypoints_outside_the_image_and_guesses_show_nothing(body, pose):
     knees = int(whole.pixels[body.joint_names.index('left_knee'), 1])
     cut = unseen_after(body, pose, camera_to(knees - 5), Observation(keypoints=whole))
     assert cut >= {'left_hip_x', 'right_hip_x', 'left_knee'}
-    guessed = keypoints(body, pose, confidence=0.05)
+    guessed = keypoints(body, pose, confidence=0.01)
     assert 'left_hip_x' in unseen_after(body, pose, camera_to(240), Observation(keypoints=guessed))
 
 
