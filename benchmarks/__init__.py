@@ -37,6 +37,7 @@ BENCHMARKS = {
     'soak': 'nodes and files under load and fault',
     'strangers': 'files of other programs, as their commands take them',
     'tracking': 'accuracy, calibration and speed of the tracker on clips with known truth',
+    'unseen': 'what is said of limbs that no image shows',
     'vertical': 'how well the lines of a scene tell which way is up, and what a look costs',
     'votes': 'which chain to flip or to search, by the vote that chooses it',
 }

@@ -27,6 +27,7 @@ from benchmarks import (
     nodes,
     real_video,
     rolled,
+    unseen,
     vertical,
     votes,
 )
@@ -38,6 +39,7 @@ from benchmarks.stages import StageClock
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.flips.interpretation_tree import enumerate_flips
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Status
@@ -335,7 +337,7 @@ def test_command_line(capsys, tmp_path, monkeypatch, timed_flips):
         'error_model, experts, flips, forecast, gate, hypotheses, joint_errors, keep_out, '
         'keypoint_noise, '
         'kernels, kjs, lifting, live, motion_prior, nodes, people, real_video, smoothing, soak, '
-        'tracking, vertical, votes'
+        'tracking, unseen, vertical, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -658,3 +660,33 @@ def test_errors_of_joints_are_found_so_that_regions_hold():
         assert one['absolute'] == pytest.approx(one['relative'], abs=0.03)
     text = joint_errors.as_text({'shares': found}, markdown=True)
     assert text.count('\n|') == 1 + len(joint_errors.SHARES)
+
+
+def test_cut_clips_hide_what_is_below_or_beside(clip):
+    stamp = clip.stamps[0]
+    names = list(clip.truth.joint_names)
+    ankles = [names.index(f'{side}_ankle') for side in ('left', 'right')]
+    for cut in (unseen.WAIST, unseen.KNEES):
+        shorter, area = unseen.cut_clip(clip, cut)
+        rows = shorter.camera.height
+        assert shorter.images[0].shape[0] == rows < clip.camera.height
+        assert area[rows:].all()
+        assert not area[:rows].any()
+        assert unseen.is_hidden(area, clip.pixels[stamp][ankles]).all()
+        assert not unseen.is_hidden(area, clip.pixels[stamp][[names.index('neck')]]).any()
+    covered, area = unseen.cut_clip(clip, unseen.PILLAR)
+    assert covered.images[0].shape == clip.images[0].shape
+    assert (covered.images[0][area] == unseen.GREY).all()
+    assert (covered.images[0][~area] == clip.images[0][~area]).all()
+    assert unseen.is_hidden(area, np.array([[-5.0, 3.0], [np.nan, np.nan]])).all()
+
+
+def test_hidden_keypoints_are_not_seen():
+    area = np.zeros((10, 10), dtype=bool)
+    area[5:] = True
+    names, pixels = (
+        ('neck', 'left_hip', 'left_knee'),
+        np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 7.0]]),
+    )
+    keypoints = Keypoints(names, pixels, np.tile(np.eye(2), (3, 1, 1)), np.ones(3))
+    assert unseen.shown(keypoints, area, {'left_hip'}).seen.tolist() == [True, False, False]

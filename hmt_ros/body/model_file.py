@@ -106,6 +106,12 @@ def usual_symmetries() -> Mapping[str, float]:
     return result
 
 
+def usual_postures() -> Mapping[str, Mapping[str, Any]]:
+    """The table of human37, see `body.postures`; other bodies have what they share with it."""
+    result: Mapping[str, Mapping[str, Any]] = _shipped('human37')['postures']
+    return result
+
+
 def joint_errors_of(joint_names: Sequence[str], table: Mapping[str, float] | None = None) -> Array:
     """Errors (J,) of joints, m: of the joints of a table, or that of human37; see `Body`.
 
@@ -171,7 +177,7 @@ def _mount(entry: dict[str, Any]) -> Array:
 
 KEYS = {
     'name', 'lengths', 'stature_spread', 'stature', 'stature_extra', 'segments', 'joints',
-    'chains', 'fixed', 'symmetries', 'joint_errors',
+    'chains', 'fixed', 'symmetries', 'joint_errors', 'postures',
 }  # fmt: skip
 SEGMENT_KEYS = {
     'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',

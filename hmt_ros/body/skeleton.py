@@ -132,6 +132,15 @@ class Skeleton:
         }
 
     @cached_property
+    def spine(self) -> tuple[int, ...]:
+        """Segments between the pelvis and the neck, from above."""
+        ends = [s for s, name in zip(self.joint_segments, self.joint_names) if name == 'neck']
+        found = [int(s) for s in ends]
+        while found and self.parents[found[-1]] > 0:
+            found.append(self.parents[found[-1]])
+        return tuple(found[1:])
+
+    @cached_property
     def chain_joints(self) -> dict[str, Index]:
         """Joints that the segments of each chain carry."""
         return {

@@ -229,13 +229,13 @@ def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
         track.waiting.stamp_ns,
         frame,
         joint_positions=positions,
-        log_likelihoods=tracker.modes.log_likelihoods,
+        log_likelihoods=tracker.published.log_likelihoods,
         state=_state(tracker),
         track_id=tracker.track_id,
         existence_probability=tracker.existence_probability,
         cue_probabilities=_in_range(tracker.validity.shown),
         reason=tracker.reason,
-        identities=tracker.modes.identities,
+        identities=tracker.published.identities,
         velocities=velocities,
     )
 

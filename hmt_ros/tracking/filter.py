@@ -17,10 +17,12 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.mirror import faces_back
 from hmt_ros.body.pose_terms import FrameTerm
+from hmt_ros.body.postures import postures_of
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.unseen_limbs import UnseenLimbs
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
@@ -68,6 +70,8 @@ from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_
 FIRST_FITS = 3
 # Number of the heaviest modes that the shape is estimated from.
 SHAPED = 4
+# Bits of an identity below the number of the posture of unseen limbs.
+OF_POSTURE = 20
 
 
 class MixtureFilter:
@@ -104,6 +108,10 @@ class MixtureFilter:
         self.misfit = 0.0
         self._rng = np.random.default_rng(seed)
         self._modes: Modes | None = None
+        # The modes that are published, and the mode that each comes from.
+        self._shown: Modes | None = None
+        self._sources: Index = np.empty(0, dtype=np.intp)
+        self.limbs = UnseenLimbs(body)
         self._identities = Identities()
         self.shape = ShapeEstimate(body)
         self.validity = Validity()
@@ -136,6 +144,15 @@ class MixtureFilter:
         if self._modes is None:
             raise ValueError('there is no track yet')
         return self._modes
+
+    @property
+    def published(self) -> Modes:
+        """The present modes, where limbs that no image shows are as people hold them.
+
+        Raises:
+            ValueError: there is no track.
+        """
+        return self._shown or self.modes
 
     @property
     def dynamics(self) -> LinearGaussianDynamics:
@@ -233,6 +250,7 @@ class MixtureFilter:
     def carry(self, motion: CameraMotion) -> None:
         """Takes everything that has a place into the camera frame of the next image."""
         self._modes = motion.modes(self.body, self.modes)
+        self._shown = motion.modes(self.body, self.published)
         self._facing.carry(self.body, self._modes.poses)
         if self._by_keypoints.pose is not None:
             self._by_keypoints.pose = motion.poses(self.body, self._by_keypoints.pose)
@@ -375,7 +393,9 @@ class MixtureFilter:
         """
         s = self.settings
         poses = optimised.minima.x
-        joints = self.body.relative_joints(poses)
+        best = poses[int(np.argmax(log_weights))]
+        self.limbs.look(self.body, self.camera, observation, best, self._dt)
+        joints = self.body.relative_joints(poses)[:, self.limbs.shown_joints(self.body)]
         kept = choose_hypotheses(
             joints,
             log_weights,
@@ -395,12 +415,30 @@ class MixtureFilter:
             posterior.likelihood, observation, modes.poses,
             posterior.exchanges_of(selected.hypotheses),
         )  # fmt: skip
+        self._publish(modes)
         self._outline_costs = posterior.fit(modes.poses, observation).outline_costs
         self._points = None
         seen = observation.foreground is not None and s.likelihood.coverage.weight > 0
         if s.flow_weight > 0 or seen:
             self._points = posterior.seen_points(modes.poses, observation)
         self._facing.lead(self.body, modes.poses)
+
+    def _publish(self, modes: Modes) -> None:
+        """Makes the modes that are published, and what they come from in the image before."""
+        before, self._sources = self._sources, np.arange(len(modes))
+        weights = np.exp(self._shown.log_weights) if self._shown else np.ones(len(before))
+        unseen = self.limbs.of_dofs(self.body)
+        if unseen.any():
+            spread, self._sources, postures = postures_of(self.body).spread(modes.mixture, unseen)
+            modes = replace(
+                modes[self._sources], poses=spread.means, covariances=spread.covariances,
+                log_weights=np.log(spread.weights),
+                identities=modes.identities[self._sources] + (postures << OF_POSTURE),
+            )  # fmt: skip
+        if modes.origins.shape[1]:
+            share = weights / np.bincount(before, weights)[before]
+            modes = replace(modes, origins=modes.origins[:, before] * share)
+        self._shown = modes
 
     def _best_of_the_other_way(self, poses: Array, log_weights: Array) -> list[int]:
         """The heaviest of poses (N, d) that faces the other way than the heaviest of all, if any.

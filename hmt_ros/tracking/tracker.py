@@ -278,7 +278,7 @@ class Tracker:
     @property
     def body(self) -> Body:
         """The person, with the present estimate of lengths and flesh."""
-        return self._track.body
+        return self._track.limbs.told(self._track.body)
 
     @property
     def ground(self) -> Ground:
@@ -364,6 +364,15 @@ class Tracker:
         return self._track.modes
 
     @property
+    def published(self) -> Modes:
+        """The modes of the posterior: limbs that no image shows are as people hold them.
+
+        Raises:
+            ValueError: there is no track.
+        """
+        return self._track.published
+
+    @property
     def point_estimate(self) -> Array:
         """The pose (d,) of the likeliest motion; see `PointEstimate`.
 
@@ -410,7 +419,7 @@ class Tracker:
         """
         assert self._followed is not None
         weights = self.posterior.weights
-        return Forecaster(self.modes, weights, self.body, self.settings.motion, self._followed)
+        return Forecaster(self.published, weights, self.body, self.settings.motion, self._followed)
 
     @property
     def origins(self) -> Array:
@@ -422,7 +431,8 @@ class Tracker:
         Raises:
             ValueError: there is no track.
         """
-        return np.eye(len(self.modes)) if self._foreseen else self.modes.origins
+        modes = self.published
+        return np.eye(len(modes)) if self._foreseen else modes.origins
 
     @property
     def velocities(self) -> Array | None:
@@ -430,12 +440,13 @@ class Tracker:
 
         They are unknown in the first image of a track, and where poses walk randomly.
         """
-        return self.modes.velocities if self.modes.velocities.any() else None
+        velocities = self.published.velocities
+        return velocities if velocities.any() else None
 
     @property
     def posterior(self) -> GaussianMixture:
         """The present posterior."""
-        return self.modes.mixture
+        return self.published.mixture
 
     def _move_camera(self, stamp: int) -> None:
         """Carries the estimates into the camera frame of the next image; takes newer gravity."""
@@ -475,7 +486,8 @@ class Tracker:
 
     def _stand_upright(self) -> None:
         """Levels the body by what is known of gravity, before a track starts."""
-        before, body = self.body, self.body.levelled(self._ground.level)
+        before = self._track.body
+        body = before.levelled(self._ground.level)
         if body is not before:
             self._track = self._new_track(body)
             if isinstance(self._given, GaussianMixture):
@@ -488,7 +500,7 @@ class Tracker:
 
     def _drop_track(self, body: Body | None = None) -> None:
         """Keeps nothing but the body, or takes another one."""
-        self._track = self._new_track(body or self.body)
+        self._track = self._new_track(body or self._track.body)
         self._point = PointEstimate()
         self._ground.reset()
         self._observer.last_image, self._followed = None, None
@@ -535,7 +547,8 @@ class Tracker:
             self._ground.update(self.body, self.modes, resting, dt)
         follows = self.modes.origins.shape[1] > 0
         # The motion takes in one image after another, so each with its own covariance alone.
-        found = replace(self.posterior, covariances=self.modes.covariances / TOGETHER)
+        found = self.modes.mixture
+        found = replace(found, covariances=found.covariances / TOGETHER)
         self._point.update(self.body, self._track.dynamics, found, dt if follows else None)
         self._observer.last_image, self._followed = view.image, stamp
         if self._existence.seen:
@@ -576,11 +589,11 @@ class Tracker:
             near = replace(
                 observation, magnification=self.camera.magnification(float(np.median(poses[:, 2])))
             )
-            arrived = Beginning(Source.ARRIVAL, self.body, poses)
+            arrived = Beginning(Source.ARRIVAL, self._track.body, poses)
             self._begin(near, arrived, stamp)
         else:
             shown = Shown(
-                view, stamp, self.model.levelled(self.body.level), self.body, self.camera,
+                view, stamp, self.model.levelled(self.body.level), self._track.body, self.camera,
                 self._gravity, self._given, self._box, prediction, masked,
                 lambda: self._observe(view, None),
             )  # fmt: skip

@@ -92,6 +92,10 @@ class StubTracker:
         return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]), identities=identities)
 
     @property
+    def published(self):
+        return self.modes
+
+    @property
     def forecaster(self):
         """To the right by 1 m/s."""
         stamp, before = self.seen[-1][0], self.posterior

@@ -50,6 +50,10 @@ class Follower(StubTracker):
         )  # fmt: skip
 
     @property
+    def published(self):
+        return self.modes
+
+    @property
     def point_estimate(self):
         return self.pose
 

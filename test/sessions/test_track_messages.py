@@ -49,7 +49,7 @@ def track(body):
         status=Status.TRACKING,
         track_id=1,
         existence_probability=0.75,
-        modes=SimpleNamespace(
+        published=SimpleNamespace(
             log_likelihoods=np.array([-3.0, -2.0, -1.0]), identities=np.arange(1, 4)
         ),
         log_likelihoods=np.array([-2.5, -1.5]),
@@ -197,7 +197,7 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
     other = changed(
         track,
         body=body,
-        modes=SimpleNamespace(log_likelihoods=np.zeros(2), identities=np.arange(2)),
+        published=SimpleNamespace(log_likelihoods=np.zeros(2), identities=np.arange(2)),
         log_likelihoods=np.zeros(2),
         shape_covariance=np.zeros((body.dimension, body.dimension)),
         point_estimate=poses[1],

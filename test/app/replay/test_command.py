@@ -109,6 +109,10 @@ class StandingStill:
     def modes(self):
         return self
 
+    @property
+    def published(self):
+        return self.modes
+
     log_likelihoods, identities, velocities = np.zeros(1), np.ones(1, dtype=int), None
     forecaster, foreseen, nobody_shown = None, False, False
 

@@ -1,0 +1,124 @@
+"""How people hold limbs that no image shows: standing, striding, sitting, kneeling.
+
+    p(x) = sum_c q_c prod_i N(x_i; m_ci, s_ci^2)                    angles i of the limbs
+    y_i ~ N(x_i, S_ii + b_i t_i)                                    where a mode says that they are
+
+The modes (y, S) of a tracker say where a limb is that an image shows. Of another one they know less
+and less, as its angles wander at the rates b of the body for the time t since it was seen last, and
+nothing where it never was. Postures are narrow, so that within one a linear map from angles to
+joints is good enough.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.mirror import mirror_order
+from hmt_ros.body.model_file import usual_postures
+from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.mixture import GaussianMixture
+
+# Share of the mode's own guess, which goes on from what is seen of the person, where a limb has not
+# been seen for much longer than the time, s; before it is larger. Chosen on clips.
+SUPPOSED, FORGOTTEN = 0.5, 1.0
+# A posture in which a mode has less than this share of all is left out.
+LIGHTEST = 0.006
+# Joints that stay where they are as the pelvis turns.
+TOP = ('neck', 'left_shoulder', 'right_shoulder')
+
+
+@dataclass(frozen=True, eq=False)
+class Postures:
+    """P postures of a body.
+
+    Attributes:
+        body: whose angles.
+        shares: (P,) how often people are in each; they sum to 1.
+        means, sigmas: (P, d) of the degrees of freedom.
+    """
+
+    body: Body
+    shares: Array
+    means: Array
+    sigmas: Array
+
+    def spread(self, modes: GaussianMixture, unseen: Array) -> tuple[GaussianMixture, Index, Index]:
+        """Modes whose unseen angles spread as people's do.
+
+        Args:
+            modes: K of them over poses (d,).
+            unseen: (d,) time since an image has shown each angle, s; 0: this one does; inf: none.
+
+        Returns:
+            A component for each mode, and for each posture that it may be in instead, heaviest
+            first; (N,) the mode of each, and (N,) the number of the posture, 0 for the mode's own.
+        """
+        spine = np.isin(self.body.skeleton.dof_segments, self.body.skeleton.spine)
+        hidden, variances = np.flatnonzero((unseen > 0.0) & ~spine), self.sigmas**2
+        noise = np.einsum('kii->ki', modes.covariances) + self.body.rates * unseen
+        differs = np.ptp(self.means, axis=0) > 0.0
+        told = differs & np.isfinite(unseen)
+        total = noise[:, None, told] + variances[:, told]
+        offsets = modes.means[:, None, told] - self.means[:, told]
+        log_shares = np.log(self.shares) - 0.5 * (offsets**2 / total + np.log(total)).sum(2)
+        if not differs[hidden].any():
+            log_shares[:, 1:] = -np.inf
+        shares = np.exp(log_shares - np.logaddexp.reduce(log_shares, axis=1)[:, None])
+        other = (1.0 - SUPPOSED) * -np.expm1(-unseen.max() / FORGOTTEN)
+        shares = np.insert(other * shares, 0, 1.0 - other, axis=1)
+        weights = modes.normalised().weights[:, None]
+        shares[(weights * shares < LIGHTEST) & (np.arange(shares.shape[1]) > 0)] = 0.0
+        weights = weights * shares / shares.sum(1)[:, None]
+        rows, postures = np.nonzero(weights)
+        order = np.argsort(-weights[rows, postures], kind='stable')
+        rows, postures = rows[order], postures[order]
+        means, covariances = modes.means[rows], modes.covariances[rows]
+        others = np.flatnonzero(postures)
+        place, at = np.ix_(others, hidden), postures[others] - 1
+        middle, own = self.means[at][:, hidden], variances[at][:, hidden]
+        left = own / (own + noise[rows[others]][:, hidden])
+        moved = middle + left * (means[place] - middle)
+        means[place] = np.clip(moved, self.body.lower[hidden], self.body.upper[hidden])
+        covariances[place] = covariances.swapaxes(1, 2)[place] = 0.0
+        covariances[others[:, None], hidden, hidden] = own * (1.0 - left)
+        covariances += self._swaying(means, np.where(spine, unseen, 0.0))
+        return GaussianMixture(weights[rows, postures], means, covariances), rows, postures
+
+    def _swaying(self, poses: Array, unseen: Array) -> Array:
+        """Covariances (N, d, d) of a pelvis that turns below a trunk that stays where it is.
+
+        The angles between them are the soft prior's, or have wandered for less time than that.
+
+        Args:
+            poses: (N, d).
+            unseen: (d,) times of these angles, s; 0 of the others.
+        """
+        skeleton = self.body.skeleton
+        own = np.flatnonzero(unseen > 0.0)
+        root = list(skeleton.segment_dofs[0])
+        top = skeleton.joint_index([x for x in skeleton.trunk_joints if x in TOP])
+        slopes = self.body.joint_jacobians(poses)[:, top].reshape(len(poses), -1, len(unseen))
+        moves = np.zeros((len(poses), len(unseen), len(own)))
+        moves[:, own, np.arange(len(own))] = 1.0
+        moves[:, root] = -np.linalg.pinv(slopes[..., root]) @ slopes[..., own]
+        drift = np.minimum(self.body.prior_sigma**2, self.body.rates * unseen)[own]
+        return np.asarray((moves * drift) @ moves.swapaxes(1, 2))
+
+
+def postures_of(body: Body) -> Postures:
+    """The postures of a body; what the table does not name is as the soft prior of the angles."""
+    names, rows = list(body.dof_names), []
+    order, signs = mirror_order(body.skeleton)
+    for entry in usual_postures().values():
+        mean, sigma = body.prior_mean.copy(), body.prior_sigma.copy()
+        for name, numbers in entry['angles'].items():
+            if name in names:
+                mean[names.index(name)], sigma[names.index(name)] = np.radians(numbers)
+        rows += [(mean, sigma, entry['share'])]
+        if entry['mirrored']:
+            rows += [(mean[order] * signs, sigma[order], entry['share'])]
+    means, sigmas, shares = map(np.array, zip(*rows, strict=True))
+    return Postures(body, shares / shares.sum(), means, sigmas)

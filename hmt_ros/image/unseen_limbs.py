@@ -1,0 +1,99 @@
+"""Which limbs an image shows, and for how long none has shown the others.
+
+A limb is shown as far out as a keypoint or the silhouette finds its joints. Without keypoints, and
+in the image, edges and flow may show it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.observation import Observation
+from hmt_ros.inference.arrays import Array, Mask
+
+# Confidence below which a keypoint is a guess.
+GUESSED = 0.02
+# Time for which it still matters where an unseen limb may be, s.
+SHORT = 1.0
+# Error of an unseen joint for each bone of its limb, as a share of its length: by the lengths
+# of people, and by what a linear map misses within a posture.
+ALONG_LIMB = 0.08
+
+
+class UnseenLimbs:
+    """For how long no image has shown the segments of a person's limbs.
+
+    Attributes:
+        times: (S,) s; 0: the last image shows the joint at its start, or one further out, or it is
+            no segment of a limb; inf: no image has.
+    """
+
+    def __init__(self, body: Body) -> None:
+        self.times: Array = np.zeros(len(body.skeleton.parents))
+
+    def look(
+        self, body: Body, camera: Camera, observation: Observation, pose: Array, dt: float
+    ) -> None:
+        """Takes in an image and the likeliest pose (d,) in it.
+
+        Args:
+            dt: time since the image before, s; inf: there is none.
+        """
+        shown = shown_segments(body, camera, observation, pose)
+        self.times = np.where(shown, 0.0, self.times + dt)
+
+    def of_dofs(self, body: Body) -> Array:
+        """Time (d,) since the degrees of freedom were shown: the joint beyond tells of them."""
+        beyond = np.arange(len(self.times))
+        for chain in body.chains.values():
+            beyond[list(chain[:-1])] = chain[1:]
+        times = self.times[beyond]
+        times[list(body.skeleton.spine)], times[0] = self.times[0], 0.0
+        return times[body.skeleton.dof_segments]
+
+    def shown_joints(self, body: Body) -> Mask:
+        """Joints (J,) that an image has shown a short time ago."""
+        return np.asarray(self.times[body.skeleton.joint_segments] < SHORT)
+
+    def told(self, body: Body) -> Body:
+        """The body, whose unseen joints err more: bones may be longer, and joints move on arcs."""
+        hidden = self.times > 0.0
+        return _told(body, tuple(hidden.tolist())) if hidden.any() else body
+
+
+@lru_cache(maxsize=8)
+def _told(body: Body, hidden: tuple[bool, ...]) -> Body:
+    skeleton, away = body.skeleton, np.zeros(len(hidden))
+    for chain in body.chains.values():
+        own = list(chain[1:])
+        away[own] = np.cumsum((skeleton.offsets[own] ** 2).sum(1))
+    more = ALONG_LIMB**2 * (away * hidden)[skeleton.joint_segments]
+    return replace(body, joint_errors=np.sqrt(body.joint_errors**2 + more))
+
+
+def shown_segments(body: Body, camera: Camera, observation: Observation, pose: Array) -> Mask:
+    """Segments (S,) that an image shows at a pose (d,), see `UnseenLimbs.times`."""
+    skeleton, size = body.skeleton, np.array([camera.width, camera.height])
+    pixels = camera.project(forward(skeleton, pose[None]).origins[..., 0])
+    shown = np.asarray(((pixels >= -0.5) & (pixels < size - 0.5)).all(1))
+    keypoints = observation.keypoints
+    if keypoints is not None:
+        inside = ((keypoints.pixels >= -0.5) & (keypoints.pixels < size - 0.5)).all(1)
+        found = np.flatnonzero(inside & (keypoints.confidences >= GUESSED))
+        joints = skeleton.joint_index([keypoints.names[i] for i in found])
+        shown = np.isin(np.arange(len(shown)), skeleton.joint_segments[joints])
+    result = np.ones_like(shown)
+    for left_or_right in body.chain_pairs:
+        for chain in left_or_right:
+            own = list(body.chains[chain])
+            result[own] = np.logical_or.accumulate(shown[own][::-1])[::-1]
+    # The pelvis is shown by a leg.
+    hung = [own[0] for own in body.chains.values() if skeleton.parents[own[0]] == 0]
+    result[0] = not hung or result[hung].any()
+    return result

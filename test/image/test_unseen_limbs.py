@@ -1,0 +1,112 @@
+"""Which limbs an image shows: by keypoints, or by being in it."""
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import Camera, load_body
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.unseen_limbs import UnseenLimbs
+
+
+@pytest.fixture(scope='module')
+def body():
+    return load_body('human37')
+
+
+@pytest.fixture(scope='module')
+def pose(body):
+    """Of a person who stands, 3 m away."""
+    result = body.prior_mean.copy()
+    result[2] = 3.0
+    return result
+
+
+def camera_to(row):
+    """A camera whose images end at a row."""
+    return Camera(330.0, 330.0, 159.5, 119.5, 320, row)
+
+
+def keypoints(body, pose, without=(), confidence=1.0):
+    pixels = camera_to(240).project(body.joint_positions(pose[None]))[0]
+    gone = np.array([any(x in name for x in without) for name in body.joint_names])
+    pixels[gone] = np.nan
+    n = len(pixels)
+    return Keypoints(
+        body.joint_names, pixels, np.tile(np.eye(2), (n, 1, 1)), np.where(gone, 0.0, confidence)
+    )
+
+
+def unseen_after(body, pose, camera, observation):
+    limbs = UnseenLimbs(body)
+    limbs.look(body, camera, observation, pose, np.inf)
+    return {x for x, t in zip(body.dof_names, limbs.of_dofs(body), strict=True) if t > 0}
+
+
+SHINS = ('left_knee', 'right_knee', 'left_ankle', 'right_ankle')
+
+
+@pytest.mark.parametrize(
+    ('without', 'names'),
+    [
+        ((), set()),
+        (('ankle', 'toe'), set(SHINS)),
+        (('left_wrist', 'left_hand'), {'left_elbow', 'left_wrist'}),
+        (('toe', 'hand'), set()),
+        (('elbow',), set()),
+    ],
+)
+def test_a_limb_is_shown_as_far_out_as_it_has_keypoints(body, pose, without, names):
+    seen = Observation(keypoints=keypoints(body, pose, without))
+    found = unseen_after(body, pose, camera_to(240), seen)
+    assert {x for x in found if x.rpartition('_')[0] in names or x in names} == found
+    assert bool(found) == bool(names)
+
+
+def test_legs_without_keypoints_leave_the_pelvis_free_to_turn(body, pose):
+    without = ('hip', 'knee', 'ankle', 'toe')
+    seen = Observation(keypoints=keypoints(body, pose, without))
+    found = unseen_after(body, pose, camera_to(240), seen)
+    assert found >= {'trunk_x', 'trunk_y', 'trunk_z', 'left_hip_x', 'right_ankle_y'}
+    assert not any(x.startswith(('root', 'neck')) or 'elbow' in x for x in found)
+
+
+def test_keypoints_outside_the_image_and_guesses_show_nothing(body, pose):
+    whole = keypoints(body, pose)
+    knees = int(whole.pixels[body.joint_names.index('left_knee'), 1])
+    cut = unseen_after(body, pose, camera_to(knees - 5), Observation(keypoints=whole))
+    assert cut >= {'left_hip_x', 'right_hip_x', 'left_knee'}
+    guessed = keypoints(body, pose, confidence=0.01)
+    assert 'left_hip_x' in unseen_after(body, pose, camera_to(240), Observation(keypoints=guessed))
+
+
+def test_without_keypoints_a_limb_in_the_image_is_shown(body, pose):
+    assert unseen_after(body, pose, camera_to(240), Observation()) == set()
+    assert 'left_knee' in unseen_after(body, pose, camera_to(150), Observation())
+
+
+def test_times_add_up_until_the_limb_is_shown_again(body, pose):
+    limbs, camera = UnseenLimbs(body), camera_to(240)
+    whole = Observation(keypoints=keypoints(body, pose))
+    cut = Observation(keypoints=keypoints(body, pose, ('ankle', 'toe')))
+    knee = body.dof_names.index('left_knee')
+    limbs.look(body, camera, whole, pose, np.inf)
+    for expected in (0.1, 0.2):
+        limbs.look(body, camera, cut, pose, 0.1)
+        assert limbs.of_dofs(body)[knee] == pytest.approx(expected)
+    limbs.look(body, camera, whole, pose, 0.1)
+    assert limbs.of_dofs(body).max() == 0.0
+
+
+def test_unseen_joints_err_by_the_lengths_of_their_bones(body, pose):
+    limbs = UnseenLimbs(body)
+    assert limbs.told(body) is body
+    seen = Observation(keypoints=keypoints(body, pose, ('knee', 'ankle', 'toe')))
+    limbs.look(body, camera_to(240), seen, pose, np.inf)
+    told = limbs.told(body)
+    more = np.sqrt(told.joint_errors**2 - body.joint_errors**2)
+    of = dict(zip(body.joint_names, more, strict=True))
+    thigh, shin = (body.segment_lengths[x] for x in ('thigh', 'shin'))
+    assert of['left_knee'] == pytest.approx(0.08 * thigh)
+    assert of['right_ankle'] == pytest.approx(0.08 * np.hypot(thigh, shin))
+    assert of['left_hip'] == of['left_wrist'] == of['head'] == 0.0
