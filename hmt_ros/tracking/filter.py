@@ -395,7 +395,7 @@ class MixtureFilter:
         poses = optimised.minima.x
         best = poses[int(np.argmax(log_weights))]
         self.limbs.look(self.body, self.camera, observation, best, self._dt)
-        joints = self.body.relative_joints(poses) * self.limbs.shown_joints(self.body)[:, None]
+        joints = self.body.relative_joints(poses)[:, self.limbs.shown_joints(self.body)]
         kept = choose_hypotheses(
             joints,
             log_weights,
