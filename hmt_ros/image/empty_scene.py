@@ -10,7 +10,8 @@ Both look like silhouettes, so what follows from them can not tell. Two other th
                                               image has the stronger edges, not the background
 
 of somebody in the scene as it was learned. Whoever is before a scene covers it, edges and all; a
-ghost has its edges in the background. Where a detector sees nobody either, it takes less time.
+ghost has its edges in the background. Where a detector sees nobody it takes less time, and what
+moves is nobody.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ class EmptyScene:
         if self.log_odds == -math.inf or detected:
             return
         dt = seconds(stamp - self._learned) if self._recent is not None else 0.0
-        if self._has_moved(image, dt):
+        if self._has_moved(image, dt) and detected is None:
             if self.seen:
                 return
             self.background, self.log_odds = BackgroundModel(self.background.settings), 0.0

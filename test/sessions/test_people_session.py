@@ -318,11 +318,19 @@ def test_arrays_of_people(session, small_camera):
 
 def test_an_empty_scene_is_learned_until_somebody_comes(session, small_camera):
     one = started(session(), small_camera)
-    for i in range(3):
+    for i in range(6):
         show(one, small_camera, i)
-    show(one, small_camera, 3, somebody_at(15))
-    show(one, small_camera, 4, somebody_at(15))
-    assert StubTracker.made[0].background.frames == 3
+    show(one, small_camera, 6, somebody_at(15))
+    show(one, small_camera, 7, somebody_at(15))
+    assert StubTracker.made[0].background.frames == 6
+
+
+def test_a_scene_that_was_hardly_seen_is_not_used(session, small_camera):
+    one = started(session(), small_camera)
+    show(one, small_camera, 0)
+    show(one, small_camera, 1, somebody_at(15))
+    show(one, small_camera, 2, somebody_at(15))
+    assert StubTracker.made[0].background.frames == 0
 
 
 def test_somebody_at_the_border(session, small_camera):

@@ -49,6 +49,7 @@ def track(body):
         status=Status.TRACKING,
         track_id=1,
         existence_probability=0.75,
+        reason='',
         published=SimpleNamespace(
             log_likelihoods=np.array([-3.0, -2.0, -1.0]), identities=np.arange(1, 4)
         ),

@@ -87,7 +87,7 @@ class StandingStill:
     def __init__(self, body, camera, settings, background, seed, **others):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
-        self.existence_probability = 1.0
+        self.existence_probability, self.reason = 1.0, ''
         self.likelihood_errors = CueErrors(0.25, 0.125)
         self.shape_covariance = np.zeros((body.dimension, body.dimension))
         self.track_id, self.started_from = 1, None
