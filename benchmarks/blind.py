@@ -57,7 +57,7 @@ from msg_tools.messages.keep_out import KeepOutState, keep_out_of
 from msg_tools.messages.keypoints import keypoints_message, keypoints_of
 
 RATES = (15.0, 8.0, 2.0, 0.5)  # images a second
-IMAGES, QUICK = 60, 12  # of a run
+IMAGES, QUICK = 30, 12  # of a run
 BEFORE, LATE, FAR = 2.0, 1.0, 0.15  # see the text above; s, s, share
 BLIND, STILL, SUBJECT, VISIT, DETECTOR = CASES = ('blind', 'still', 'subject', 'visit', 'detector')
 NOISE = 2.0  # of a scene that is shown before, grey levels

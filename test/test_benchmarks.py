@@ -333,10 +333,12 @@ def test_command_line(capsys, tmp_path, monkeypatch, timed_flips):
     assert 'tracking' in capsys.readouterr().out
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
-        "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, distance, "
+        "benchmarks: no 'flops', wanted one of absence, bags, blind, contour_noise, depth, "
+        'distance, '
         'error_model, experts, flips, forecast, gate, hypotheses, joint_errors, keep_out, '
         'keypoint_noise, '
-        'kernels, kjs, lifting, live, motion_prior, nodes, people, real_video, smoothing, soak, '
+        'kernels, kjs, lifting, live, motion_prior, nodes, people, real_clips, real_video, '
+        'rolled, smoothing, soak, strangers, '
         'tracking, unseen, vertical, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1

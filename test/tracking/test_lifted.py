@@ -43,9 +43,9 @@ def observed(tracker, monkeypatch):
     seen, observer = [], tracker._observer
     view = observer.view
 
-    def spy(image, keypoints, *arguments, **named):
+    def spy(image, stamp, keypoints, *arguments, **named):
         seen.append(keypoints)
-        return view(image, keypoints, *arguments, **named)
+        return view(image, stamp, keypoints, *arguments, **named)
 
     monkeypatch.setattr(observer, 'view', spy)
     return seen
