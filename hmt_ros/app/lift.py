@@ -61,6 +61,9 @@ from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixt
 LIFTED, REPORT = 'lifted', 'report'
 # Part of gravity along the optical axis above which poses are checked that were lifted without it.
 STEEP = 0.8
+# Ratio of a distance to the median of those within so many seconds at which it leaps, and share of
+# the images in which it may.
+LEAP, NEIGHBOURS, RARE = 1.5, 1.0, 0.05
 # Lean of the trunk above which a person lies, rad.
 LYING = np.radians(55.0)
 # Frames without an entry get an empty mixture, unless they are so many for each with one.
@@ -178,6 +181,7 @@ def _lift(arguments: argparse.Namespace) -> int:
         raise ValueError(
             f'{arguments.keypoints}: no image shows five landmarks that are known; see --scheme'
         )
+    mixtures = _with_leaps(mixtures, stamps)
     if up is not None and not nobody:
         checked = mixtures if abs(up[2]) < STEEP else lifted(None)
         _check_gravity(up, body, [one for one in checked if one is not None])
@@ -230,6 +234,41 @@ def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) ->
     if ground.reversed:
         tell_user('lift', reversed_gravity(ground.estimate.up))
     return ground.estimate.up
+
+
+def _with_leaps(
+    mixtures: Sequence[GaussianMixture | None], stamps: Sequence[int]
+) -> list[GaussianMixture | None]:
+    """Mixtures that are as uncertain of the distance as it leaps, which is told.
+
+    So little of a person may be in view that her pose, and with it the distance, is not known from
+    image to image: no one walks so fast.
+    """
+    posed = [i for i, one in enumerate(mixtures) if one is not None]
+    places = np.array([one.means[0, :3] for one in mixtures if one is not None]).reshape(-1, 3)
+    distances = np.linalg.norm(places, axis=1)
+    times = 1e-9 * np.array([stamps[i] for i in posed])
+    result, most, leaps = list(mixtures), 1.0, 0
+    for i, time, distance in zip(posed, times, distances, strict=True):
+        usual = float(np.median(distances[np.abs(times - time) <= NEIGHBOURS]))
+        ratio = max(distance / usual, usual / distance)
+        if ratio < LEAP:
+            continue
+        most, leaps = max(most, ratio), leaps + 1
+        one = mixtures[i]
+        assert one is not None
+        covariances = one.covariances.copy()
+        along = (usual / distance - 1.0) * one.means[:, :3]
+        covariances[:, :3, :3] += along[:, :, None] * along[:, None]
+        result[i] = GaussianMixture(one.weights, one.means, covariances)
+    if leaps > RARE * len(posed):
+        tell_user(
+            'lift',
+            f'the distance leaps in {leaps} of {len(posed)} images, up to {most:.1f} times: '
+            'too little of the person is seen for keypoints alone; take the images, too '
+            '(track-video), or give lengths (--subject) and --gravity',
+        )
+    return result
 
 
 def _check_gravity(up: Array, body: Body, mixtures: Sequence[GaussianMixture]) -> None:

@@ -14,6 +14,7 @@ from hmt_ros.app.rendered_bag import START_NS
 from hmt_ros.body import Camera, load_body
 from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
@@ -200,3 +201,30 @@ def test_too_few_landmarks_are_told(tmp_path, capsys):
     assert lift.main([str(path), '-o', str(tmp_path / 'out'), *USUAL]) == 1
     assert 'five landmarks' in capsys.readouterr().err
     assert lift.main([str(tmp_path / 'no.npz'), '-o', str(tmp_path / 'out'), *USUAL]) == 1
+
+
+def test_a_distance_that_leaps_is_told_and_not_trusted(capsys):
+    """One image in ten has the person ten times as far away."""
+    body = load_body('human37')
+    mean = body.prior_mean.copy()
+    mean[:3] = 0.3, 0.0, 3.0
+    covariance = 1e-3 * np.eye(body.dimension)[None]
+    mixtures = []
+    for i in range(20):
+        place = mean.copy()
+        place[:3] *= 10.0 if i % 10 == 4 else 1.0
+        mixtures.append(GaussianMixture(np.ones(1), place[None], covariance))
+    mixtures[7] = None
+    stamps = [i * 33_000_000 for i in range(20)]
+    found = lift._with_leaps(mixtures, stamps)
+    assert found[7] is None
+    assert [found[i] is mixtures[i] for i in range(20)] == [i % 10 != 4 for i in range(20)]
+    # The usual distance is one deviation away along the ray, and nothing else changed.
+    wide = found[4].covariances[0] - covariance[0]
+    assert wide[:3, :3] == pytest.approx(np.outer(9.0 * mean[:3], 9.0 * mean[:3]))
+    assert not wide[3:].any()
+    assert (
+        'the distance leaps in 2 of 19 images, by up to a factor of 10.0' in capsys.readouterr().err
+    )
+    assert lift._with_leaps([None] * 3, stamps[:3]) == [None] * 3
+    assert capsys.readouterr().err == ''
