@@ -82,6 +82,7 @@ def run_case(case: Case, cases: Path, folder: Path) -> dict[str, Any]:
         code = case.program.main([*arguments, '-o', str(folder)])
     lines = [line for line in spoken.getvalue().splitlines() if line.strip()]
     said = lines[-1] if lines else ''
+    said = said.replace(f'{cases}/', '').replace(f'{folder}/', '')
     result = {'case': case.name, 'code': code, 'said': said, 'mm': np.nan, 'images': case.images}
     if code == 0 and case.images:
         bag = folder / ('lifted' if case.program is lift else 'tracked')
