@@ -180,7 +180,7 @@ def measure(only: tuple[str, ...] = CLIPS, *, quick: bool = False) -> dict[str, 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """A table for people."""
-    rows = [['clip', 'tracked', 'nobody, falsely', 'error, mm', 'MediaPipe, mm', 'ankles +-, cm']]
+    rows = [['clip', 'tracked', 'said empty', 'error, mm', 'MediaPipe, mm', 'ankles +-, cm']]
     for one in result['rows']:
         of = one.get('seen', one['images'])
         numbers = [f'{one[x]:.0f}' if x in one else '-' for x in ('error_mm', 'detector_mm')]
