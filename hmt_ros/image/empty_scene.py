@@ -39,8 +39,9 @@ KNOWN, STILLEST, SURE = -3.5, -5.0, -14.0
 # that noise does not make, grey levels; least size of a piece that is part of a person, a share of
 # the image (in empty scenes up to 6e-5; of people who stand 2e-4 to 3e-3 in half a second).
 BLUR, MEMORY, CHANGED, PIECE = 1.5, 1.0, 10.0, 2e-4
-# N, m and the time for which errors of the outline last, s. On 10 clips u is 0.85 to 1 before the
-# empty scene, and 0.25 to 0.66 before one with the person in it. Least length of the outline, px.
+# N, m and the time for which errors of the outline last, s. On nine rendered clips u is 0.85 to 1
+# before the empty scene, and 0.25 to 0.66 before their first image, until the person has left the
+# place of the ghost. Least length of the outline, px.
 NATS, UNDECIDED, TAU, OUTLINE = 16.0, 0.75, 0.2, 40
 
 
@@ -62,7 +63,8 @@ class EmptyScene:
         self.seen = bool(background.frames or trusted)
         self.log_odds = -math.inf if self.seen else 0.0
         self._recent: Array | None = None
-        self._learned = self._judged = 0
+        self._learned = 0
+        self._judged: int | None = None
         self._edges: Array | None = None
 
     @property
@@ -117,8 +119,8 @@ class EmptyScene:
         if np.count_nonzero(outline) < OUTLINE * now.shape[1] / WIDTH:
             return
         stronger = cv2.dilate(now, square) > cv2.dilate(self._edges, square)
-        share = share_of_time(seconds(stamp - self._judged) if self._judged else math.inf, TAU)
-        evidence = share * NATS * (float(stronger[outline].mean()) - UNDECIDED)
+        since = math.inf if self._judged is None else seconds(stamp - self._judged)
+        evidence = share_of_time(since, TAU) * NATS * (float(stronger[outline].mean()) - UNDECIDED)
         self.log_odds -= float(np.clip(evidence, -MOST, MOST))
         self._judged = stamp
 
