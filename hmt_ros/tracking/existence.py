@@ -189,7 +189,8 @@ class Existence:
         forgotten = CHAIN.transition(self._appearance.unseen(stamp))[1, 1] < MOST
         self.hidden = self._appearance.open_to_view(view.others) < 1.0 - MOST
         cues, usable, apart = self._cues(view, stamp, body)
-        if motion.moved and not any(value < 0.0 for value, _ in cues.values()):
+        denied = min((value * cue.nats for value, cue in cues.values()), default=0.0)
+        if motion.moved and denied > -0.5 * DOUBTFUL.nats:
             cues['motion'] = 1.0, DOUBTFUL
         if waiting and cues.get('detector', (0.0, CLEAR))[0] > 0.0 and self._is_counted(view):
             del cues['detector']
