@@ -138,7 +138,7 @@ def answers_of(work: Work) -> list[Answer]:
 
 
 def _keypoints_of(clip: Clip) -> dict[int, Keypoints]:
-    """By stamp; those of the bag where there is no file of them."""
+    """By stamp, from the bag where no file has them."""
     file = clip.folder / 'keypoints_mediapipe.npz'
     if file.is_file():
         content = read_archive(file)

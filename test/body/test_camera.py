@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmt_ros.body import Camera
-from hmt_ros.body.camera import unfolded_share
+from hmt_ros.body.camera import LEAST_UNFOLDED, unfolded_share
 
 LENSES = {
     'none': ('plumb_bob', ()),
@@ -169,7 +169,8 @@ def test_magnification_behind_the_camera_is_finite(depth):
 def test_distortions_of_real_cameras_do_not_fold(focal, size, model, coefficients):
     """Colour and grey cameras of public data sets, fisheyes that see more than half of a sphere."""
     width, height = size
-    Camera(focal, focal, width / 2, height / 2, width, height, coefficients, model)
+    camera = Camera(focal, focal, width / 2, height / 2, width, height, coefficients, model)
+    assert unfolded_share(camera) >= LEAST_UNFOLDED
 
 
 def test_a_fold_outside_of_the_image_does_not_matter():

@@ -185,7 +185,7 @@ def person_in(
         flags: whether confidences are flags of annotators.
 
     Raises:
-        ValueError: the object is no person.
+        ValueError: the object is not a person.
     """
     points = _get(entry, _POINTS)
     if points is None:

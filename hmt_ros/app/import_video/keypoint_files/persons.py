@@ -52,7 +52,7 @@ class Person:
         return float(np.linalg.norm(self.box[1] - self.box[0]))
 
     def distance(self, other: Person) -> float:
-        """Mean distance of the keypoints that both have, px; of the boxes if there is none."""
+        """Mean distance of the keypoints that both have, px; without any, of the boxes."""
         both = self.keypoints.seen & other.keypoints.seen
         apart = self.keypoints.pixels[both] - other.keypoints.pixels[both]
         if not both.any():
@@ -171,7 +171,7 @@ class FoundPersons:
 
     @property
     def last(self) -> int:
-        """Number of the last frame with an entry; -1: there is none, or only times are known."""
+        """Number of the last frame with an entry; -1 without one, or where only times are known."""
         return -1 if self.timed else max(self.frames, default=-1)
 
     @property
