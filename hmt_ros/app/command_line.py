@@ -51,17 +51,23 @@ class CommandParser(argparse.ArgumentParser):
             '--level', action='store_true', help='the camera is level: gravity is down in the image'
         )
         tilt.add_argument(
-            '--gravity', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+            '--gravity',
+            type=float,
+            nargs=3,
+            metavar=('X', 'Y', 'Z'),
             help='direction of gravity, of any length; x to the right of the image, y down, z '
             'forward (default: not known)',
-        )  # fmt: skip
+        )
 
     def add_motions(self) -> None:
         """Adds the motions and the body of a command that learns from recorded motions."""
         self.add_argument(
-            'motions', nargs='+', type=Path, metavar='MOTION',
+            'motions',
+            nargs='+',
+            type=Path,
+            metavar='MOTION',
             help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
-        )  # fmt: skip
+        )
         add_body(self)
 
     def add_model(self) -> None:
@@ -82,19 +88,26 @@ class CommandParser(argparse.ArgumentParser):
             'bag', type=Path, metavar='OUT', help='bag with mixtures: a folder or a file'
         )
         self.add_argument(
-            '--truth', type=Path, metavar='FILE',
+            '--truth',
+            type=Path,
+            metavar='FILE',
             help='true joint positions: a .npz file with stamps, joint_names and joints, or a bag '
             'with ground truth (default: the ground truth in OUT)',
-        )  # fmt: skip
+        )
         self.add_argument(
-            '--topic', action='append', default=[], dest='topics', metavar='NAME',
+            '--topic',
+            action='append',
+            default=[],
+            dest='topics',
+            metavar='NAME',
             help=f'{verb} only this topic; may be repeated (default: all topics with mixtures)',
-        )  # fmt: skip
+        )
         self.add_argument(
-            '--body', metavar='MODEL',
+            '--body',
+            metavar='MODEL',
             help='body model of the poses: a name or a YAML file (default: the model that OUT '
             'names)',
-        )  # fmt: skip
+        )
 
 
 def add_body(parser: argparse._ActionsContainer) -> None:
@@ -114,13 +127,18 @@ def add_seed(parser: argparse._ActionsContainer) -> None:
 def add_sources(parser: argparse._ActionsContainer, said: str = '--acknowledgement') -> None:
     """Adds --without, and the note on the motions, of a command that learns from motions."""
     parser.add_argument(
-        '--without', nargs='+', default=[], metavar='NAME',
+        '--without',
+        nargs='+',
+        default=[],
+        metavar='NAME',
         help='motions to leave out, names of files without suffix; * stands for any letters',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        said, default='', metavar='TEXT',
+        said,
+        default='',
+        metavar='TEXT',
         help='what the motions are, their licence and whom to acknowledge; kept in the file',
-    )  # fmt: skip
+    )
 
 
 def add_people(parser: argparse._ActionsContainer) -> None:
@@ -129,13 +147,18 @@ def add_people(parser: argparse._ActionsContainer) -> None:
         '--test', type=Path, metavar='DIR', help='motions of other people to score on'
     )
     parser.add_argument(
-        '--alike', default='', metavar='PREFIX',
+        '--alike',
+        default='',
+        metavar='PREFIX',
         help='motions whose names start with it are few exercises, each done many times',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--alike-share', type=number(0.0, 1.0), default=0.35, metavar='SHARE',
+        '--alike-share',
+        type=number(0.0, 1.0),
+        default=0.35,
+        metavar='SHARE',
         help='factor on how often these are drawn (0.35)',
-    )  # fmt: skip
+    )
 
 
 def gravity_of(arguments: argparse.Namespace) -> list[float] | None:

@@ -53,9 +53,13 @@ def _parser() -> CommandParser:
         help='folder of a bag, with subject.yaml, background.png and truth.npz in it if known',
     )
     parser.add_argument(
-        '-o', '--output', type=Path, required=True, metavar='DIR',
+        '-o',
+        '--output',
+        type=Path,
+        required=True,
+        metavar='DIR',
         help='folder for the new bag and the report',
-    )  # fmt: skip
+    )
     parser.add_argument('--live', action='store_true', help='run the real nodes, over DDS')
     return parser
 

@@ -68,15 +68,19 @@ def _parser() -> CommandParser:
     )
     parser.add_mixtures('evaluate')
     parser.add_argument(
-        '--model-sigma', type=number(0, 1, what='a length', unit=' m'), default=MODEL_SIGMA,
+        '--model-sigma',
+        type=number(0, 1, what='a length', unit=' m'),
+        default=MODEL_SIGMA,
         metavar='M',
         help='standard deviation, in m, of each coordinate of a joint that is added to the '
         f'covariances of the mixture (default: {MODEL_SIGMA:g})',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--seed', type=whole_number(0), default=0,
+        '--seed',
+        type=whole_number(0),
+        default=0,
         help='seed of the samples from which coverage is estimated (default: 0)',
-    )  # fmt: skip
+    )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
     return parser
@@ -90,9 +94,14 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     total = message_count(bag, arguments.topics)
     with show_progress('evaluate', 'messages', total, quiet=arguments.quiet) as bar:
         found = score_bag(
-            bag, truth, topics=arguments.topics, model_sigma=model_sigma, body_model=arguments.body,
-            seed=arguments.seed, progress=bar.update,
-        )  # fmt: skip
+            bag,
+            truth,
+            topics=arguments.topics,
+            model_sigma=model_sigma,
+            body_model=arguments.body,
+            seed=arguments.seed,
+            progress=bar.update,
+        )
     verticals = score_gravity(bag, truth)
     if arguments.json:
         print(json.dumps(as_json(found, truth, model_sigma, verticals), indent=1))
@@ -148,11 +157,22 @@ def as_text(
     """Tables for people: one row per topic, and the errors joint by joint."""
     rows: list[tuple[str, ...]] = [
         (
-            '', 'frames', 'missing', 'modes', 'heaviest', 'best of K', 'expected', 'under',
-            '-log p', 'all', 'joints', 'each', 'joint',
+            '',
+            'frames',
+            'missing',
+            'modes',
+            'heaviest',
+            'best of K',
+            'expected',
+            'under',
+            '-log p',
+            'all',
+            'joints',
+            'each',
+            'joint',
         ),
         ('', '', '', '', 'mm', 'mm', 'mm', '150 mm', '', '50 %', '90 %', '50 %', '90 %'),
-    ]  # fmt: skip
+    ]
     summaries = {name: topic.scores.summary() for name, topic in found.items()}
     for name, topic in found.items():
         s = summaries[name]
@@ -312,10 +332,14 @@ def _read_pose(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -
     body = None if mixture is None else bodies.of(stored.topic, content)
     track.take(
         Estimate(
-            content.stamp_ns, content.weights, mixture, content.joint_positions,
-            content.joint_names, body,
+            content.stamp_ns,
+            content.weights,
+            mixture,
+            content.joint_positions,
+            content.joint_names,
+            body,
         )
-    )  # fmt: skip
+    )
 
 
 def _read_trajectories(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -> None:

@@ -138,27 +138,33 @@ def _parser() -> CommandParser:
     )
     parser.add_output('OUT', 'file', f'file to write, one of {" ".join(FORMATS)}')
     parser.add_argument(
-        '--topic', metavar='NAME',
+        '--topic',
+        metavar='NAME',
         help='mixtures over poses (default: smoothed, else the posterior, else predictions)',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--identity', type=whole_number(1), metavar='N',
+        '--identity',
+        type=whole_number(1),
+        metavar='N',
         help='the motion of this identity (default: the heaviest mode at each time)',
-    )  # fmt: skip
+    )
     parser.add_argument(
         '--track', type=whole_number(0), metavar='N', help='track_id (default: the longest track)'
     )
     parser.add_argument(
-        '--fps', type=number(0.01, 1e4), metavar='RATE',
+        '--fps',
+        type=number(0.01, 1e4),
+        metavar='RATE',
         help='poses a second of a .bvh (default: as recorded)',
-    )  # fmt: skip
+    )
     parser.add_argument(
         '--camera-axes', action='store_true', help='do not turn upright though gravity is known'
     )
     parser.add_argument(
-        '--body', metavar='MODEL',
+        '--body',
+        metavar='MODEL',
         help='body model of the poses: a name or a YAML file (default: the model that RUN names)',
-    )  # fmt: skip
+    )
     return parser
 
 
@@ -176,9 +182,14 @@ def _export(arguments: argparse.Namespace) -> int:
         raise ValueError(f'{output} can not be written: {place} is no place to write to')
     with show_progress(str(output), 'messages', quiet=quiet) as bar:
         motion = read_tracked_motion(
-            arguments.bag, arguments.topic, arguments.identity, arguments.track,
-            body_model=arguments.body, camera_axes=arguments.camera_axes, progress=bar.update,
-        )  # fmt: skip
+            arguments.bag,
+            arguments.topic,
+            arguments.identity,
+            arguments.track,
+            body_model=arguments.body,
+            camera_axes=arguments.camera_axes,
+            progress=bar.update,
+        )
         output.write_bytes(motion_bytes(motion, kind, arguments.fps))
     if not quiet:
         span = f'{len(motion.steps)} poses over {motion.times[-1]:.2f} s'
@@ -368,11 +379,16 @@ def _pose(content: PoseMixture, identity: int | None) -> TrackedPose | None:
         return None
     covariances, spread = content.covariances, content.joint_covariances
     return TrackedPose(
-        content.stamp_ns, content.track_id, int(content.identities[k]), float(weights[k]),
-        content.means[k], None if covariances is None else covariances[k],
-        content.joint_positions[k], None if spread is None else spread[k],
+        content.stamp_ns,
+        content.track_id,
+        int(content.identities[k]),
+        float(weights[k]),
+        content.means[k],
+        None if covariances is None else covariances[k],
+        content.joint_positions[k],
+        None if spread is None else spread[k],
         content.segment_lengths,
-    )  # fmt: skip
+    )
 
 
 def _track(

@@ -70,21 +70,26 @@ def _parser() -> CommandParser:
     add_sources(parser)
     add_people(parser)
     parser.add_argument(
-        '--steps', type=whole_number(1), default=usual.steps,
+        '--steps',
+        type=whole_number(1),
+        default=usual.steps,
         help=f'number of steps ({usual.steps})',
-    )  # fmt: skip
+    )
     parser.add_argument(
         '--batch', type=whole_number(2), default=usual.batch, help=f'windows a step ({usual.batch})'
     )
     parser.add_argument(
-        '--experts', type=whole_number(1, 32), default=usual.experts,
+        '--experts',
+        type=whole_number(1, 32),
+        default=usual.experts,
         help=f'number of experts ({usual.experts})',
-    )  # fmt: skip
+    )
     add_seed(parser)
     parser.add_argument(
-        '--resume', action='store_true',
+        '--resume',
+        action='store_true',
         help='go on with a training that was broken off, marked beside FILE as FILE.resume',
-    )  # fmt: skip
+    )
     return parser
 
 
@@ -111,9 +116,10 @@ def _learn(options: argparse.Namespace) -> int:
         tracks = keypoint_tracks(body, learned, shares, seed=options.seed)
     notes = {
         'card': data_card(learned, options.acknowledgement),
-        'scored on': sorted(one.name for one in tested), 'learning': asdict(settings),
+        'scored on': sorted(one.name for one in tested),
+        'learning': asdict(settings),
         'windows': asdict(windows),
-    }  # fmt: skip
+    }
     with show_progress('learning', 'steps', options.steps, quiet=quiet) as bar:
         done = 0
 
@@ -267,9 +273,11 @@ def lifter_scores(lifter: Lifter, inputs: Any, joints: Any) -> LifterScores:
     distance = np.linalg.norm(seen - wanted[:, None], axis=3).mean(2)
     rows = np.arange(len(gates))
     return LifterScores(
-        float(distance[rows, gates.argmax(1)].mean()), float(distance.min(1).mean()),
-        float(density.mean()), float(_within(gates, off / deviations).mean()),
-    )  # fmt: skip
+        float(distance[rows, gates.argmax(1)].mean()),
+        float(distance.min(1).mean()),
+        float(density.mean()),
+        float(_within(gates, off / deviations).mean()),
+    )
 
 
 def _within(gates: Array, off: Array, share: float = 0.9) -> Array:

@@ -51,18 +51,27 @@ def _parser() -> CommandParser:
     add_sources(parser, '--source')
     add_people_tables(parser)
     parser.add_argument(
-        '--test', type=Path, nargs='+', default=[], metavar='FILES',
+        '--test',
+        type=Path,
+        nargs='+',
+        default=[],
+        metavar='FILES',
         help='motions of other people, whose log likelihood is printed',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--components', type=whole_number(1, 200), nargs='+', default=list(s.components),
+        '--components',
+        type=whole_number(1, 200),
+        nargs='+',
+        default=list(s.components),
         help='numbers of components to choose from, by the likelihood of people left out '
         f'({" ".join(map(str, s.components))})',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--folds', type=whole_number(2, 1000), default=s.folds,
+        '--folds',
+        type=whole_number(2, 1000),
+        default=s.folds,
         help=f'number of groups of people, each left out once ({s.folds})',
-    )  # fmt: skip
+    )
     parser.add_argument(
         '--seed', type=whole_number(0), default=s.seed, help=f'seed of the starts ({s.seed})'
     )
@@ -73,8 +82,10 @@ def _learn(arguments: argparse.Namespace) -> int:
     output = model_file(arguments.output, overwrite=arguments.overwrite)
     settings = replace(
         PriorSettings(),
-        components=tuple(arguments.components), folds=arguments.folds, seed=arguments.seed,
-    )  # fmt: skip
+        components=tuple(arguments.components),
+        folds=arguments.folds,
+        seed=arguments.seed,
+    )
     body = load_body(arguments.body)
     owners = people_in(arguments.people)
     quiet = arguments.quiet
@@ -102,10 +113,14 @@ def _learn(arguments: argparse.Namespace) -> int:
 def add_people_tables(parser: CommandParser) -> None:
     """Adds --people, for `people_in`."""
     parser.add_argument(
-        '--people', type=Path, nargs='+', default=[], metavar='FILE.csv',
+        '--people',
+        type=Path,
+        nargs='+',
+        default=[],
+        metavar='FILE.csv',
         help='tables with the columns file and subject: whose motion a file is (default: the first '
         'two words of its name)',
-    )  # fmt: skip
+    )
 
 
 def person_of(name: str, owners: dict[str, str]) -> str:

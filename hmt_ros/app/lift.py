@@ -100,37 +100,49 @@ def _parser() -> CommandParser:
     parser.add_output('DIR', 'result', 'folder for the bag and the report')
     add_camera_arguments(parser)
     parser.add_argument(
-        '--size', type=image_size, metavar='WxH',
+        '--size',
+        type=image_size,
+        metavar='WxH',
         help='width and height of the images, px; not needed where the file tells it',
-    )  # fmt: skip
+    )
     parser.add_argument(
         '--fps', type=number(0.01, 1000), default=30.0, help='images per second (default: 30)'
     )
     parser.add_argument(
-        '--first-stamp', type=whole_number(1, 2**62), default=START_NS, metavar='NS',
+        '--first-stamp',
+        type=whole_number(1, 2**62),
+        default=START_NS,
+        metavar='NS',
         help=f'stamp of the first image, ns (default: {START_NS})',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--first-number', type=whole_number(0), default=0, metavar='N',
+        '--first-number',
+        type=whole_number(0),
+        default=0,
+        metavar='N',
         help='number of the first image (default: 0)',
-    )  # fmt: skip
+    )
     add_keypoint_arguments(parser)
     person = parser.add_mutually_exclusive_group()
     person.add_argument(
         '--stature', type=number(0.3, 3), help='stature of the person, m (default: not known)'
     )
     person.add_argument(
-        '--subject', type=Path, metavar='FILE',
+        '--subject',
+        type=Path,
+        metavar='FILE',
         help='subject file with joints and lengths of the person, see subject',
-    )  # fmt: skip
+    )
     parser.add_gravity()
     parser.add_argument(
         '--causal', action='store_true', help='as a camera sees it: later images do not count'
     )
     parser.add_argument(
-        '--lifter', default=SHIPPED, metavar='MODEL',
+        '--lifter',
+        default=SHIPPED,
+        metavar='MODEL',
         help='file that learn-lifter wrote (default: the one that ships)',
-    )  # fmt: skip
+    )
     return parser
 
 
@@ -170,10 +182,16 @@ def _lift(arguments: argparse.Namespace) -> int:
 
     def lifted(ups: Array | None) -> list[GaussianMixture | None]:
         return lift_poses(
-            lifter, body, camera, 1e-9 * np.array(times, dtype=np.float64), seen, ups,
-            lengths_known=arguments.subject is not None, causal=arguments.causal,
+            lifter,
+            body,
+            camera,
+            1e-9 * np.array(times, dtype=np.float64),
+            seen,
+            ups,
+            lengths_known=arguments.subject is not None,
+            causal=arguments.causal,
             scheme=arguments.scheme,
-        )  # fmt: skip
+        )
 
     with show_progress('lifting', quiet=quiet):
         mixtures = lifted(ups)
@@ -199,9 +217,12 @@ def _lift(arguments: argparse.Namespace) -> int:
             )
             bag.write(PREDICTION, stamp, pose_mixture_message(messages, content))
     options = ReportOptions(
-        folder / LIFTED, folder / REPORT, overwrite=arguments.overwrite, quiet=quiet,
+        folder / LIFTED,
+        folder / REPORT,
+        overwrite=arguments.overwrite,
+        quiet=quiet,
         topics=(PREDICTION,),
-    )  # fmt: skip
+    )
     _, written = write_report(options)
     if not quiet:
         posed = sum(one is not None for one in mixtures)

@@ -78,65 +78,91 @@ def _parser() -> CommandParser:
     )
     add_body(motion)
     motion.add_argument(
-        '--stature', type=number(0.3, 3),
+        '--stature',
+        type=number(0.3, 3),
         help='stature of the person, m; not with --mocap (default: that of the body model)',
-    )  # fmt: skip
+    )
     motion.add_argument(
-        '--duration', type=number(0.001, 1e5),
+        '--duration',
+        type=number(0.001, 1e5),
         help=f'duration, s (default: {DURATION:g}, or all of --mocap)',
-    )  # fmt: skip
+    )
     motion.add_argument(
-        '--start', type=number(0, 1e6), default=0.0,
+        '--start',
+        type=number(0, 1e6),
+        default=0.0,
         help='time in --mocap at which the bag begins, s (default: 0)',
-    )  # fmt: skip
+    )
     motion.add_argument(
-        '--fps', type=number(0.01, 1000), default=30.0,
+        '--fps',
+        type=number(0.01, 1000),
+        default=30.0,
         help='images per second; with --mocap the nearest rate that every n-th frame gives '
         '(default: 30)',
-    )  # fmt: skip
+    )
     motion.add_argument(
-        '--heading', type=number(-3600, 3600),
+        '--heading',
+        type=number(-3600, 3600),
         help='heading of the person at the beginning, degrees; 0: towards the camera, 90: to the '
         f'right of the image (default: chosen for the motion, {HEADING:g} with --mocap)',
-    )  # fmt: skip
+    )
 
     camera = parser.add_argument_group('camera and scene')
     camera.add_argument(
-        '--size', type=image_size, default=(640, 480), metavar='WxH',
+        '--size',
+        type=image_size,
+        default=(640, 480),
+        metavar='WxH',
         help='size of the images, px (default: 640x480)',
-    )  # fmt: skip
+    )
     camera.add_argument(
-        '--fov', type=number(1, 150), default=51.7,
+        '--fov',
+        type=number(1, 150),
+        default=51.7,
         help='horizontal field of view, degrees (default: 51.7)',
-    )  # fmt: skip
+    )
     camera.add_argument(
-        '--distance', type=number(0.3, 1000), default=5.6,
+        '--distance',
+        type=number(0.3, 1000),
+        default=5.6,
         help='distance of the camera from the middle of the motion, m (default: 5.6)',
-    )  # fmt: skip
+    )
     camera.add_argument(
-        '--camera-height', type=number(0.01, 100), default=1.2,
+        '--camera-height',
+        type=number(0.01, 100),
+        default=1.2,
         help='height of the camera above the floor, m (default: 1.2)',
-    )  # fmt: skip
+    )
     camera.add_argument(
-        '--pitch', type=number(-80, 80), default=0.0,
+        '--pitch',
+        type=number(-80, 80),
+        default=0.0,
         help='angle by which the camera looks down, degrees (default: 0)',
-    )  # fmt: skip
+    )
     camera.add_argument(
-        '--noise', type=number(0, 100), default=2.5,
+        '--noise',
+        type=number(0, 100),
+        default=2.5,
         help='standard deviation of the noise of a pixel, grey levels of 255 (default: 2.5)',
-    )  # fmt: skip
+    )
     camera.add_argument(
-        '--shadow', action=argparse.BooleanOptionalAction, default=True,
+        '--shadow',
+        action=argparse.BooleanOptionalAction,
+        default=True,
         help='draw the shadow of the person on the floor (default: yes)',
-    )  # fmt: skip
+    )
     camera.add_argument(
-        '--depth', action='store_true',
+        '--depth',
+        action='store_true',
         help='add depth images with the noise and the holes of a sensor, registered to the images',
-    )  # fmt: skip
+    )
     camera.add_argument(
-        '--jpeg-quality', type=whole_number(1, 100), default=90, metavar='Q',
+        '--jpeg-quality',
+        type=whole_number(1, 100),
+        default=90,
+        metavar='Q',
         help='JPEG quality, 1 to 100 (default: 90)',
-    )  # fmt: skip
+    )
     return parser
 
 
@@ -210,9 +236,14 @@ def motion_of(options: MotionOptions, viewpoint: Viewpoint) -> Take:
         body = body.with_stature(options.stature)
     duration = DURATION if options.duration is None else options.duration
     poses = procedural_motion(
-        options.name, body, duration, options.fps, options.seed, heading=heading,
+        options.name,
+        body,
+        duration,
+        options.fps,
+        options.seed,
+        heading=heading,
         viewpoint=viewpoint,
-    )  # fmt: skip
+    )
     return Take(f'{options.name}, seed {options.seed}', body, poses, options.fps)
 
 

@@ -58,9 +58,17 @@ CLICK_SIGMA = 2.0  # px
 OF_CLICKS = 5  # stream of random numbers of a seed; `hmt_ros.image` uses others
 TAPE = 0.005  # resolution of the measured lengths of a subject, m
 MEASURED = (
-    'thigh', 'shin', 'foot', 'upper_arm', 'forearm', 'hand', 'hip_width', 'shoulder_width', 'trunk',
+    'thigh',
+    'shin',
+    'foot',
+    'upper_arm',
+    'forearm',
+    'hand',
+    'hip_width',
+    'shoulder_width',
+    'trunk',
     'neck_to_head',
-)  # fmt: skip
+)
 
 CROSSING = 'crossing'
 PEOPLE = ('a', 'b')

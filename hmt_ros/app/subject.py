@@ -93,17 +93,19 @@ def _parser() -> CommandParser:
     when = parser.add_mutually_exclusive_group()
     when.add_argument('--stamp', type=whole_number(0), metavar='NS', help='stamp of the image, ns')
     when.add_argument(
-        '--time', type=number(0, 1e9, what='a time', unit=' s'),
+        '--time',
+        type=number(0, 1e9, what='a time', unit=' s'),
         help='time since the first image, s; the image nearest to it is taken',
-    )  # fmt: skip
+    )
     parser.add_argument(
         '--stature', type=number(0.3, 3), help='stature of the person, m (default: not known)'
     )
     parser.add_argument(
-        '--sigma', type=number(0.01, 1e4),
+        '--sigma',
+        type=number(0.01, 1e4),
         help='standard deviation of a keypoint, px (default: 3 %% of the size of the person in the '
         'image, at least 2)',
-    )  # fmt: skip
+    )
     add_body(parser)
     return parser
 

@@ -87,9 +87,13 @@ def _parser() -> CommandParser:
     parser.add_gravity()
     parser.add_argument('--seed', type=int, metavar='N', help='seed of all random numbers')
     parser.add_argument(
-        '--set', action='append', default=[], dest='settings', metavar='NAME=VALUE',
+        '--set',
+        action='append',
+        default=[],
+        dest='settings',
+        metavar='NAME=VALUE',
         help='one parameter of the tracker, see replay; may be repeated',
-    )  # fmt: skip
+    )
     return parser
 
 
@@ -140,10 +144,13 @@ def _track(arguments: argparse.Namespace) -> int:
             start.write_text(subject_text(seen, stature=stature), encoding='utf-8')
             say(f'{start}: {len(seen.joints.names)} joints at {seen.stamp_ns} ns')
     options = ReplayOptions(
-        overwrite=overwrite, quiet=quiet, subject=subject,
-        background=arguments.background, seed=arguments.seed,
+        overwrite=overwrite,
+        quiet=quiet,
+        subject=subject,
+        background=arguments.background,
+        seed=arguments.seed,
         settings=[*settings, *_of_gravity(arguments), *arguments.settings],
-    )  # fmt: skip
+    )
     replayed = replay_bag(video, folder / TRACKED, options, tell)
     say(f'{folder / TRACKED}: {replayed}')
     _, written = write_report(

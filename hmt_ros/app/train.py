@@ -90,38 +90,51 @@ def _parser() -> CommandParser:
 
     motion = parser.add_argument_group('motions')
     motion.add_argument(
-        '--mocap', nargs='+', type=Path, default=[], metavar='DIR',
+        '--mocap',
+        nargs='+',
+        type=Path,
+        default=[],
+        metavar='DIR',
         help='folders of recorded motions (.bvh, or .amc beside its .asf) with their subfolders',
-    )  # fmt: skip
+    )
     add_sources(motion)
     add_people(motion)
     motion.add_argument(
-        '--motions', metavar='NAMES',
+        '--motions',
+        metavar='NAMES',
         help=f'"procedural" for all, or names with commas ({", ".join(PROCEDURAL_MOTIONS)})',
-    )  # fmt: skip
+    )
     add_body(motion)
 
     learning = parser.add_argument_group('learning')
     learning.add_argument(
-        '--model', choices=sorted(KINDS), default='network',
+        '--model',
+        choices=sorted(KINDS),
+        default='network',
         help='model that learns; network, the default, needs jax and optax',
-    )  # fmt: skip
+    )
     learning.add_argument(
-        '--experts', type=whole_number(1, 1000),
+        '--experts',
+        type=whole_number(1, 1000),
         help='number of experts; maximum number of modes of the local model (5)',
-    )  # fmt: skip
+    )
     learning.add_argument(
-        '--samples', type=whole_number(50, 1_000_000), default=6000,
+        '--samples',
+        type=whole_number(50, 1_000_000),
+        default=6000,
         help='number of silhouettes (6000); a network can use ten times as many',
-    )  # fmt: skip
+    )
     learning.add_argument(
-        '--dynamics', action=argparse.BooleanOptionalAction, default=False,
+        '--dynamics',
+        action=argparse.BooleanOptionalAction,
+        default=False,
         help='learn p(x_t | x_t-1, r_t) as well, for rule (1) (no)',
-    )  # fmt: skip
+    )
     learning.add_argument(
-        '--resume', action='store_true',
+        '--resume',
+        action='store_true',
         help='go on with a training that was broken off; its silhouettes are kept beside FILE',
-    )  # fmt: skip
+    )
     return parser
 
 

@@ -106,9 +106,14 @@ class Camera:
             )
         x, y = width / self.width, height / self.height
         return replace(
-            self, fx=self.fx * x, fy=self.fy * y, cx=(self.cx + 0.5) * x - 0.5,
-            cy=(self.cy + 0.5) * y - 0.5, width=width, height=height,
-        )  # fmt: skip
+            self,
+            fx=self.fx * x,
+            fy=self.fy * y,
+            cx=(self.cx + 0.5) * x - 0.5,
+            cy=(self.cy + 0.5) * y - 0.5,
+            width=width,
+            height=height,
+        )
 
     @property
     def matrix(self) -> Array:
@@ -295,8 +300,10 @@ class Viewpoint:
 
     def __post_init__(self) -> None:
         for name, low, high in (
-            ('distance', 0.1, 1000.0), ('height', 0.01, 100.0), ('pitch', -1.4, 1.4)
-        ):  # fmt: skip
+            ('distance', 0.1, 1000.0),
+            ('height', 0.01, 100.0),
+            ('pitch', -1.4, 1.4),
+        ):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ValueError(f'{name} of the camera must lie in [{low}, {high}], saw {value}')

@@ -51,8 +51,15 @@ class Constants(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def add_ground_energies(  # type: ignore[no-untyped-def]
-    c, columns, origins, axes, dof_origins, terms, gradient, hessian,
-):  # fmt: skip
+    c,
+    columns,
+    origins,
+    axes,
+    dof_origins,
+    terms,
+    gradient,
+    hessian,
+):
     """Adds the terms of N poses.
 
     Args:

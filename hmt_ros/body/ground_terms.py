@@ -128,8 +128,13 @@ class GroundTerm:
         gradient = np.zeros((n if derivatives else 0, d))
         hessian = np.zeros((n if derivatives else 0, d, d))
         add_ground_energies(
-            self.compiled, *frames.by_pose(), *frames.dofs_by_pose(), terms, gradient, hessian,
-        )  # fmt: skip
+            self.compiled,
+            *frames.by_pose(),
+            *frames.dofs_by_pose(),
+            terms,
+            gradient,
+            hessian,
+        )
         return terms, gradient, hessian
 
     @cached_property

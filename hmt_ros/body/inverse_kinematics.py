@@ -72,13 +72,22 @@ def solve_joint_positions(
 
     def distances(x: Array, problem: Index) -> tuple[Array, Array, Array]:
         return point_energy(
-            forward(skeleton, x), segments, offsets, goal[problem].transpose(1, 2, 0),
-            weight[problem].T, None if across is None else across[problem].transpose(1, 2, 3, 0),
-        )  # fmt: skip
+            forward(skeleton, x),
+            segments,
+            offsets,
+            goal[problem].transpose(1, 2, 0),
+            weight[problem].T,
+            None if across is None else across[problem].transpose(1, 2, 3, 0),
+        )
 
     energy = Sum((EnergyFunction(distances), Quadratic(body.prior_mean, precision)))
     return minimise(
-        energy, start, limits_low, limits_high,
+        energy,
+        start,
+        limits_low,
+        limits_high,
         step_scale=np.where(skeleton.dof_is_rotation, 0.5, 0.3),
-        damping=1.0, max_iterations=max_iterations, tolerance=tolerance,
-    )  # fmt: skip
+        damping=1.0,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+    )

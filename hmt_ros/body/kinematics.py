@@ -184,9 +184,15 @@ def directed_derivatives(
     points, directions = (np.ascontiguousarray(x) for x in (points, directions))
     result = np.zeros((len(points), skeleton.dimension))
     _directed(
-        skeleton.moves, skeleton.dof_is_rotation, axes, origins, segments, points, directions,
+        skeleton.moves,
+        skeleton.dof_is_rotation,
+        axes,
+        origins,
+        segments,
+        points,
+        directions,
         result,
-    )  # fmt: skip
+    )
     return result
 
 
@@ -328,10 +334,13 @@ def point_energy(
     value = 0.5 * np.einsum('jn,jin,jin->n', weights, error, error)
     rows = np.repeat(weights, 3, axis=0)
     sums = segment_sums(
-        np.repeat(segments, 3), np.repeat(points, 3, axis=0),
-        across.reshape(-1, 3, frames.count), rows * error.reshape(-1, frames.count), rows,
+        np.repeat(segments, 3),
+        np.repeat(points, 3, axis=0),
+        across.reshape(-1, 3, frames.count),
+        rows * error.reshape(-1, frames.count),
+        rows,
         len(frames.skeleton.parents),
-    )  # fmt: skip
+    )
     gradient, hessian = assemble(frames, *sums)
     return value, gradient, hessian
 

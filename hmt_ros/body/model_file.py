@@ -30,9 +30,13 @@ from hmt_ros.inference.arrays import Array
 from msg_tools.files.plain_yaml import load_plain_yaml, read_plain_yaml
 
 AXES = {
-    'x': (0, True), 'y': (1, True), 'z': (2, True),
-    'tx': (0, False), 'ty': (1, False), 'tz': (2, False),
-}  # fmt: skip
+    'x': (0, True),
+    'y': (1, True),
+    'z': (2, True),
+    'tx': (0, False),
+    'ty': (1, False),
+    'tz': (2, False),
+}
 MIRROR = np.array([-1.0, 1.0, 1.0])
 DIFFUSION = (0.25, 1.4)  # of a root that the model file gives none, m and rad after one second
 LARGEST_FILE = 1_000_000  # bytes; a body is a few kB
@@ -176,12 +180,30 @@ def _mount(entry: dict[str, Any]) -> Array:
 
 
 KEYS = {
-    'name', 'lengths', 'stature_spread', 'stature', 'stature_extra', 'segments', 'joints',
-    'chains', 'fixed', 'symmetries', 'joint_errors', 'postures',
-}  # fmt: skip
+    'name',
+    'lengths',
+    'stature_spread',
+    'stature',
+    'stature_extra',
+    'segments',
+    'joints',
+    'chains',
+    'fixed',
+    'symmetries',
+    'joint_errors',
+    'postures',
+}
 SEGMENT_KEYS = {
-    'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',
-}  # fmt: skip
+    'name',
+    'parent',
+    'offset',
+    'points',
+    'x_axis',
+    'length',
+    'diffusion',
+    'dofs',
+    'flesh',
+}
 FLESH_KEYS = {'centre', 'radii', 'exponents', 'taper', 'bend', 'extend', 'rings', 'size'}
 
 

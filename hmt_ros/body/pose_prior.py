@@ -136,9 +136,15 @@ def gaussian_model(body: Body, weight: float) -> PriorModel:
     """The independent Gaussians of the model file as compiled code reads them."""
     nothing = np.zeros((1, 0))
     return PriorModel(
-        np.zeros((1, 0, 0)), nothing, np.zeros(1), np.zeros((1, 0, 0)), np.zeros(0, dtype=np.int64),
-        body.prior_mean, body.prior_sigma**-2.0, weight,
-    )  # fmt: skip
+        np.zeros((1, 0, 0)),
+        nothing,
+        np.zeros(1),
+        np.zeros((1, 0, 0)),
+        np.zeros(0, dtype=np.int64),
+        body.prior_mean,
+        body.prior_sigma**-2.0,
+        weight,
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -72,9 +72,13 @@ def self_intersection_energy(
     n, d = frames.count, body.dimension
     value, gradient, hessian = np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
     add_overlaps(
-        overlaps_of(body, sigma), *frames.by_pose(), *frames.dofs_by_pose(), value, gradient,
+        overlaps_of(body, sigma),
+        *frames.by_pose(),
+        *frames.dofs_by_pose(),
+        value,
+        gradient,
         hessian,
-    )  # fmt: skip
+    )
     return value, gradient, hessian
 
 
@@ -84,9 +88,13 @@ def overlaps_of(body: Body, sigma: float) -> Overlaps:
     first, second = _pairs(body)
     skeleton = body.skeleton
     return Overlaps(
-        _axes_of(body), first.astype(np.int64), second.astype(np.int64), skeleton.dof_is_rotation,
-        skeleton.moves, float(sigma),
-    )  # fmt: skip
+        _axes_of(body),
+        first.astype(np.int64),
+        second.astype(np.int64),
+        skeleton.dof_is_rotation,
+        skeleton.moves,
+        float(sigma),
+    )
 
 
 @lru_cache(maxsize=16)

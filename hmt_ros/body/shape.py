@@ -88,10 +88,18 @@ class ShapeSpace:
         result = np.zeros((n, size)), np.zeros((n, size, size)), np.zeros((n, size, d))
         lifts = origin_length_jacobians(skeleton, frames).transpose(3, 0, 1, 2)
         _sum_residuals(
-            self._table, np.ascontiguousarray(lifts), placing_of(skeleton).parents,
-            skeleton.dof_segments, skeleton.dof_is_rotation, skeleton.joint_segments,
-            *frames.by_pose(), *frames.dofs_by_pose(), of_flesh, of_joints, *result,
-        )  # fmt: skip
+            self._table,
+            np.ascontiguousarray(lifts),
+            placing_of(skeleton).parents,
+            skeleton.dof_segments,
+            skeleton.dof_is_rotation,
+            skeleton.joint_segments,
+            *frames.by_pose(),
+            *frames.dofs_by_pose(),
+            of_flesh,
+            of_joints,
+            *result,
+        )
         return result
 
     @cached_property
@@ -113,9 +121,15 @@ class ShapeSpace:
         for own, row in zip(variables, moved, strict=True):
             own[: row.sum()] = np.flatnonzero(row)
         return _ShapeTable(
-            part_of.astype(np.int64), centres, radii, by_centre, by_radius, skeleton.joint_basis,
-            variables, counts.astype(np.int64),
-        )  # fmt: skip
+            part_of.astype(np.int64),
+            centres,
+            radii,
+            by_centre,
+            by_radius,
+            skeleton.joint_basis,
+            variables,
+            counts.astype(np.int64),
+        )
 
     @cached_property
     def _parts(self) -> tuple[Array, Array, Array, Array]:
@@ -170,9 +184,22 @@ class _ShapeTable(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _sum_residuals(  # type: ignore[no-untyped-def]
-    table, lifts, parents, dof_segments, is_rotation, joint_segments, columns, origins, axes,
-    dof_origins, of_flesh, of_joints, gradient, curvature, mixed,
-):  # fmt: skip
+    table,
+    lifts,
+    parents,
+    dof_segments,
+    is_rotation,
+    joint_segments,
+    columns,
+    origins,
+    axes,
+    dof_origins,
+    of_flesh,
+    of_joints,
+    gradient,
+    curvature,
+    mixed,
+):
     """Adds up the sums of `ShapeSpace.second_order`.
 
     A residual on the flesh has r = B' f, with f = (R' a, u R' a, a) (9,) and B (9, P) the
@@ -183,8 +210,10 @@ def _sum_residuals(  # type: ignore[no-untyped-def]
     segments, lengths = len(parents), lifts.shape[3]
     d, size = axes.shape[1], gradient.shape[1]
     pulls, squares, products = (
-        np.empty((segments, 9)), np.empty((segments, 9, 9)), np.empty((segments, 9, 6)),
-    )  # fmt: skip
+        np.empty((segments, 9)),
+        np.empty((segments, 9, 9)),
+        np.empty((segments, 9, 6)),
+    )
     carried = np.empty((segments, size, 6))
     most = table.variables.shape[1]
     f, b, row = np.empty(9), np.empty(6), np.empty(lengths)

@@ -64,11 +64,18 @@ class Skeleton:
         s, d = len(self.segment_names), len(self.dof_names)
         j, n = len(self.joint_names), len(self.length_names)
         wanted = {
-            'mounts': (s, 3, 3), 'fixed_offsets': (s, 3), 'offset_basis': (s, 3, n),
-            'dof_segments': (d,), 'dof_axes': (d,), 'dof_is_rotation': (d,),
-            'lower': (d,), 'upper': (d,), 'joint_segments': (j,),
-            'joint_basis': (j, 3, n), 'lengths': (n,),
-        }  # fmt: skip
+            'mounts': (s, 3, 3),
+            'fixed_offsets': (s, 3),
+            'offset_basis': (s, 3, n),
+            'dof_segments': (d,),
+            'dof_axes': (d,),
+            'dof_is_rotation': (d,),
+            'lower': (d,),
+            'upper': (d,),
+            'joint_segments': (j,),
+            'joint_basis': (j, 3, n),
+            'lengths': (n,),
+        }
         for key, shape in wanted.items():
             value = np.array(getattr(self, key))
             if value.shape != shape:

@@ -32,9 +32,20 @@ from hmt_ros.inference.calibration import (
 from hmt_ros.inference.mixture import GaussianMixture
 
 EVALUATED_JOINTS = (
-    'neck', 'left_shoulder', 'right_shoulder', 'left_elbow', 'right_elbow', 'left_wrist',
-    'right_wrist', 'left_hip', 'right_hip', 'left_knee', 'right_knee', 'left_ankle', 'right_ankle',
-)  # fmt: skip
+    'neck',
+    'left_shoulder',
+    'right_shoulder',
+    'left_elbow',
+    'right_elbow',
+    'left_wrist',
+    'right_wrist',
+    'left_hip',
+    'right_hip',
+    'left_knee',
+    'right_knee',
+    'left_ankle',
+    'right_ankle',
+)
 ORIGIN = 'pelvis'
 # Their middle is the origin where the truth has no pelvis.
 HIPS = ('left_hip', 'right_hip')
@@ -236,9 +247,11 @@ class Scores:
         errors = {
             key: 1e3 * value.mean(1)
             for key, value in (
-                ('heaviest', self.heaviest), ('best', self.best), ('expected', self.expected),
+                ('heaviest', self.heaviest),
+                ('best', self.best),
+                ('expected', self.expected),
             )
-        }  # fmt: skip
+        }
         result: dict[str, Any] = {
             'frames': len(self),
             'modes': float(self.modes.mean()),
@@ -254,8 +267,10 @@ class Scores:
             -float(np.mean(self.log_densities)) if self.log_densities is not None else None
         )
         for kind, levels in (
-            ('', self.levels), ('joint_', self.joint_levels), ('absolute_', self.absolute_levels),
-        ):  # fmt: skip
+            ('', self.levels),
+            ('joint_', self.joint_levels),
+            ('absolute_', self.absolute_levels),
+        ):
             for percent in (50, 90):
                 result[f'{kind}coverage_{percent}'] = (
                     coverage(levels, percent / 100) if levels is not None else None
@@ -358,7 +373,13 @@ def score(
             levels[t] = levels_of(together[:1], together[1:])[0]
             joint_levels[t] = levels_of(alone[:1], alone[1:])[0]
     return Scores(
-        tuple(names), heaviest, best, expected, modes, perplexity,
-        log_densities if known else None, levels if known else None,
+        tuple(names),
+        heaviest,
+        best,
+        expected,
+        modes,
+        perplexity,
+        log_densities if known else None,
+        levels if known else None,
         joint_levels if known else None,
-    )  # fmt: skip
+    )

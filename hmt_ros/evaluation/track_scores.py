@@ -207,9 +207,13 @@ class TrackScorer:
             )
         missing = len(self.truth.joints) - len(self._seen)
         return TrackScores(
-            self.kind, Scores.concatenate(self._parts), missing, self._without_truth, self._note,
+            self.kind,
+            Scores.concatenate(self._parts),
+            missing,
+            self._without_truth,
+            self._note,
             ground_scores(self._heaviest, self._names, self.truth.ground),
-        )  # fmt: skip
+        )
 
     def _keep_heaviest(self, estimate: Estimate) -> None:
         """Joint positions of the heaviest mode, for the scores of its feet."""

@@ -343,11 +343,15 @@ class ExpertMixture(ConditionalDensity):
         stored = [part(f'expert{i}', arrays) for i in range(int(arrays['n_experts']))]
         self.experts_ = tuple(
             SparseRegression(
-                own['active'], own['precisions'], own['weights'], own['covariance'],
-                inflation * own['noise'], np.nan,
+                own['active'],
+                own['precisions'],
+                own['weights'],
+                own['covariance'],
+                inflation * own['noise'],
+                np.nan,
             )
             for own in stored
-        )  # fmt: skip
+        )
         self.gates_ = self._gates.of_arrays(part('gates', arrays))
         self._prepare()
 
@@ -395,9 +399,16 @@ class RelevanceVectorRegression(ExpertMixture):
         scaling: str = 'each',
     ) -> None:
         super().__init__(
-            1, basis, seed, width=width, max_kernels=max_kernels, n_starts=1,
-            max_iterations=max_iterations, tolerance=tolerance, scaling=scaling,
-        )  # fmt: skip
+            1,
+            basis,
+            seed,
+            width=width,
+            max_kernels=max_kernels,
+            n_starts=1,
+            max_iterations=max_iterations,
+            tolerance=tolerance,
+            scaling=scaling,
+        )
 
     def _expert(self, sums: WeightedSums, old: SparseRegression | None) -> SparseRegression:
         return maximise_evidence(sums, self._prior, old)

@@ -41,12 +41,15 @@ Floats = NDArray[np.float32]
 
 # Joints of the poses that are learned.
 JOINTS = (
-    'neck', 'head',
-    *(f'{side}_{name}'
-      for name in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle', 'toe', 'hand')
-      for side in ('left', 'right')),
+    'neck',
+    'head',
+    *(
+        f'{side}_{name}'
+        for name in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle', 'toe', 'hand')
+        for side in ('left', 'right')
+    ),
     'pelvis',
-)  # fmt: skip
+)
 # Landmarks of schemes of joint centres, behind those on the skin, and the rows that they replace.
 CENTRES = tuple(name for name in INSTEAD if name != 'centre_of_neck')
 REPLACED = tuple(LANDMARKS.index(INSTEAD[name]) for name in CENTRES)
@@ -174,10 +177,14 @@ def keypoint_tracks(
             weights.append(share * np.sqrt(len(poses)))
     counts = np.array([len(x) for x in roots], dtype=np.intp)
     return KeypointTracks(
-        np.concatenate(places), np.concatenate(joints), np.concatenate(roots),
-        np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp), counts, np.array(persons),
+        np.concatenate(places),
+        np.concatenate(joints),
+        np.concatenate(roots),
+        np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp),
+        counts,
+        np.array(persons),
         np.array(weights) / np.sum(weights),
-    )  # fmt: skip
+    )
 
 
 def _other_lengths(

@@ -88,9 +88,12 @@ def lift_poses(
     level = body.level if ups is None else roll(ups.mean(0))
     upright = body.levelled(level)
     found = poses_of(
-        upright, [one for one in lifted if one is not None], rays[rows], confidences[rows],
+        upright,
+        [one for one in lifted if one is not None],
+        rays[rows],
+        confidences[rows],
         KNOWN_SIZE if lengths_known else UNKNOWN_SIZE,
-    )  # fmt: skip
+    )
     result: list[GaussianMixture | None] = [None] * len(lifted)
     for row, mixture in zip(rows, found, strict=True):
         result[row] = relevelled(upright, mixture, body)
@@ -174,9 +177,13 @@ def _fitted(
     def energy(x: Array, rows: Index) -> tuple[Array, Array, Array]:
         frames = forward(skeleton, x)
         placed = point_energy(
-            frames, skeleton.joint_segments[which], skeleton.joint_offsets[which],
-            means[rows].transpose(1, 2, 0), ones[:, rows], whiten[..., rows],
-        )  # fmt: skip
+            frames,
+            skeleton.joint_segments[which],
+            skeleton.joint_offsets[which],
+            means[rows].transpose(1, 2, 0),
+            ones[:, rows],
+            whiten[..., rows],
+        )
         marks = point_energy(
             frames, segments, local, nothing[..., rows], precision[:, rows], across[..., rows]
         )
@@ -185,10 +192,15 @@ def _fitted(
         return total.value, *total.derivatives()
 
     found = minimise(
-        EnergyFunction(energy), poses, body.lower, body.upper,
-        step_scale=np.where(skeleton.dof_is_rotation, 0.5, 0.3), damping=1.0,
-        max_iterations=ITERATIONS, tolerance=TOLERANCE,
-    )  # fmt: skip
+        EnergyFunction(energy),
+        poses,
+        body.lower,
+        body.upper,
+        step_scale=np.where(skeleton.dof_is_rotation, 0.5, 0.3),
+        damping=1.0,
+        max_iterations=ITERATIONS,
+        tolerance=TOLERANCE,
+    )
     covariances = np.linalg.inv(found.hessian + 1e-6 * np.eye(skeleton.dimension))
     return found.x, np.asarray(0.5 * (covariances + covariances.transpose(0, 2, 1)))
 

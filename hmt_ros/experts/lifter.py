@@ -53,17 +53,24 @@ NEAR = np.array([0.02, *([0.045, 0.06, 0.09, 0.12, 0.17] * 2)])
 
 _SIDED = ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle', 'heel', 'toe')
 LANDMARKS = (
-    'nose', 'left_ear', 'right_ear',
+    'nose',
+    'left_ear',
+    'right_ear',
     *(f'{side}_{name}' for name in _SIDED for side in ('left', 'right')),
-    'neck_base', 'mid_hip', 'centre_of_head',
-)  # fmt: skip
+    'neck_base',
+    'mid_hip',
+    'centre_of_head',
+)
 # Names in schemes of joint centres, in the place of landmarks on the skin.
 INSTEAD = {
-    **{f'centre_of_{side}_{name}': f'{side}_{name}'
-       for name in ('shoulder', 'hip') for side in ('left', 'right')},
+    **{
+        f'centre_of_{side}_{name}': f'{side}_{name}'
+        for name in ('shoulder', 'hip')
+        for side in ('left', 'right')
+    },
     'centre_of_pelvis': 'mid_hip',
     'centre_of_neck': 'neck_base',
-}  # fmt: skip
+}
 CORE = tuple(
     LANDMARKS.index(name)
     for name in ('left_shoulder', 'right_shoulder', 'left_hip', 'right_hip', 'mid_hip')
@@ -72,9 +79,18 @@ CORE = tuple(
 OF_JOINTS = {'pelvis': 'mid_hip', 'neck': 'neck_base', 'head': 'centre_of_head'}
 # Lengths of a person whose proportions are inputs; a rise of the shoulders has none.
 PROPORTIONED = (
-    'thigh', 'shin', 'foot', 'upper_arm', 'forearm', 'hand', 'hip_width', 'hip_drop',
-    'shoulder_width', 'trunk', 'neck_to_head',
-)  # fmt: skip
+    'thigh',
+    'shin',
+    'foot',
+    'upper_arm',
+    'forearm',
+    'hand',
+    'hip_width',
+    'hip_drop',
+    'shoulder_width',
+    'trunk',
+    'neck_to_head',
+)
 # A length counts as at least this share of the usual one.
 SHORTEST = 0.3
 # A keypoint of less confidence is not looked at; fewer landmarks are no person.
@@ -206,11 +222,18 @@ def window_inputs(
     up = np.einsum('nij,nj->ni', turn, ups.astype(f32))
     values = np.concatenate(
         [
-            q.reshape(n, -1), sure.reshape(n, -1), there, late, np.log(extent)[:, None] + f32(2.0),
-            up, (np.abs(up).sum(1) > 0)[:, None], f32(5.0) * persons.astype(f32),
+            q.reshape(n, -1),
+            sure.reshape(n, -1),
+            there,
+            late,
+            np.log(extent)[:, None] + f32(2.0),
+            up,
+            (np.abs(up).sum(1) > 0)[:, None],
+            f32(5.0) * persons.astype(f32),
             (np.abs(persons).sum(1) > 0)[:, None],
-        ], axis=1,
-    )  # fmt: skip
+        ],
+        axis=1,
+    )
     return WindowInputs(values.astype(f32), axes, (now > 0).sum(1) >= FEWEST)
 
 
@@ -308,10 +331,12 @@ class Lifter:
         rows, there, times = filled(stamps, at, causal=causal)
         n = len(at)
         inputs = window_inputs(
-            rays[rows], confidences[rows] * there[..., None], times,
+            rays[rows],
+            confidences[rows] * there[..., None],
+            times,
             np.zeros((n, 3)) if ups is None else ups,
             np.zeros((n, len(PROPORTIONED))) if person is None else np.tile(person, (n, 1)),
-        )  # fmt: skip
+        )
         result: list[LiftedPoses | None] = [None] * n
         seen = np.flatnonzero(inputs.known)
         if len(seen):
@@ -325,9 +350,12 @@ class Lifter:
     def save(self, path: str | Path) -> Path:
         """Writes the lifter into an .npz file, with half precision, and returns its path."""
         parameters = {
-            'joints': list(self.joints), 'landmarks': list(LANDMARKS), 'times': TIMES.tolist(),
-            'body': self.usual.name, 'notes': self.notes,
-        }  # fmt: skip
+            'joints': list(self.joints),
+            'landmarks': list(LANDMARKS),
+            'times': TIMES.tolist(),
+            'body': self.usual.name,
+            'notes': self.notes,
+        }
         return write_arrays(path, header(KIND, parameters) | self.network.to_arrays())
 
     @classmethod

@@ -146,9 +146,12 @@ class NearestNeighbours(_NeighbourModel):
         if self.n_neighbours < 1:
             raise ValueError(f'n_neighbours is {self.n_neighbours}, wanted at least 1')
         pairs = checked_pairs(
-            inputs, targets, sample_weight,
-            at_least=self.n_neighbours + 1, what='one more than neighbours',
-        )  # fmt: skip
+            inputs,
+            targets,
+            sample_weight,
+            at_least=self.n_neighbours + 1,
+            what='one more than neighbours',
+        )
         ridge = self._keep_pairs(pairs)
         distances, index = self._nearest(self._scaled, self.n_neighbours + 1)
         # A sample is its own neighbour, though not always the first where inputs are equal.
@@ -231,9 +234,12 @@ class LocalExperts(_NeighbourModel):
                 f'{self.width_neighbour}: wanted at least 1 of each, the width among the neighbours'
             )
         pairs = checked_pairs(
-            inputs, targets, sample_weight,
-            at_least=max(self.n_neighbours, self.n_experts) + 1, what='one more than neighbours',
-        )  # fmt: skip
+            inputs,
+            targets,
+            sample_weight,
+            at_least=max(self.n_neighbours, self.n_experts) + 1,
+            what='one more than neighbours',
+        )
         ridge = self._keep_pairs(pairs)
         rng = np.random.default_rng(self.seed)
         left_out = np.sort(rng.permutation(len(pairs))[:LEFT_OUT])

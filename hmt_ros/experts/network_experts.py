@@ -160,9 +160,11 @@ class NetworkExperts(ConditionalDensity):
         out = self._layers.outputs(seen).astype(np.float64)
         gates, means, widths = _read(out, self.n_experts, self.n_outputs_)
         return Components(
-            log_softmax(gates), means * of_targets.scale + of_targets.centre,
-            np.exp(2.0 * np.clip(widths, -WIDTHS, WIDTHS)), self.noise_,
-        )  # fmt: skip
+            log_softmax(gates),
+            means * of_targets.scale + of_targets.centre,
+            np.exp(2.0 * np.clip(widths, -WIDTHS, WIDTHS)),
+            self.noise_,
+        )
 
     def jacobians(self, inputs: ArrayLike) -> Array:
         """Derivatives (n, M, D, p) of the components' means with respect to the input."""
@@ -182,11 +184,14 @@ class NetworkExperts(ConditionalDensity):
     def _learned(self) -> Arrays:
         return {
             **self._layers.to_arrays(),
-            'input_centre': self._of_inputs.centre, 'input_scale': self._of_inputs.scale,
-            'target_centre': self._of_targets.centre, 'target_scale': self._of_targets.scale,
-            'noise': self.noise_.astype(np.float32), 'centres': self._centres.astype(np.float16),
+            'input_centre': self._of_inputs.centre,
+            'input_scale': self._of_inputs.scale,
+            'target_centre': self._of_targets.centre,
+            'target_scale': self._of_targets.scale,
+            'noise': self.noise_.astype(np.float32),
+            'centres': self._centres.astype(np.float16),
             'spacing': np.array(self._spacing),
-        }  # fmt: skip
+        }
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         a = {name: np.asarray(value) for name, value in arrays.items()}
@@ -194,8 +199,10 @@ class NetworkExperts(ConditionalDensity):
             Layers.from_arrays(a),
             Standardisation(a['input_centre'], a['input_scale']),
             Standardisation(a['target_centre'], a['target_scale']),
-            a['noise'].astype(np.float64), a['centres'].astype(np.float64), float(a['spacing']),
-        )  # fmt: skip
+            a['noise'].astype(np.float64),
+            a['centres'].astype(np.float64),
+            float(a['spacing']),
+        )
 
 
 def _read(out: Any, m: int, d: int) -> tuple[Any, Any, Any]:

@@ -171,8 +171,11 @@ def _rotation_by_root(points: Array) -> Array:
     zero, one = np.zeros_like(a), np.ones_like(a)
     by_a = [[-2 * k * a, -k * b, one], [-k * b, zero, zero], [-one, zero, zero]]
     by_b = [[zero, -k * a, zero], [-k * a, -2 * k * b, one], [zero, -one, zero]]
-    by_c = [[k * k * a * a, k * k * a * b, zero], [k * k * a * b, k * k * b * b, zero],
-            [zero, zero, one]]  # fmt: skip
+    by_c = [
+        [k * k * a * a, k * k * a * b, zero],
+        [k * k * a * b, k * k * b * b, zero],
+        [zero, zero, one],
+    ]
     change = np.array([by_a, by_b, by_c]).transpose(3, 0, 1, 2)  # (N, component, 3, 3)
     skew = change @ ray_rotations(points)[:, None].transpose(0, 1, 3, 2)
     # A direction keeps its length: only changes across it count.

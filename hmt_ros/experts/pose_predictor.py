@@ -143,9 +143,14 @@ class PosePredictor:
         """
         _check_body(body, self.body.dof_names, f'this predictor, of {self.body.name}')
         return PosePredictor(
-            body, self.descriptor, self.model, self.target_basis, self.equilibrium, self.dynamics,
+            body,
+            self.descriptor,
+            self.model,
+            self.target_basis,
+            self.equilibrium,
+            self.dynamics,
             self.notes,
-        )  # fmt: skip
+        )
 
     def predict(self, mask: ArrayLike, camera: Camera) -> GaussianMixture:
         """Mixture over poses of the person in a mask (H, W); see `observe`."""
@@ -190,9 +195,13 @@ class PosePredictor:
             descriptor, previous, interval, propagation=propagation, max_components=max_components
         )
         placement = place_roots(
-            self.encoding, camera, blob, targets.means, targets.covariances,
+            self.encoding,
+            camera,
+            blob,
+            targets.means,
+            targets.covariances,
             size_spread=size_spread,
-        )  # fmt: skip
+        )
         means, covariances = placed_gaussians(
             self.encoding, targets.means, targets.covariances, placement
         )
@@ -234,9 +243,12 @@ class PosePredictor:
         forgotten = -math.expm1(-FORGETTING * interval)
         if propagation == BY_DYNAMICS:
             return self._by_dynamics(
-                _transformed(found, self._from_basis), previous, interval, forgotten,
+                _transformed(found, self._from_basis),
+                previous,
+                interval,
+                forgotten,
                 max_components,
-            )  # fmt: skip
+            )
         if propagation != BY_EXPERTS:
             raise ValueError(f'no propagation {propagation!r}, wanted one of {PROPAGATIONS}')
         if self.dynamics is None:
@@ -248,17 +260,24 @@ class PosePredictor:
         known = np.linalg.inv(before.covariances) + np.linalg.inv(self.equilibrium.covariances)
         before = GaussianMixture(before.weights, before.means, np.linalg.inv(known))
         after = propagate(
-            self.dynamics, _transformed(before, self.target_basis), row, without_past=found,
+            self.dynamics,
+            _transformed(before, self.target_basis),
+            row,
+            without_past=found,
             n_components=max_components,
-        )  # fmt: skip
+        )
         whole = joined([(1.0 - forgotten, after), (forgotten, found)])
         whole = _heaviest(reduced(whole, max_components), max_components)
         return _transformed(whole, self._from_basis)
 
     def _by_dynamics(
-        self, found: GaussianMixture, previous: GaussianMixture, interval: float,
-        forgotten: float, count: int,
-    ) -> GaussianMixture:  # fmt: skip
+        self,
+        found: GaussianMixture,
+        previous: GaussianMixture,
+        interval: float,
+        forgotten: float,
+        count: int,
+    ) -> GaussianMixture:
         """Rule (9), over targets."""
         prior = self._to_targets(self._expected(previous, interval))
         wider = np.zeros(self.encoding.size)
@@ -268,9 +287,13 @@ class PosePredictor:
             for x in (prior, found)
         )
         result = propagate_by_dynamics(
-            prior, found, self.equilibrium, share=share_of_time(interval, LASTING),
-            forgotten=forgotten, n_components=count,
-        )  # fmt: skip
+            prior,
+            found,
+            self.equilibrium,
+            share=share_of_time(interval, LASTING),
+            forgotten=forgotten,
+            n_components=count,
+        )
         return _heaviest(result, count)
 
     def _expected(self, poses: GaussianMixture, interval: float) -> GaussianMixture:
@@ -342,10 +365,14 @@ class PosePredictor:
                 np.ones(1), arrays['equilibrium_mean'][None], arrays['equilibrium_covariance'][None]
             )
             return cls(
-                body, descriptor, model, np.asarray(arrays['target_basis'], dtype=np.float64),
-                equilibrium, stored_model(dynamics, where) if dynamics else None,
+                body,
+                descriptor,
+                model,
+                np.asarray(arrays['target_basis'], dtype=np.float64),
+                equilibrium,
+                stored_model(dynamics, where) if dynamics else None,
                 parameters['notes'],
-            )  # fmt: skip
+            )
         except _WrongBodyError as fault:
             raise ValueError(str(fault)) from None
         except FileNotFoundError as fault:

@@ -84,9 +84,14 @@ def _local(experts: int, seed: int, samples: int | None) -> ConditionalDensity:
 
 def _conditional(experts: int, seed: int, _: int | None) -> ConditionalDensity:
     return ConditionalExperts(
-        experts, scaling='common', seed=seed, width=WIDTH, n_starts=1, max_iterations=5,
+        experts,
+        scaling='common',
+        seed=seed,
+        width=WIDTH,
+        n_starts=1,
+        max_iterations=5,
         max_kernels=200,
-    )  # fmt: skip
+    )
 
 
 def _joint(experts: int, seed: int, _: int | None) -> ConditionalDensity:
@@ -187,9 +192,12 @@ def described(
     rows = [descriptor.describe([silhouette_parts(mask, descriptor.points)])[0] for mask in masks]
     encoding = PoseEncoding(body)
     return Described(
-        descriptor, np.array(rows), encoding.encode(pairs.poses),
-        encoding.encode(pairs.previous), pairs.sequences,
-    )  # fmt: skip
+        descriptor,
+        np.array(rows),
+        encoding.encode(pairs.poses),
+        encoding.encode(pairs.previous),
+        pairs.sequences,
+    )
 
 
 def learned_predictor(

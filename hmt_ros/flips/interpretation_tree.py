@@ -107,9 +107,16 @@ def _grown(
     angles = np.empty((len(poses), count, len(chain.dofs)))
     valid = np.zeros((len(poses), count), dtype=np.bool_)
     grow_leaves(
-        chain, frames.columns, frames.origins, poses, targets, float(slack), given_stays, angles,
+        chain,
+        frames.columns,
+        frames.origins,
+        poses,
+        targets,
+        float(slack),
+        given_stays,
+        angles,
         valid,
-    )  # fmt: skip
+    )
     return angles, valid
 
 

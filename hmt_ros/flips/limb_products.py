@@ -100,9 +100,16 @@ class LimbProducts:
             np.full((len(modes), len(counts), most), np.inf),
         )
         exchanged = fill_configurations(
-            placing_of(skeleton), limbs, modes, more, counts, flipped, float(price), float(apart),
+            placing_of(skeleton),
+            limbs,
+            modes,
+            more,
+            counts,
+            flipped,
+            float(price),
+            float(apart),
             result,
-        )  # fmt: skip
+        )
         used = slice(1 + exchanged + len(flipped))
         result = result._replace(
             trunks=result.trunks[used], angles=result.angles[used], counts=result.counts[used]
@@ -131,9 +138,15 @@ class LimbProducts:
         return poses
 
     def best(
-        self, energies: Array, log_weights: Array, *, exchange: float, flip: float, share: float,
+        self,
+        energies: Array,
+        log_weights: Array,
+        *,
+        exchange: float,
+        flip: float,
+        share: float,
         count: int,
-    ) -> Products:  # fmt: skip
+    ) -> Products:
         """The most probable products on each trunk, best first, trunk after trunk.
 
         The cost of a product is the sum over limbs of the share of the changes in energy and of the
@@ -149,11 +162,21 @@ class LimbProducts:
         prices[0], prices[1 : 1 + self.exchanged] = 0.0, exchange
         most = len(found.trunks) * count
         poses, parents, values = (
-            np.empty((most, self.body.dimension)), np.empty(most, dtype=np.intp), np.empty(most),
-        )  # fmt: skip
+            np.empty((most, self.body.dimension)),
+            np.empty(most, dtype=np.intp),
+            np.empty(most),
+        )
         n = combine(
-            limbs_of(self.body.skeleton), self.modes, found, energies,
-            np.asarray(log_weights, dtype=np.float64), np.logaddexp.reduce(log_weights) - prices,
-            float(share), int(count), poses, parents, values,
-        )  # fmt: skip
+            limbs_of(self.body.skeleton),
+            self.modes,
+            found,
+            energies,
+            np.asarray(log_weights, dtype=np.float64),
+            np.logaddexp.reduce(log_weights) - prices,
+            float(share),
+            int(count),
+            poses,
+            parents,
+            values,
+        )
         return Products(poses[:n], parents[:n], values[:n])

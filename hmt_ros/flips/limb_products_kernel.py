@@ -118,10 +118,17 @@ def _links(limbs, c):  # type: ignore[no-untyped-def]
     """The `ChainLinks` of limb c."""
     k, d = limbs.links[c], limbs.dofs[c]
     return ChainLinks(
-        limbs.segments[c, :k], limbs.parents[c], limbs.mounts[c, :k], limbs.mounted[c, :k],
-        limbs.lengths[c, :k], limbs.first_dofs[c, : k + 1], limbs.own[c, :d], limbs.lower[c, :d],
-        limbs.upper[c, :d], limbs.sides[c, :k],
-    )  # fmt: skip
+        limbs.segments[c, :k],
+        limbs.parents[c],
+        limbs.mounts[c, :k],
+        limbs.mounted[c, :k],
+        limbs.lengths[c, :k],
+        limbs.first_dofs[c, : k + 1],
+        limbs.own[c, :d],
+        limbs.lower[c, :d],
+        limbs.upper[c, :d],
+        limbs.sides[c, :k],
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -152,10 +159,16 @@ def _hang(limbs, c, columns, origins, pose, ends, slack, leaves, out):  # type: 
     count, width = 1 << limbs.links[c], leaves.shape[2]
     valid = np.zeros((1, count), np.bool_)
     grow_leaves(
-        links, columns.reshape(len(columns), 3, 3, 1), origins.reshape(len(origins), 3, 1),
-        pose.reshape(1, len(pose)), ends, slack, given, leaves[0, :count].reshape(1, count, width),
+        links,
+        columns.reshape(len(columns), 3, 3, 1),
+        origins.reshape(len(origins), 3, 1),
+        pose.reshape(1, len(pose)),
+        ends,
+        slack,
+        given,
+        leaves[0, :count].reshape(1, count, width),
         valid,
-    )  # fmt: skip
+    )
     n = 0
     for leaf in range(1 if given else 0, count):
         if valid[0, leaf]:

@@ -23,18 +23,29 @@ from hmt_ros.body.skeleton import Skeleton, other_side
 from hmt_ros.inference.arrays import Array, Index
 
 WHOLE = {
-    'pelvis', 'neck', 'head',
-    *(f'{side}_{name}' for name in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
-      for side in ('left', 'right')),
-}  # fmt: skip
+    'pelvis',
+    'neck',
+    'head',
+    *(
+        f'{side}_{name}'
+        for name in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
+        for side in ('left', 'right')
+    ),
+}
 # Deviation of a joint without an estimate, m.
 UNKNOWN = 0.5
 HIPS = ('left_hip', 'right_hip')
 # The joint that each joint hangs on by a bone; the others hang on the middle of the hips.
 CARRIERS = {
-    'head': 'neck', 'shoulder': 'neck', 'elbow': 'shoulder', 'wrist': 'elbow', 'hand': 'wrist',
-    'knee': 'hip', 'ankle': 'knee', 'toe': 'ankle',
-}  # fmt: skip
+    'head': 'neck',
+    'shoulder': 'neck',
+    'elbow': 'shoulder',
+    'wrist': 'elbow',
+    'hand': 'wrist',
+    'knee': 'hip',
+    'ankle': 'knee',
+    'toe': 'ankle',
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +83,13 @@ class LiftedPoses:
         """The mixture over some of the joints."""
         rows = [self.joints.index(name) for name in names]
         return LiftedPoses(
-            tuple(names), self.log_weights, self.means[:, rows], self.deviations[:, rows],
-            self.axes, self.lengths[rows],
-        )  # fmt: skip
+            tuple(names),
+            self.log_weights,
+            self.means[:, rows],
+            self.deviations[:, rows],
+            self.axes,
+            self.lengths[rows],
+        )
 
     def sized(self, skeleton: Skeleton) -> Array:
         """The means (C, J, 3) of a person with the lengths of a skeleton that has the joints."""
@@ -100,9 +115,13 @@ class LiftedPoses:
         swapped = [self.joints.index(other_side(name)) for name in self.joints]
         mirror = np.array([1.0, 1.0, -1.0])
         return LiftedPoses(
-            self.joints, self.log_weights, self.means[:, swapped] * mirror,
-            self.deviations[:, swapped], self.axes, self.lengths[swapped],
-        )  # fmt: skip
+            self.joints,
+            self.log_weights,
+            self.means[:, swapped] * mirror,
+            self.deviations[:, swapped],
+            self.axes,
+            self.lengths[swapped],
+        )
 
 
 def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
@@ -157,9 +176,13 @@ def from_positions(
         lengths[j] = np.linalg.norm(places[j] - start)
     spread = np.array([deviations[name.rpartition('_')[2]] for name in names])
     return LiftedPoses(
-        names, np.zeros(1), (places @ axes.T)[None], np.repeat(spread[None, :, None], 3, axis=2),
-        axes, lengths,
-    )  # fmt: skip
+        names,
+        np.zeros(1),
+        (places @ axes.T)[None],
+        np.repeat(spread[None, :, None], 3, axis=2),
+        axes,
+        lengths,
+    )
 
 
 @lru_cache(maxsize=64)

@@ -165,11 +165,15 @@ class ImageLikelihood:
         assert observation.keypoints is not None
         exchanges = usual_exchanges() if exchanges is None else exchanges
         return KeypointTerm(
-            self.body.skeleton, self.camera, observation.keypoints,
+            self.body.skeleton,
+            self.camera,
+            observation.keypoints,
             replace(self.settings.keypoints, weight=share * self.settings.keypoints.weight),
-            observation.magnification, exchanges,
-            None if observation.beliefs is None else observation.beliefs.keypoints, lifted_share,
-        )  # fmt: skip
+            observation.magnification,
+            exchanges,
+            None if observation.beliefs is None else observation.beliefs.keypoints,
+            lifted_share,
+        )
 
     @cached_property
     def priors(self) -> tuple[FrameTerm, ...]:
@@ -212,9 +216,16 @@ class ImageLikelihood:
 
             def work(first: int, last: int) -> None:
                 add_energies(
-                    first, last, self.model, inputs, shape, placement, energies, gradient,
+                    first,
+                    last,
+                    self.model,
+                    inputs,
+                    shape,
+                    placement,
+                    energies,
+                    gradient,
                     hessian,
-                )  # fmt: skip
+                )
 
             in_threads(work, n, threads=self.threads)
         result = {term.name: energies[:, i] for i, term in enumerate(TERMS) if running[i]} or {
@@ -258,9 +269,12 @@ class ImageLikelihood:
             if beliefs is not None:
                 weight *= beliefs.of_term(term.name)
             weighting = Weighting(
-                weight, float(s.sigma), float(s.scale), float(observation.magnification),
+                weight,
+                float(s.sigma),
+                float(s.scale),
+                float(observation.magnification),
                 float(s.growth),
-            )  # fmt: skip
+            )
             result.append(term.inputs(weighting, evidence, request))
         return tuple(result)
 

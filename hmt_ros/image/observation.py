@@ -135,9 +135,15 @@ def observe(
         measured = np.where(others, 0.0, depth)
     before = None if last_image is None else np.ascontiguousarray(last_image[rows, columns])
     part = ImageWindow(
-        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful, hidden,
+        np.ascontiguousarray(image[rows, columns]),
+        left,
+        top,
+        mask,
+        before,
+        doubtful,
+        hidden,
         None if measured is None else measured[rows, columns],
-    )  # fmt: skip
+    )
     terms = [term for term in TERMS if wanted is None or term.name in wanted]
     takes = [partial(term.evidence, part) for term in terms]
     flow, *found = together([partial(optical_flow, part), *takes], threads)

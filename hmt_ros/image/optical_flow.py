@@ -95,9 +95,16 @@ class FlowTerm:
         gradient = np.zeros((n if derivatives else 0, d))
         hessian = np.zeros((n if derivatives else 0, d, d))
         add_flow(
-            self.compiled, tree_of(self.skeleton), self.lens, np.ascontiguousarray(rows),
-            *frames.by_pose(), *frames.dofs_by_pose(), value, gradient, hessian,
-        )  # fmt: skip
+            self.compiled,
+            tree_of(self.skeleton),
+            self.lens,
+            np.ascontiguousarray(rows),
+            *frames.by_pose(),
+            *frames.dofs_by_pose(),
+            value,
+            gradient,
+            hessian,
+        )
         return Energy(value, gradient, hessian) if derivatives else Energy(value)
 
     @property
@@ -146,10 +153,18 @@ def add_flow(  # type: ignore[no-untyped-def]
             for a in range(2):
                 error = e0 if a == 0 else e1
                 add_residual(
-                    wrenches, stiffnesses, s, p0, p1, p2, projection[0, a, 0] * inverse,
-                    projection[0, a, 1] * inverse, projection[0, a, 2] * inverse,
-                    curvature * error, curvature,
-                )  # fmt: skip
+                    wrenches,
+                    stiffnesses,
+                    s,
+                    p0,
+                    p1,
+                    p2,
+                    projection[0, a, 0] * inverse,
+                    projection[0, a, 1] * inverse,
+                    projection[0, a, 2] * inverse,
+                    curvature * error,
+                    curvature,
+                )
         if len(hessians) > 0:
             assemble_pose(
                 tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradients[n], hessians[n]

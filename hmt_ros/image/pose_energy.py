@@ -132,9 +132,22 @@ class PoseEnergy:
 
         def work(first: int, last: int) -> None:
             solve(
-                first, last, compiled, self._point, self._free, rows, exact, limits, NO_DESCENT,
-                x, value, gradient, hessian, parts, *nothing,
-            )  # fmt: skip
+                first,
+                last,
+                compiled,
+                self._point,
+                self._free,
+                rows,
+                exact,
+                limits,
+                NO_DESCENT,
+                x,
+                value,
+                gradient,
+                hessian,
+                parts,
+                *nothing,
+            )
 
         in_threads(work, n, 8, self.likelihood.threads)
         if self.counted is not None:
@@ -167,9 +180,15 @@ class PoseEnergy:
         lower, upper = body.lower[self._free], body.upper[self._free]
         if self._strange:
             return minimise(
-                self, x, lower, upper, step_scale=step_scale, damping=damping,
-                max_iterations=max_iterations, tolerance=tolerance,
-            )  # fmt: skip
+                self,
+                x,
+                lower,
+                upper,
+                step_scale=step_scale,
+                damping=damping,
+                max_iterations=max_iterations,
+                tolerance=tolerance,
+            )
         x = np.clip(self._checked(x), lower, upper)
         n, f = x.shape
         metric = np.broadcast_to(np.asarray(step_scale, dtype=np.float64) ** -2.0, (f,)).copy()
@@ -182,9 +201,23 @@ class PoseEnergy:
 
         def work(first: int, last: int) -> None:
             solve(
-                first, last, compiled, self._point, self._free, rows, False, limits, descent, x,
-                value, gradient, hessian, parts, status, iterations,
-            )  # fmt: skip
+                first,
+                last,
+                compiled,
+                self._point,
+                self._free,
+                rows,
+                False,
+                limits,
+                descent,
+                x,
+                value,
+                gradient,
+                hessian,
+                parts,
+                status,
+                iterations,
+            )
 
         in_threads(work, n, 2, self.likelihood.threads)
         if self.counted is not None:
@@ -303,17 +336,21 @@ def _empty_parts(values: int, derivatives: int, d: int) -> tuple[Array, Array, A
 
 # Kinds of terms with a kernel here.
 _KNOWN: tuple[Any, ...] = (
-    ObservedImage, KeypointTerm, (MixturePrior, AnglePrior), SelfIntersection, GroundTerm,
+    ObservedImage,
+    KeypointTerm,
+    (MixturePrior, AnglePrior),
+    SelfIntersection,
+    GroundTerm,
     FlowTerm,
-)  # fmt: skip
+)
 NOTHING_SEEN = Observation()
 _NONE, _NO_PAIRS = np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
 _NO_POINTS = Points(_NO_PAIRS, np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)), _NONE)
 _NO_FLOW = FlowInputs(
-    SurfacePoints(
-        _NONE, np.zeros((0, 0), np.int64), np.zeros((0, 0, 3)), np.zeros((0, 0, 2))
-    ), NO_MAP, 0.0,
-)  # fmt: skip
+    SurfacePoints(_NONE, np.zeros((0, 0), np.int64), np.zeros((0, 0, 3)), np.zeros((0, 0, 2))),
+    NO_MAP,
+    0.0,
+)
 _AS_CALLED = np.zeros((1, 1), dtype=np.int64)
 _ONE, _SURE = np.zeros(1), np.zeros((1, 1))
 
@@ -328,6 +365,17 @@ def _no_keypoints(model: Model) -> KeypointInputs:
 def _no_ground(dimension: int) -> Constants:
     none, nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
     return Constants(
-        np.zeros(dimension, dtype=np.bool_), np.zeros((0, dimension), dtype=np.bool_), np.zeros(2),
-        np.zeros(3), 0.0, none, np.zeros((0, 3, 3)), nothing, none, nothing, 0.0, 1.0, 1.0,
-    )  # fmt: skip
+        np.zeros(dimension, dtype=np.bool_),
+        np.zeros((0, dimension), dtype=np.bool_),
+        np.zeros(2),
+        np.zeros(3),
+        0.0,
+        none,
+        np.zeros((0, 3, 3)),
+        nothing,
+        none,
+        nothing,
+        0.0,
+        1.0,
+        1.0,
+    )

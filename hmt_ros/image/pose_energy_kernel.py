@@ -29,9 +29,12 @@ from hmt_ros.inference.bounded_newton import (
 _CONVERGED, _LIMIT, _STALLED, _NOT_FINITE = (
     int(status)
     for status in (
-        Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE,
+        Status.CONVERGED,
+        Status.ITERATION_LIMIT,
+        Status.STALLED,
+        Status.NOT_FINITE,
     )
-)  # fmt: skip
+)
 
 
 class Compiled(NamedTuple):
@@ -119,12 +122,23 @@ class Room(NamedTuple):
 def _room(model, terms, point, f, cues):  # type: ignore[no-untyped-def]
     segments, d = len(model.tree.parents), len(point)
     room = Room(
-        np.empty((1, d)), np.empty((1, segments, 3, 3)), np.empty((1, segments, 3)),
-        np.empty((1, d, 3)), np.zeros((1, d, 3)),
-        new_view(model), np.empty((segments, 6)), np.empty((segments, 6, 6)), np.empty(terms),
-        np.empty(cues), np.empty((1, 2)), np.zeros(1, np.int64), np.empty((cues, d)),
-        np.empty((cues, d, d)), np.empty(f), np.empty((f, f)),
-    )  # fmt: skip
+        np.empty((1, d)),
+        np.empty((1, segments, 3, 3)),
+        np.empty((1, segments, 3)),
+        np.empty((1, d, 3)),
+        np.zeros((1, d, 3)),
+        new_view(model),
+        np.empty((segments, 6)),
+        np.empty((segments, 6, 6)),
+        np.empty(terms),
+        np.empty(cues),
+        np.empty((1, 2)),
+        np.zeros(1, np.int64),
+        np.empty((cues, d)),
+        np.empty((cues, d, d)),
+        np.empty(f),
+        np.empty((f, f)),
+    )
     room.pose[0] = point
     return room
 
@@ -167,34 +181,67 @@ def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: 
         value[0] += room.energies.sum()
         if wanted:
             assemble_pose(
-                compiled.model.tree, axes[0], dof_origins[0], wrenches, stiffnesses, gradient[0],
+                compiled.model.tree,
+                axes[0],
+                dof_origins[0],
+                wrenches,
+                stiffnesses,
+                gradient[0],
                 hessian[0],
-            )  # fmt: skip
+            )
     keypoints = compiled.keypoints
     if len(keypoints.points.groups) > 0 or keypoints.lifted.weight > 0.0:
         own = row if len(keypoints.log_priors) > 1 else 0
         add_keypoints(
-            keypoints, keypoints.log_priors[own : own + 1], columns, origins, axes, dof_origins,
-            keypoint_value, keypoint_gradient, keypoint_hessian,
-        )  # fmt: skip
+            keypoints,
+            keypoints.log_priors[own : own + 1],
+            columns,
+            origins,
+            axes,
+            dof_origins,
+            keypoint_value,
+            keypoint_gradient,
+            keypoint_hessian,
+        )
     if compiled.overlaps.sigma < np.inf:
         add_overlaps(
-            compiled.overlaps, columns, origins, axes, dof_origins, known_value, known_gradient,
+            compiled.overlaps,
+            columns,
+            origins,
+            axes,
+            dof_origins,
+            known_value,
+            known_gradient,
             known_hessian,
-        )  # fmt: skip
+        )
     if compiled.ground.weights.sum() > 0.0:
         room.ground[:] = 0.0
         add_ground_energies(
-            compiled.ground, columns, origins, axes, dof_origins, room.ground, known_gradient,
+            compiled.ground,
+            columns,
+            origins,
+            axes,
+            dof_origins,
+            room.ground,
+            known_gradient,
             known_hessian,
-        )  # fmt: skip
+        )
         known_value[0] += room.ground.sum()
     if compiled.flow.weight > 0.0:
         room.row[0] = row
         add_flow(
-            compiled.flow, compiled.model.tree, compiled.model.lens, room.row, columns, origins,
-            axes, dof_origins, known_value, known_gradient, known_hessian,
-        )  # fmt: skip
+            compiled.flow,
+            compiled.model.tree,
+            compiled.model.lens,
+            room.row,
+            columns,
+            origins,
+            axes,
+            dof_origins,
+            known_value,
+            known_gradient,
+            known_hessian,
+        )
     return value.sum()
 
 
@@ -254,9 +301,23 @@ def _energy_at(compiled, number, row, free, x, exact, room, slope, curve):  # ty
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def solve(  # type: ignore[no-untyped-def]
-    first, last, compiled, point, free, rows, exact, limits, descent, x, value, gradient, hessian,
-    by_cue, status, iterations,
-):  # fmt: skip
+    first,
+    last,
+    compiled,
+    point,
+    free,
+    rows,
+    exact,
+    limits,
+    descent,
+    x,
+    value,
+    gradient,
+    hessian,
+    by_cue,
+    status,
+    iterations,
+):
     """Energies at the points first to last - 1, or minima from there.
 
     One function for both: a function that calls the kernels of all terms takes long to compile.
@@ -278,8 +339,12 @@ def solve(  # type: ignore[no-untyped-def]
     room = _room(compiled.model, len(compiled.inputs), point, f, 3 if apart else 1)
     slope, curve = room.slope, room.curve
     low, high, step, trial, scratch = (
-        np.empty(f), np.empty(f), np.empty(f), np.empty(f), np.empty(f),
-    )  # fmt: skip
+        np.empty(f),
+        np.empty(f),
+        np.empty(f),
+        np.empty(f),
+        np.empty(f),
+    )
     lower, upper = limits[0], limits[1]
     wanted = len(gradient) > 0
     for n in range(first, last):
@@ -307,9 +372,16 @@ def solve(  # type: ignore[no-untyped-def]
                     else:
                         trial[i] = min(max(x[n, i] + step[i], lower[i]), upper[i])
             found = _energy_at(
-                compiled, n, rows[n], free, trial, exact, room, slope if wanted else slope[:0],
+                compiled,
+                n,
+                rows[n],
+                free,
+                trial,
+                exact,
+                room,
+                slope if wanted else slope[:0],
                 curve,
-            )  # fmt: skip
+            )
             if apart:
                 by_cue[0][n] = room.value
                 if wanted:

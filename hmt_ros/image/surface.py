@@ -87,9 +87,11 @@ def lens_of(camera: Camera) -> Lens:
     k1, k2, k3, k4, k5, k6, k7, k8, *_ = (*map(float, camera.distortion), *(0.0,) * 8)
     model = LENSES[camera.distortion_model] if camera.distortion else -1
     return Lens(
-        (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy)), model,
+        (float(camera.fx), float(camera.fy)),
+        (float(camera.cx), float(camera.cy)),
+        model,
         (k1, k2, k3, k4, k5, k6, k7, k8),
-    )  # fmt: skip
+    )
 
 
 def flesh_table_of(body: Body) -> FleshTable:
@@ -128,10 +130,16 @@ def empty_contour(rings):  # type: ignore[no-untyped-def]
     """Room for the contour of one pose."""
     count = 2 * rings
     return Contour(
-        np.empty(count, np.int64), np.empty((count, 3)), np.empty((count, 2)),
-        np.empty((count, 2, 3)), np.empty((count, 2)), np.empty(count, np.bool_),
-        np.empty(count, np.bool_), np.empty(count, np.bool_), np.empty(count),
-    )  # fmt: skip
+        np.empty(count, np.int64),
+        np.empty((count, 3)),
+        np.empty((count, 2)),
+        np.empty((count, 2, 3)),
+        np.empty((count, 2)),
+        np.empty(count, np.bool_),
+        np.empty(count, np.bool_),
+        np.empty(count, np.bool_),
+        np.empty(count),
+    )
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -151,9 +159,10 @@ def project(lens, x, y, z, i, pixels, projections):  # type: ignore[no-untyped-d
         bottom = 1.0 + s * (k[5] + s * (k[6] + s * k[7]))
         radial = top / bottom
         slope = (
-            k[0] + s * (2.0 * k[1] + s * 3.0 * k[4])
+            k[0]
+            + s * (2.0 * k[1] + s * 3.0 * k[4])
             - radial * (k[5] + s * (2.0 * k[6] + s * 3.0 * k[7]))
-        ) / bottom  # fmt: skip
+        ) / bottom
         u = a * radial + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a)
         v = b * radial + p1 * (s + 2.0 * b * b) + 2.0 * p2 * a * b
         da = radial + 2.0 * a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
@@ -199,13 +208,18 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
     """
     # Fields that are looked up in a loop would be counted as references there, each time.
     part_segments, ring_parts, ring_centres = (
-        flesh.part_segments, flesh.ring_parts, flesh.ring_centres,
-    )  # fmt: skip
+        flesh.part_segments,
+        flesh.ring_parts,
+        flesh.ring_centres,
+    )
     ring_radii, ring_slopes, ring_leans = flesh.ring_radii, flesh.ring_slopes, flesh.ring_leans
     ring_exponents, ring_noise = flesh.ring_exponents, flesh.ring_noise
     parts, points, pixels, projections = (
-        contour.parts, contour.points, contour.pixels, contour.projections,
-    )  # fmt: skip
+        contour.parts,
+        contour.points,
+        contour.pixels,
+        contour.projections,
+    )
     normals, valid, noise = contour.normals, contour.valid, contour.noise
     rings = len(ring_parts)
     cosines, sines = np.empty(2), np.empty(2)
@@ -334,8 +348,10 @@ def mark_visibility(flesh, occluders, columns, origins, parts, points, valid, co
         covered, hidden: (P,) results.
     """
     part_segments, part_centres, part_radii = (
-        flesh.part_segments, flesh.part_centres, flesh.part_radii,
-    )  # fmt: skip
+        flesh.part_segments,
+        flesh.part_centres,
+        flesh.part_radii,
+    )
     count = len(part_segments)
     shapes = np.empty((count, 3, 3))
     centres, k = np.empty((count, 3)), np.empty((count, 3))

@@ -54,18 +54,30 @@ def seen_points(
     k = frames.count
     mesh = coarse_mesh(body)
     result = SurfacePoints(
-        np.zeros(k, np.int64), np.zeros((k, points), np.int64), np.zeros((k, points, 3)),
+        np.zeros(k, np.int64),
+        np.zeros((k, points), np.int64),
+        np.zeros((k, points, 3)),
         np.zeros((k, points, 2)),
-    )  # fmt: skip
+    )
     columns, origins = frames.by_pose()
     flesh, lens = flesh_table_of(body), lens_of(camera)
     hidden = np.zeros((0, 0), np.bool_) if others is None else np.ascontiguousarray(others)
     size = np.array([camera.width, camera.height])
     for i in range(k):
         _see(
-            flesh, mesh.vertices, mesh.normals, mesh.segments, mesh.parts, lens, size,
-            columns[i], origins[i], hidden, i, result,
-        )  # fmt: skip
+            flesh,
+            mesh.vertices,
+            mesh.normals,
+            mesh.segments,
+            mesh.parts,
+            lens,
+            size,
+            columns[i],
+            origins[i],
+            hidden,
+            i,
+            result,
+        )
     return result
 
 

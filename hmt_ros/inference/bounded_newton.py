@@ -160,9 +160,7 @@ def box_steps(  # type: ignore[no-untyped-def]
         n = rows[k]
         for i in range(d):
             low[i], high[i] = lower[n, i] - x[n, i], upper[n, i] - x[n, i]
-        predicted[k] = box_step(
-            gradient[n], hessian[n], low, high, lam[n], metric, step[k], curve
-        )  # fmt: skip
+        predicted[k] = box_step(gradient[n], hessian[n], low, high, lam[n], metric, step[k], curve)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -211,8 +209,9 @@ def _box_step(gradient, hessian, low, high, shift, metric, step):  # type: ignor
             if not bound[i]:
                 free[count] = i
                 count += 1
-        while not _solve(gradient, hessian, shift, metric, bound, free, count, step, factor,
-                         solution):  # fmt: skip
+        while not _solve(
+            gradient, hessian, shift, metric, bound, free, count, step, factor, solution
+        ):
             if shift > DAMPING_LIMIT:
                 break
             # Not positive definite: the least shift that Gershgorin asks for is far too careful.

@@ -138,6 +138,8 @@ ERRORS: Mapping[str, CueErrors] = MappingProxyType(
 # Factor on the depths of experts where they are counted like keypoints: the ratio of the
 # information of both in a second of many images.
 LIFTED_AS_KEYPOINTS = (
-    ERRORS['lifted'].independent / ERRORS['lifted'].time
-    * ERRORS['keypoints'].time / ERRORS['keypoints'].independent
-)  # fmt: skip
+    ERRORS['lifted'].independent
+    / ERRORS['lifted'].time
+    * ERRORS['keypoints'].time
+    / ERRORS['keypoints'].independent
+)

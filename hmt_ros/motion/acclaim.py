@@ -33,8 +33,17 @@ CHANNELS = {
     f'{kind}{letter}': (axis, kind == 'r') for kind in 'tr' for axis, letter in enumerate('xyz')
 }
 BONE_KEYS = (
-    'id', 'name', 'direction', 'length', 'axis', 'dof', 'limits', 'bodymass', 'cofmass', 'end',
-)  # fmt: skip
+    'id',
+    'name',
+    'direction',
+    'length',
+    'axis',
+    'dof',
+    'limits',
+    'bodymass',
+    'cofmass',
+    'end',
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,9 +300,10 @@ def _complete(path: Path, bone: _Bone) -> _Bone:
             raise MotionFileError(path, bone.line, f'bone {bone.name or "?"} has no {key}')
     if bone.limits and len(bone.limits) != len(bone.dofs):
         raise MotionFileError(
-            path, bone.line,
+            path,
+            bone.line,
             f'bone {bone.name}: {len(bone.limits)} limits for {len(bone.dofs)} degrees of freedom',
-        )  # fmt: skip
+        )
     return bone
 
 

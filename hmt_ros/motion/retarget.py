@@ -28,10 +28,18 @@ Misfit = Callable[[Array, Index], tuple[Array, Array, Array]]
 
 # Joints that a motion must have, and the standard deviation of each, m.
 SIGMA = {
-    'pelvis': 0.010, 'neck': 0.005, 'head': 0.015,
-    'hip': 0.005, 'knee': 0.005, 'ankle': 0.005, 'toe': 0.010,
-    'shoulder': 0.005, 'elbow': 0.005, 'wrist': 0.005, 'hand': 0.010,
-}  # fmt: skip
+    'pelvis': 0.010,
+    'neck': 0.005,
+    'head': 0.015,
+    'hip': 0.005,
+    'knee': 0.005,
+    'ankle': 0.005,
+    'toe': 0.010,
+    'shoulder': 0.005,
+    'elbow': 0.005,
+    'wrist': 0.005,
+    'hand': 0.010,
+}
 OPTIONAL = {'toe': 'ankle', 'hand': 'wrist'}  # and the joint that each hangs on
 SHORTEST = 0.02  # m; a shorter foot or hand of a file has no direction
 FRONT = 0.1  # m before the pelvis: a point that carries the recorded rotation of the pelvis
@@ -148,9 +156,12 @@ def retarget(
 
     def misfit(poses: Array, rows: Index) -> tuple[Array, Array, Array]:
         return point_energy(
-            forward(skeleton, poses), segments, local, targets[:, :, rows],
+            forward(skeleton, poses),
+            segments,
+            local,
+            targets[:, :, rows],
             np.broadcast_to(weights, (len(weights), len(rows))),
-        )  # fmt: skip
+        )
 
     return _refined(body, misfit, start, motion.fps)
 
@@ -224,9 +235,14 @@ def _refined(body: Body, misfit: Misfit, start: Array, fps: float) -> Array:
             return value + 0.5 * (pull * off * off).sum(1), gradient + pull * off, hessian
 
         best = minimise(
-            EnergyFunction(objective), poses, skeleton.lower, skeleton.upper,
-            step_scale=step_scale, max_iterations=iterations, tolerance=1e-4,
-        )  # fmt: skip
+            EnergyFunction(objective),
+            poses,
+            skeleton.lower,
+            skeleton.upper,
+            step_scale=step_scale,
+            max_iterations=iterations,
+            tolerance=1e-4,
+        )
         return best.x, best.value
 
     everyone = np.arange(len(start))

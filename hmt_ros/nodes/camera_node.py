@@ -183,9 +183,11 @@ def _parser() -> argparse.ArgumentParser:
         '--fov', type=_angle, metavar='DEGREES', help='field of view from left to right'
     )
     view.add_argument(
-        '--calibration', type=Path, metavar='FILE',
+        '--calibration',
+        type=Path,
+        metavar='FILE',
         help='calibration file, as import-video --camera takes it',
-    )  # fmt: skip
+    )
     parser.add_argument('--frame-id', default=FRAME_ID, help=f'of the images ({FRAME_ID})')
     return parser
 

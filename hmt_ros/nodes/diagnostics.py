@@ -134,17 +134,21 @@ class MiddlewareEvents:
             self._count(f'messages lost of {topic}', count, text)
 
         callbacks = self._misfits(
-            topic, 'publishers of', ('a publisher offers', 'asked for', 'a publisher has'),
+            topic,
+            'publishers of',
+            ('a publisher offers', 'asked for', 'a publisher has'),
             'none of its messages will arrive',
-        )  # fmt: skip
+        )
         return SubscriptionEventCallbacks(**callbacks, message_lost=lost)
 
     def of_publisher(self, topic: str) -> PublisherEventCallbacks:
         """Callbacks for a publisher of a topic, by its full name."""
         callbacks = self._misfits(
-            topic, 'subscriptions to', ('a subscription asks for', 'offered', 'a subscription has'),
+            topic,
+            'subscriptions to',
+            ('a subscription asks for', 'offered', 'a subscription has'),
             'it will get no messages',
-        )  # fmt: skip
+        )
         return PublisherEventCallbacks(**callbacks)
 
     def _misfits(

@@ -346,7 +346,7 @@ def _front(triangles: _Triangles, filled: _Filled, shape: tuple[int, int]) -> _F
     seen = winner[winner >= 0]
     return _Front(
         filled.pixels[seen], filled.rows[seen], filled.columns[seen], which[seen], inverse[seen]
-    )  # fmt: skip
+    )
 
 
 def _extent(places: Array, size: int, margin: int = 0) -> tuple[int, int]:

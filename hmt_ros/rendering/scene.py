@@ -36,9 +36,15 @@ WAVE_LENGTHS = (0.30, 0.16, 0.10, 0.07)  # m, of the waves that make up a patter
 SLEEVE, SHORTS, SOCK = 0.80, 0.15, 0.85
 # Cover of the segments whose name contains the word; everything else is skin.
 KIND_OF_SEGMENT = {
-    'head': 'head', 'neck': 'head', 'trunk': 'shirt', 'pelvis': 'shorts', 'upper_arm': 'sleeve',
-    'thigh': 'shorts', 'shin': 'shin', 'foot': 'shoe',
-}  # fmt: skip
+    'head': 'head',
+    'neck': 'head',
+    'trunk': 'shirt',
+    'pelvis': 'shorts',
+    'upper_arm': 'sleeve',
+    'thigh': 'shorts',
+    'shin': 'shin',
+    'foot': 'shoe',
+}
 
 
 @dataclass(frozen=True)
@@ -70,9 +76,13 @@ class Scene:
 
     def __post_init__(self) -> None:
         for name, low, high in (
-            ('seed', 0, 2**63), ('ambient', 0.0, 1.0), ('shadow', 0.0, 1.0),
-            ('noise', 0.0, 100.0), ('clear', 0.0, 1000.0), ('clutter', 0, 1000),
-        ):  # fmt: skip
+            ('seed', 0, 2**63),
+            ('ambient', 0.0, 1.0),
+            ('shadow', 0.0, 1.0),
+            ('noise', 0.0, 100.0),
+            ('clear', 0.0, 1000.0),
+            ('clutter', 0, 1000),
+        ):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ValueError(f'{name} of a scene must lie in [{low}, {high}], saw {value}')

@@ -276,9 +276,11 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         made = self._by_keypoints
         if made is None:
             made = self._by_keypoints = KeypointPredictor(
-                self._lifter, self._predictor.body, camera,
+                self._lifter,
+                self._predictor.body,
+                camera,
                 size_known=self.parameters.stature > 0,
-            )  # fmt: skip
+            )
         taken = self._inputs[KEYPOINTS].take_all(stamp)
         for each, keypoints in taken.items():
             # Some may come after those of a later image.
@@ -397,9 +399,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return (None, STEP) if interval > p.longest_interval else (previous.mixture, interval)
 
     def _seen(
-        self, mask: Mask, camera: Camera, previous: GaussianMixture | None = None,
+        self,
+        mask: Mask,
+        camera: Camera,
+        previous: GaussianMixture | None = None,
         interval: float = STEP,
-    ) -> Prediction:  # fmt: skip
+    ) -> Prediction:
         return self._predictor.observe(
             mask,
             camera,

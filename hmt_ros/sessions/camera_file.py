@@ -30,12 +30,26 @@ else:
 LARGEST_FILE = 1_000_000  # bytes
 # Names of the entries in several programs.
 _MATRIX = (
-    'camera_matrix', 'Camera_Matrix', 'cameraMatrix', 'K', 'k', 'M1', 'matrix', 'intrinsics',
-)  # fmt: skip
+    'camera_matrix',
+    'Camera_Matrix',
+    'cameraMatrix',
+    'K',
+    'k',
+    'M1',
+    'matrix',
+    'intrinsics',
+)
 _DISTORTION = (
-    'distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'dist_coeffs', 'D', 'd',
-    'D1', 'distortions', 'distortion_coeffs',
-)  # fmt: skip
+    'distortion_coefficients',
+    'Distortion_Coefficients',
+    'distCoeffs',
+    'dist_coeffs',
+    'D',
+    'd',
+    'D1',
+    'distortions',
+    'distortion_coeffs',
+)
 _WIDTH, _HEIGHT = (
     ('image_width', 'image_Width', 'width'),
     ('image_height', 'image_Height', 'height'),
@@ -161,10 +175,15 @@ def _entries(content: dict[Any, Any], model: str, size: tuple[int, int]) -> dict
     if isinstance(content.get('roi'), dict):
         vars(region).update({str(name): value for name, value in content['roi'].items()})
     return {
-        'k': k, 'd': d, 'distortion_model': model, 'width': int(sides[0]), 'height': int(sides[1]),
-        'roi': region, 'binning_x': content.get('binning_x') or 0,
+        'k': k,
+        'd': d,
+        'distortion_model': model,
+        'width': int(sides[0]),
+        'height': int(sides[1]),
+        'roi': region,
+        'binning_x': content.get('binning_x') or 0,
         'binning_y': content.get('binning_y') or 0,
-    }  # fmt: skip
+    }
 
 
 def _first(content: dict[Any, Any], names: tuple[str, ...]) -> Any:

@@ -220,9 +220,12 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
         p = self.parameters
         keypoints = self._keypoints.at_joints(
-            waiting.content(KEYPOINTS), waiting.content(KEYPOINTS_3D), self.start.body,
-            p.keypoint_scheme, waiting.stamp_ns,
-        )  # fmt: skip
+            waiting.content(KEYPOINTS),
+            waiting.content(KEYPOINTS_3D),
+            self.start.body,
+            p.keypoint_scheme,
+            waiting.stamp_ns,
+        )
         prediction = self._prediction_of(waiting) if p.use_predictions else None
         self._follow(waiting, camera, keypoints, prediction)
 
@@ -319,9 +322,15 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             self._turn = fixed.turn_of(tracker.body, posterior.means[0])
         shown_frames = (waiting.frame_id, p.frame_prefix)
         track = TrackedImage(
-            waiting, tracker, posterior, likelihood, p,
-            starts=starts, describe=starts or self._shown_frames != shown_frames, fixed=fixed,
-        )  # fmt: skip
+            waiting,
+            tracker,
+            posterior,
+            likelihood,
+            p,
+            starts=starts,
+            describe=starts or self._shown_frames != shown_frames,
+            fixed=fixed,
+        )
         for topic, message in track_messages(track, self._wanted):
             self._publish(topic, waiting.stamp_ns, message)
         self._shown_frames = shown_frames
@@ -353,9 +362,15 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         if state is KeepOutState.TRACKING and tracker is not None:
             if placed and posterior is not None and not tracker.foreseen:
                 seen = LastSeen(
-                    waiting.stamp_ns, waiting.frame_id, tracker.body, posterior, tracker.forecaster,
-                    fixed, p.keep_out_probability, p.focal_length_sigma,
-                )  # fmt: skip
+                    waiting.stamp_ns,
+                    waiting.frame_id,
+                    tracker.body,
+                    posterior,
+                    tracker.forecaster,
+                    fixed,
+                    p.keep_out_probability,
+                    p.focal_length_sigma,
+                )
             else:
                 state = KeepOutState.LOST
         number, existence, reason = self._tracks, math.nan, 'the image can not be tracked'

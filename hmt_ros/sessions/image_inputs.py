@@ -31,8 +31,12 @@ KEYPOINTS, KEYPOINTS_3D, DETECTIONS = 'keypoints', 'keypoints_3d', 'detections'
 PREDICTION = 'pose_prediction'
 # Types of detections by value of the parameter `source`.
 SOURCES = {
-    'people': PEOPLE_2D, 'yolo': YOLO, 'boxes': BOXES, 'floats': FLOATS, 'skeleton2d': SKELETON_2D,
-}  # fmt: skip
+    'people': PEOPLE_2D,
+    'yolo': YOLO,
+    'boxes': BOXES,
+    'floats': FLOATS,
+    'skeleton2d': SKELETON_2D,
+}
 
 T = TypeVar('T')
 
@@ -102,33 +106,64 @@ def _read_positions(message: Any, _stamp: int) -> Any:
 
 
 MASK_INPUT = ImageInput(
-    MASK, {MASK: IMAGE_TYPE, COMPRESSED_MASK: COMPRESSED_TYPE}, 'use_mask',
-    Fault.MASK, Fault.NO_MASK, _read_mask, lone=Fault.LONE_MASK, told=True, pixels='',
-    remembered=FEWER, largest=LARGEST_MASK,
-)  # fmt: skip
+    MASK,
+    {MASK: IMAGE_TYPE, COMPRESSED_MASK: COMPRESSED_TYPE},
+    'use_mask',
+    Fault.MASK,
+    Fault.NO_MASK,
+    _read_mask,
+    lone=Fault.LONE_MASK,
+    told=True,
+    pixels='',
+    remembered=FEWER,
+    largest=LARGEST_MASK,
+)
 DEPTH_INPUT = ImageInput(
-    DEPTH, {DEPTH: IMAGE_TYPE}, 'use_depth',
-    Fault.DEPTH, Fault.NO_DEPTH, _read_depth, lone=Fault.LONE_DEPTH, told=True,
+    DEPTH,
+    {DEPTH: IMAGE_TYPE},
+    'use_depth',
+    Fault.DEPTH,
+    Fault.NO_DEPTH,
+    _read_depth,
+    lone=Fault.LONE_DEPTH,
+    told=True,
     pixels=': use depth that is registered to the colour camera',
-    remembered=FEWER, largest=LARGEST_DEPTH,
-)  # fmt: skip
+    remembered=FEWER,
+    largest=LARGEST_DEPTH,
+)
 KEYPOINTS_INPUT = ImageInput(
-    KEYPOINTS, {KEYPOINTS: keypoints.KEYPOINTS_2D}, 'use_keypoints',
-    Fault.KEYPOINTS, Fault.NO_KEYPOINTS,
-)  # fmt: skip
+    KEYPOINTS,
+    {KEYPOINTS: keypoints.KEYPOINTS_2D},
+    'use_keypoints',
+    Fault.KEYPOINTS,
+    Fault.NO_KEYPOINTS,
+)
 KEYPOINTS_3D_INPUT = ImageInput(
-    KEYPOINTS_3D, {KEYPOINTS_3D: keypoints.KEYPOINTS_3D}, 'use_keypoints_3d',
-    Fault.KEYPOINTS_3D, Fault.NO_KEYPOINTS_3D, _read_positions,
-)  # fmt: skip
+    KEYPOINTS_3D,
+    {KEYPOINTS_3D: keypoints.KEYPOINTS_3D},
+    'use_keypoints_3d',
+    Fault.KEYPOINTS_3D,
+    Fault.NO_KEYPOINTS_3D,
+    _read_positions,
+)
 PREDICTION_INPUT = ImageInput(
-    PREDICTION, {PREDICTION: POSE_MIXTURE}, 'use_predictions',
-    Fault.PREDICTION, Fault.NO_PREDICTION, reliable=True,
-)  # fmt: skip
+    PREDICTION,
+    {PREDICTION: POSE_MIXTURE},
+    'use_predictions',
+    Fault.PREDICTION,
+    Fault.NO_PREDICTION,
+    reliable=True,
+)
 # Its type depends on the parameter `source`.
 DETECTIONS_INPUT = ImageInput(
-    DETECTIONS, {DETECTIONS: ''}, '', Fault.DETECTIONS, Fault.NO_DETECTIONS,
-    lone=Fault.LONE_DETECTIONS, told=True,
-)  # fmt: skip
+    DETECTIONS,
+    {DETECTIONS: ''},
+    '',
+    Fault.DETECTIONS,
+    Fault.NO_DETECTIONS,
+    lone=Fault.LONE_DETECTIONS,
+    told=True,
+)
 
 # In the order in which images wait for them.
 INPUTS = (MASK_INPUT, KEYPOINTS_INPUT, KEYPOINTS_3D_INPUT, DEPTH_INPUT, PREDICTION_INPUT)

@@ -135,9 +135,14 @@ class KeypointReader:
         self._unknown: set[frozenset[str]] = set()
 
     def read(
-        self, message: Any, stamp: int, parameters: CameraNodeParameters, body: Body,
-        camera: Camera | None, sigma_px: float = 0.0,
-    ) -> Keypoints:  # fmt: skip
+        self,
+        message: Any,
+        stamp: int,
+        parameters: CameraNodeParameters,
+        body: Body,
+        camera: Camera | None,
+        sigma_px: float = 0.0,
+    ) -> Keypoints:
         """The keypoints in a message.
 
         Args:
@@ -156,9 +161,13 @@ class KeypointReader:
         return found
 
     def _found(
-        self, message: Any, stamp: int, p: CameraNodeParameters, camera: Camera | None,
+        self,
+        message: Any,
+        stamp: int,
+        p: CameraNodeParameters,
+        camera: Camera | None,
         sigma_px: float,
-    ) -> Keypoints | None:  # fmt: skip
+    ) -> Keypoints | None:
         if self._source == OWN_KEYPOINTS:
             return keypoints_of(message, sigma_px)
         try:
@@ -184,9 +193,13 @@ class KeypointReader:
         return None if chosen is None else chosen[np.flatnonzero(chosen.seen)]
 
     def at_joints(
-        self, found: Keypoints | None, positions: Positions | None, body: Body, scheme: str,
+        self,
+        found: Keypoints | None,
+        positions: Positions | None,
+        body: Body,
+        scheme: str,
         stamp_ns: int,
-    ) -> Keypoints | None:  # fmt: skip
+    ) -> Keypoints | None:
         """The keypoints that were seen in an image, maybe none, as joints of the body.
 
         Args:

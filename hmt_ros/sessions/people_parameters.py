@@ -10,8 +10,11 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 
 # Inputs of a single person, whose topics can not tell which person it is.
 _OF_ONE = {
-    'subject_file': '', 'use_predictions': False, 'use_keypoints_3d': False, 'person_id': '',
-}  # fmt: skip
+    'subject_file': '',
+    'use_predictions': False,
+    'use_keypoints_3d': False,
+    'person_id': '',
+}
 
 
 @dataclass(frozen=True)

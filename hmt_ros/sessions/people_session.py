@@ -266,9 +266,15 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
                 return
             name = self._new_name(one.detected.name)
             session = PersonSession(
-                name, p, self._publish_output, self._wanted, self.start,
-                background, self.frames, self._log,
-            )  # fmt: skip
+                name,
+                p,
+                self._publish_output,
+                self._wanted,
+                self.start,
+                background,
+                self.frames,
+                self._log,
+            )
             if not one.keypoints.names:
                 session.start_in((*corners[0].tolist(), *corners[1].tolist()))
             person = _Person(name, one.detected.name, ImageTrack(one.sighting, stamp), session)
@@ -319,9 +325,13 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
                 areas[person] = grown(seen)
 
     def _area(
-        self, person: _Person, camera: Camera, one: Found | None, shape: tuple[int, ...],
+        self,
+        person: _Person,
+        camera: Camera,
+        one: Found | None,
+        shape: tuple[int, ...],
         stamp: int,
-    ) -> Mask:  # fmt: skip
+    ) -> Mask:
         """Pixels (H, W) that a person is expected to cover."""
         tracker = person.session.tracker
         if not person.session.begun or tracker is None:

@@ -138,9 +138,18 @@ class RobotOutputs:
             held = seen.capsules.grown(reach_after(unseen))
             probability = seen.probability
         return KeepOut(
-            stamp, told.frame_id, state, held.starts, held.ends, held.radii, told.track_id,
-            told.existence, unseen, probability, reason,
-        )  # fmt: skip
+            stamp,
+            told.frame_id,
+            state,
+            held.starts,
+            held.ends,
+            held.radii,
+            told.track_id,
+            told.existence,
+            unseen,
+            probability,
+            reason,
+        )
 
     def forecast(self, stamp_ns: int) -> PoseMixture:
         """The pose at a time after the newest image.
@@ -165,12 +174,16 @@ class RobotOutputs:
             frame = seen.fixed.optical
         tracking = told.state is KeepOutState.TRACKING
         return PoseMixture.of_body(
-            body, mixture, MixtureKind.FORECAST, stamp_ns, frame,
+            body,
+            mixture,
+            MixtureKind.FORECAST,
+            stamp_ns,
+            frame,
             state=TrackState.TRACKING if tracking else TrackState.LOST,
             track_id=told.track_id,
             existence_probability=told.existence,
             identities=seen.forecaster.modes.identities,
-        )  # fmt: skip
+        )
 
     def due(self, rate: float, horizon: float) -> Iterable[int]:
         """Times on a grid, ns, within the horizon of the newest image and of none before.

@@ -106,9 +106,13 @@ def trajectory_content(
 
 
 def window_messages(
-    found: TrajectoryMixture, of: SmoothedBody, wanted: Callable[[str], bool], *,
-    covariances: bool, shapes: Mapping[int, Array],
-) -> Iterator[tuple[str, Any]]:  # fmt: skip
+    found: TrajectoryMixture,
+    of: SmoothedBody,
+    wanted: Callable[[str], bool],
+    *,
+    covariances: bool,
+    shapes: Mapping[int, Array],
+) -> Iterator[tuple[str, Any]]:
     """Topics and messages of a window; arguments as of `trajectory_content`."""
     if wanted('trajectory_mixture'):
         content = trajectory_content(found, of, covariances=covariances, shapes=shapes)
@@ -121,9 +125,14 @@ def window_messages(
 
 
 def final_messages(
-    pose: FinalPose, of: SmoothedBody, told: OpenPose, wanted: Callable[[str], bool], *,
-    components: int, frame_prefix: str | None,
-) -> Iterator[tuple[str, Any]]:  # fmt: skip
+    pose: FinalPose,
+    of: SmoothedBody,
+    told: OpenPose,
+    wanted: Callable[[str], bool],
+    *,
+    components: int,
+    frame_prefix: str | None,
+) -> Iterator[tuple[str, Any]]:
     """Topics and messages of a pose that will not be revised.
 
     Args:
@@ -191,9 +200,15 @@ def nobody_messages(
         yield 'trajectory_markers', _markers(of, nothing, np.empty(0), stamp_ns)
     if wanted('smoothed_pose_mixture'):
         content = PoseMixture.of_body(
-            of.body, None, MixtureKind.SMOOTHED, stamp_ns, of.frame_id, state=TrackState.NOBODY,
-            track_id=of.track_id, existence_probability=existence,
-        )  # fmt: skip
+            of.body,
+            None,
+            MixtureKind.SMOOTHED,
+            stamp_ns,
+            of.frame_id,
+            state=TrackState.NOBODY,
+            track_id=of.track_id,
+            existence_probability=existence,
+        )
         yield 'smoothed_pose_mixture', pose_mixture_message(MESSAGES, content)
 
 

@@ -223,9 +223,12 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._weights = update.trajectories.weights
             shapes = _shapes((at, one.shape) for at, one in self._open.items())
             for topic, made in window_messages(
-                update.trajectories, of, self._wanted,
-                covariances=p.publish_covariances, shapes=shapes,
-            ):  # fmt: skip
+                update.trajectories,
+                of,
+                self._wanted,
+                covariances=p.publish_covariances,
+                shapes=shapes,
+            ):
                 self._publish(topic, stamp, made)
         for pose in update.final:
             self._publish_final(pose, of)
@@ -345,9 +348,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _publish_final(self, pose: FinalPose, of: SmoothedBody) -> None:
         p = self.parameters
         for topic, made in final_messages(
-            pose, of, self._open.pop(pose.stamp_ns), self._wanted,
-            components=p.max_hypotheses, frame_prefix=p.frame_prefix if p.publish_tf else None,
-        ):  # fmt: skip
+            pose,
+            of,
+            self._open.pop(pose.stamp_ns),
+            self._wanted,
+            components=p.max_hypotheses,
+            frame_prefix=p.frame_prefix if p.publish_tf else None,
+        ):
             self._publish(topic, pose.stamp_ns, made)
 
     def smooth_span(self, from_ns: int = 0, to_ns: int = 0) -> Any:

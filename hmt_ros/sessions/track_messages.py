@@ -155,9 +155,13 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
         yield 'markers', array
     if p.overlay_modes and wanted('overlay/compressed'):
         drawn = draw_modes(
-            track.waiting.image, tracker.camera, joints, skeleton.bones, posterior.weights,
+            track.waiting.image,
+            tracker.camera,
+            joints,
+            skeleton.bones,
+            posterior.weights,
             p.overlay_modes,
-        )  # fmt: skip
+        )
         yield 'overlay/compressed', compressed_image_message(MESSAGES, drawn, stamp, frame)
 
 
@@ -175,9 +179,16 @@ def nobody_messages(
     for topic, kind in kinds.items():
         if wanted(topic):
             content = PoseMixture.of_body(
-                body, None, kind, stamp, frame, state=state, track_id=tracker.track_id,
-                existence_probability=tracker.existence_probability, reason=tracker.reason,
-            )  # fmt: skip
+                body,
+                None,
+                kind,
+                stamp,
+                frame,
+                state=state,
+                track_id=tracker.track_id,
+                existence_probability=tracker.existence_probability,
+                reason=tracker.reason,
+            )
             yield topic, pose_mixture_message(MESSAGES, content)
     if wanted('markers'):
         names, ranks = body.joint_names, tracker.settings.max_hypotheses
@@ -193,9 +204,11 @@ def nobody_messages(
 
 
 def robot_messages(
-    robot: RobotOutputs, parameters: FilterParameters, wanted: Callable[[str], bool],
+    robot: RobotOutputs,
+    parameters: FilterParameters,
+    wanted: Callable[[str], bool],
     silence: float | None = None,
-) -> Iterator[Made]:  # fmt: skip
+) -> Iterator[Made]:
     """Topics, stamps and messages that robots act on.
 
     Args:

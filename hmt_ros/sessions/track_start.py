@@ -78,9 +78,14 @@ class TrackStart:
         background = self.background_model(camera) if shared is None else shared
         known = p.known_ground if ground is None else ground
         tracker = Tracker(
-            self.body, camera, p.tracker, background, p.random_seed, known_ground=known,
+            self.body,
+            camera,
+            p.tracker,
+            background,
+            p.random_seed,
+            known_ground=known,
             shared_background=shared is not None,
-        )  # fmt: skip
+        )
         tracker.reset(self.initial, box=self.box)
         return tracker
 

@@ -93,9 +93,14 @@ def likelihoods(body: Body) -> list[Any]:
         means = np.stack([body.prior_mean + 0.01 * t, body.prior_mean - 0.05])
         covariances = np.tile(1e-3 * np.eye(body.dimension), (2, 1, 1))
         content = PoseMixture.of_body(
-            body, GaussianMixture(np.array([0.6, 0.4]), means, covariances),
-            MixtureKind.LIKELIHOOD, _stamp(t), '', error_share=0.5, error_time=0.1,
-        )  # fmt: skip
+            body,
+            GaussianMixture(np.array([0.6, 0.4]), means, covariances),
+            MixtureKind.LIKELIHOOD,
+            _stamp(t),
+            '',
+            error_share=0.5,
+            error_time=0.1,
+        )
         made.append(pose_mixture_message(messages, content))
     return made
 

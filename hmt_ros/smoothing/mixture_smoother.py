@@ -277,9 +277,14 @@ class MixtureSmoother:
         iterations = self.max_iterations if self.adapt else 0
         found = self._descended(candidates, prior, likelihood, seed, iterations)
         result = self._mixture(
-            found.weights, found.states, found.factors, found.inflation, prior, likelihood,
+            found.weights,
+            found.states,
+            found.factors,
+            found.inflation,
+            prior,
+            likelihood,
             stamps_ns,
-        )  # fmt: skip
+        )
         return replace(result, free_energy=found.free_energy, free_energy_fresh=found.fresh)
 
     def _mixture(

@@ -396,10 +396,22 @@ class FreeEnergy:
             for i in range(edges[part], edges[part + 1]):
                 points = means[i] + inflation[i] * roots[i]
                 add_overlaps(
-                    i, points, noise[i], log_weights, log_scales, means, inflation, bands,
-                    near[i], self.size * farthest[i], derivatives, weights[i] / samples,
-                    each[i], slope[i], *sums[part],
-                )  # fmt: skip
+                    i,
+                    points,
+                    noise[i],
+                    log_weights,
+                    log_scales,
+                    means,
+                    inflation,
+                    bands,
+                    near[i],
+                    self.size * farthest[i],
+                    derivatives,
+                    weights[i] / samples,
+                    each[i],
+                    slope[i],
+                    *sums[part],
+                )
                 energy, pull = self._energy(points)
                 each[i] += energy
                 if derivatives:

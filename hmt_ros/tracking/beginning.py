@@ -148,9 +148,12 @@ def _from_subject(shown: Shown) -> Beginning:
     assert isinstance(subject, Subject)
     fresh = shown.stamp - subject.stamp_ns <= SAME_MOMENT_NS
     begun = start_from_keypoints(
-        shown.model, shown.camera, subject, upright=shown.upright,
+        shown.model,
+        shown.camera,
+        subject,
+        upright=shown.upright,
         depths=shown.depths if fresh else None,
-    )  # fmt: skip
+    )
     return Beginning(Source.SUBJECT, begun.body, begun.poses, clicked=subject.keypoints)
 
 

@@ -308,9 +308,14 @@ class MixtureFilter:
         body, modes, s = self.body, self.modes, self.settings.likelihood
         alone = None
         found = of_silhouette(
-            body, self.camera, modes.poses, observation, s.coverage,
-            self._outline_costs, self._points,
-        )  # fmt: skip
+            body,
+            self.camera,
+            modes.poses,
+            observation,
+            s.coverage,
+            self._outline_costs,
+            self._points,
+        )
         self.misfit = 0.0
         if OUTLINE in found and observation.outline is not None:
             self.misfit = found[OUTLINE].share
@@ -408,13 +413,23 @@ class MixtureFilter:
         selected, posterior = optimised[kept.chosen[order]], self._posterior
         origins = pooled_origins(histories, log_weights, kept.owner)[order]
         self._modes = modes = posterior_modes(
-            selected, weights[order], origins, posterior, observation, self.shape, self.dynamics,
-            states, self._identities_of(selected.hypotheses, anew=states is None), self._dt,
-        )  # fmt: skip
+            selected,
+            weights[order],
+            origins,
+            posterior,
+            observation,
+            self.shape,
+            self.dynamics,
+            states,
+            self._identities_of(selected.hypotheses, anew=states is None),
+            self._dt,
+        )
         posterior.exchanges.update(
-            posterior.likelihood, observation, modes.poses,
+            posterior.likelihood,
+            observation,
+            modes.poses,
             posterior.exchanges_of(selected.hypotheses),
-        )  # fmt: skip
+        )
         self._publish(modes)
         self._outline_costs = posterior.fit(modes.poses, observation).outline_costs
         self._points = None
@@ -431,10 +446,12 @@ class MixtureFilter:
         if unseen.any():
             spread, self._sources, postures = postures_of(self.body).spread(modes.mixture, unseen)
             modes = replace(
-                modes[self._sources], poses=spread.means, covariances=spread.covariances,
+                modes[self._sources],
+                poses=spread.means,
+                covariances=spread.covariances,
                 log_weights=np.log(spread.weights),
                 identities=modes.identities[self._sources] + (postures << OF_POSTURE),
-            )  # fmt: skip
+            )
         if modes.origins.shape[1]:
             share = weights / np.bincount(before, weights)[before]
             modes = replace(modes, origins=modes.origins[:, before] * share)
@@ -490,9 +507,14 @@ class MixtureFilter:
         poses, weights = self.modes.poses, np.exp(self.modes.log_weights[best])
         gradients, covariances = self._posterior.given_way(poses, observation)
         body = self.shape.update(
-            self._posterior.likelihood, observation, poses[best], weights / weights.sum(),
-            gradients[best], covariances[best], trust=trust,
-        )  # fmt: skip
+            self._posterior.likelihood,
+            observation,
+            poses[best],
+            weights / weights.sum(),
+            gradients[best],
+            covariances[best],
+            trust=trust,
+        )
         self._posterior.evaluations += len(weights)
         self._use_body(body)
         return True

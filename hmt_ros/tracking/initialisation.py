@@ -105,9 +105,13 @@ def start_from_keypoints(
 
 
 def _start(
-    body: Body, camera: Camera, subject: Subject, prior_weight: float, upright: Gravity | None,
+    body: Body,
+    camera: Camera,
+    subject: Subject,
+    prior_weight: float,
+    upright: Gravity | None,
     depths: ImageMap | None,
-) -> Start:  # fmt: skip
+) -> Start:
     """See `start_from_keypoints`."""
     body = _sized(body, subject)
     keypoints = subject.keypoints
@@ -127,9 +131,14 @@ def _start(
 
 
 def _with_flips(
-    body: Body, camera: Camera, keypoints: Keypoints, prior_weight: float, upright: Gravity | None,
-    depths: ImageMap | None, guesses: Array,
-) -> Minimum:  # fmt: skip
+    body: Body,
+    camera: Camera,
+    keypoints: Keypoints,
+    prior_weight: float,
+    upright: Gravity | None,
+    depths: ImageMap | None,
+    guesses: Array,
+) -> Minimum:
     """Distinct poses that explain joints, best first, from guesses (N, d) and all their flips.
 
     Raises:
@@ -275,9 +284,12 @@ def _is_a_stature(body: Body, lengths: Array) -> bool:
 
 
 def _fit_with_lengths(
-    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None,
+    body: Body,
+    camera: Camera,
+    keypoints: Keypoints,
+    upright: Gravity | None,
     measured: JointDepths,
-) -> Minimum:  # fmt: skip
+) -> Minimum:
     """Fits (pose, lengths) to the joints from several headings; x is (HEADINGS, d + L)."""
     skeleton = body.skeleton
     d, count = body.dimension, len(skeleton.length_names)
@@ -362,15 +374,24 @@ def _fit_with_lengths(
     )
     scale = np.concatenate([np.where(skeleton.dof_is_rotation, 0.4, 0.3), np.full(count, 0.05)])
     return minimise(
-        EnergyFunction(energy), starts, lower, upper, step_scale=scale, damping=10.0,
-        max_iterations=80, tolerance=1e-3,
-    )  # fmt: skip
+        EnergyFunction(energy),
+        starts,
+        lower,
+        upper,
+        step_scale=scale,
+        damping=10.0,
+        max_iterations=80,
+        tolerance=1e-3,
+    )
 
 
 def _first_guesses(
-    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None,
+    body: Body,
+    camera: Camera,
+    keypoints: Keypoints,
+    upright: Gravity | None,
     measured: JointDepths,
-) -> Array:  # fmt: skip
+) -> Array:
     """Mean poses at several headings, at the joints, at the distance that their spread gives."""
     seen = keypoints.seen
     pixels = keypoints.pixels[seen]
@@ -401,9 +422,12 @@ def _first_guesses(
 
 def _solve(energy: PoseEnergy, poses: Array, body: Body) -> Minimum:
     return energy.minimise(
-        poses, step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3), damping=1.0,
-        max_iterations=40, tolerance=1e-3,
-    )  # fmt: skip
+        poses,
+        step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
+        damping=1.0,
+        max_iterations=40,
+        tolerance=1e-3,
+    )
 
 
 def _distinct(solved: Minimum, body: Body, count: int) -> Minimum:

@@ -125,17 +125,25 @@ class Observer:
         if keypoints is not None and not keypoints.seen.any():
             keypoints = None
         found = observe(
-            view.image, view.silhouette if validity.believes(SILHOUETTE) else None, keypoints,
-            last_image=self.last_image if self._settings.flow_weight > 0 else None, wanted=wanted,
-            unsure=view.unsure, others=view.others, depth=view.depth,
+            view.image,
+            view.silhouette if validity.believes(SILHOUETTE) else None,
+            keypoints,
+            last_image=self.last_image if self._settings.flow_weight > 0 else None,
+            wanted=wanted,
+            unsure=view.unsure,
+            others=view.others,
+            depth=view.depth,
             threads=self._settings.threads,
-        )  # fmt: skip
+        )
         evidence = dict(found.evidence)
         depths = evidence.get(DEPTH.name)
         if not validity.believes(DEPTH.name):
             evidence.pop(DEPTH.name, None)
         magnification = 0.0 if pose is None else self._camera.magnification(float(pose[2]))
         return replace(
-            found, evidence=evidence, foreground=view.silhouette, depths=depths,
+            found,
+            evidence=evidence,
+            foreground=view.silhouette,
+            depths=depths,
             magnification=magnification,
-        )  # fmt: skip
+        )

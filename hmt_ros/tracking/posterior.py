@@ -240,9 +240,12 @@ class Posterior:
     def minimise(self, term: PoseEnergy, poses: Array, iterations: int) -> Minimum:
         """Minima from poses (N, d) within the limits of the body."""
         return term.minimise(
-            poses, step_scale=self._step_scale, damping=1.0, max_iterations=iterations,
+            poses,
+            step_scale=self._step_scale,
+            damping=1.0,
+            max_iterations=iterations,
             tolerance=TOLERANCE,
-        )  # fmt: skip
+        )
 
     def fit(self, poses: Array, observation: Observation, lifted_share: float = 1.0) -> ImageFit:
         """Fit of poses (K, d) to an image; `lifted_share` as for `keypoint_term`."""
@@ -259,9 +262,14 @@ class Posterior:
         gradient, hessian = found.energy.derivatives()
         free = ~resting(poses, gradient, self.body.lower, self.body.upper)
         fit = ImageFit(
-            found.energy, found.values[:, :2].sum(1), found.hessians[:, 0], found.hessians[:, 1],
-            found.outline_costs, free, free_covariances(hessian, free),
-        )  # fmt: skip
+            found.energy,
+            found.values[:, :2].sum(1),
+            found.hessians[:, 0],
+            found.hessians[:, 1],
+            found.outline_costs,
+            free,
+            free_covariances(hessian, free),
+        )
         self._last_fit = (poses, observation, share, fit)
         return fit
 

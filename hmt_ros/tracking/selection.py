@@ -56,9 +56,13 @@ def choose_hypotheses(
     top = log_weights.max()
     weights = np.exp(log_weights - top)
     chosen, owner = _choose(
-        np.ascontiguousarray(joints), weights / weights.sum(), count, same, cap,
+        np.ascontiguousarray(joints),
+        weights / weights.sum(),
+        count,
+        same,
+        cap,
         np.array(first, dtype=np.intp),
-    )  # fmt: skip
+    )
     groups = np.array([np.logaddexp.reduce(log_weights[owner == k]) for k in range(len(chosen))])
     return Kept(chosen, owner, groups)
 

@@ -95,9 +95,14 @@ class TrackerSettings:
         if self.motion not in MOTIONS:
             raise ValueError(f'motion must be one of {MOTIONS}, saw {self.motion!r}')
         for name in (
-            'evaluation_budget', 'max_hypotheses', 'candidates', 'combinations', 'alternatives',
-            'samples', 'iterations',
-        ):  # fmt: skip
+            'evaluation_budget',
+            'max_hypotheses',
+            'candidates',
+            'combinations',
+            'alternatives',
+            'samples',
+            'iterations',
+        ):
             if not getattr(self, name) >= 1:
                 raise ValueError(f'{name} must be at least 1, saw {getattr(self, name)}')
         if self.threads < 0:

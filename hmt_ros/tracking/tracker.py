@@ -237,10 +237,17 @@ class Tracker:
             near, dt = self.modes.poses, seconds(stamp - self._followed)
         doubted = self.silhouettes.doubted
         view = self._observer.view(
-            image, stamp, keypoints, mask, self.body, near, dt,
+            image,
+            stamp,
+            keypoints,
+            mask,
+            self.body,
+            near,
+            dt,
             predicted=False if nobody_predicted else True if prediction is not None else None,
-            others=others, depth=depth,
-        )  # fmt: skip
+            others=others,
+            depth=depth,
+        )
         if self.silhouettes.doubted > doubted and (
             not self._track.begun or self.started_from in FROM_SILHOUETTES
         ):
@@ -593,10 +600,18 @@ class Tracker:
             self._begin(near, arrived, stamp)
         else:
             shown = Shown(
-                view, stamp, self.model.levelled(self.body.level), self._track.body, self.camera,
-                self._gravity, self._given, self._box, prediction, masked,
+                view,
+                stamp,
+                self.model.levelled(self.body.level),
+                self._track.body,
+                self.camera,
+                self._gravity,
+                self._given,
+                self._box,
+                prediction,
+                masked,
                 lambda: self._observe(view, None),
-            )  # fmt: skip
+            )
             beginning = first_start(shown, self._existence)
             if beginning is None:
                 if self._given is not None or self._existence.llr <= 0.0:

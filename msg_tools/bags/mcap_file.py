@@ -170,9 +170,12 @@ class McapFile:
                 bytes_here = RECORD.size + length
                 if run and run.offset + run.size == offset and run.size < RUN_BYTES:
                     run = _Block(
-                        min(run.start, time), max(run.end, time), run.offset, run.size + bytes_here,
+                        min(run.start, time),
+                        max(run.end, time),
+                        run.offset,
+                        run.size + bytes_here,
                         is_chunk=False,
-                    )  # fmt: skip
+                    )
                     self._blocks[-1] = run
                 else:
                     run = _Block(time, time, offset, bytes_here, is_chunk=False)

@@ -23,10 +23,14 @@ _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 # Other names of the models. Of a pinhole the number of coefficients tells it, as in OpenCV.
 _PINHOLE = ('pinhole', 'perspective', 'none')
 _ALIASES = {
-    'radtan': 'plumb_bob', 'brown_conrady': 'plumb_bob', 'brown-conrady': 'plumb_bob',
-    'fisheye': 'equidistant', 'equi': 'equidistant', 'kannala_brandt': 'equidistant',
+    'radtan': 'plumb_bob',
+    'brown_conrady': 'plumb_bob',
+    'brown-conrady': 'plumb_bob',
+    'fisheye': 'equidistant',
+    'equi': 'equidistant',
+    'kannala_brandt': 'equidistant',
     'kannala_brandt4': 'equidistant',
-}  # fmt: skip
+}
 # Skew that is dropped, in focal lengths; it shifts the border of an image by 2 px at most, about.
 _LARGEST_SKEW = 0.01
 

@@ -111,8 +111,10 @@ def keep_out_of(message: Any) -> KeepOut:
         state = KeepOutState(int(message.state))
     except ValueError as error:
         raise MessageError(f'keep out: state {message.state} is unknown') from error
-    flat = {name: numbers(getattr(message, name), (3 * n,), f'keep out: {name}')
-            for name in ('starts', 'ends')}  # fmt: skip
+    flat = {
+        name: numbers(getattr(message, name), (3 * n,), f'keep out: {name}')
+        for name in ('starts', 'ends')
+    }
     return KeepOut(
         time_ns(message.header.stamp),
         str(message.header.frame_id),

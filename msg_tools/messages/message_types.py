@@ -243,9 +243,19 @@ class GeneratedMessages:
 
 
 _TYPE_CODES = {
-    'boolean': '?', 'octet': 'B', 'uint8': 'B', 'int8': 'b', 'uint16': 'H', 'int16': 'h',
-    'uint32': 'I', 'int32': 'i', 'uint64': 'Q', 'int64': 'q', 'float': 'f', 'double': 'd',
-}  # fmt: skip
+    'boolean': '?',
+    'octet': 'B',
+    'uint8': 'B',
+    'int8': 'b',
+    'uint16': 'H',
+    'int16': 'h',
+    'uint32': 'I',
+    'int32': 'i',
+    'uint64': 'Q',
+    'int64': 'q',
+    'float': 'f',
+    'double': 'd',
+}
 
 
 def _sequence(value: NDArray[Any], kind: str) -> Any:

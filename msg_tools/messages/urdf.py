@@ -62,9 +62,14 @@ def body_urdf(
 
 
 def _add_segment(
-    robot: ET.Element, joints: list[ET.Element], skeleton: Skeleton, index: int, parent: str,
-    rod_radius: float, link_prefix: str,
-) -> None:  # fmt: skip
+    robot: ET.Element,
+    joints: list[ET.Element],
+    skeleton: Skeleton,
+    index: int,
+    parent: str,
+    rod_radius: float,
+    link_prefix: str,
+) -> None:
     """Adds the links and joints that lead from a parent link to a segment."""
     name, offset = skeleton.segment_names[index], skeleton.offsets[index]
     # Degrees of freedom; None: a fixed joint. The mount stands before the first rotation.

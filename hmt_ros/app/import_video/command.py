@@ -157,17 +157,21 @@ def add_camera_arguments(parser: CommandParser, *, required: bool = True) -> Non
     camera = camera.add_mutually_exclusive_group(required=required)
     angle = number(1, 150, what='an angle', unit=' degrees')
     camera.add_argument(
-        '--fov', type=angle, metavar='DEGREES',
+        '--fov',
+        type=angle,
+        metavar='DEGREES',
         help='horizontal field of view, from the left border of the upright image to the right',
-    )  # fmt: skip
+    )
     camera.add_argument(
         '--vertical-fov', type=angle, metavar='DEGREES', help='field of view from top to bottom'
     )
     camera.add_argument(
-        '--camera', type=Path, metavar='FILE',
+        '--camera',
+        type=Path,
+        metavar='FILE',
         help='calibration file of OpenCV (YAML, XML, JSON), ROS (YAML), kalibr (camchain YAML), '
         'anipose, Pose2Sim or caliscope (TOML); FILE:NAME is camera NAME of several',
-    )  # fmt: skip
+    )
 
 
 def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) -> None:
@@ -178,9 +182,10 @@ def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) 
     add_camera_arguments(parser, required=camera_required)
     frames = parser.add_argument_group('frames')
     frames.add_argument(
-        '--fps', type=number(0.01, 1000),
+        '--fps',
+        type=number(0.01, 1000),
         help='images per second of a folder; replaces the times in a video file',
-    )  # fmt: skip
+    )
     seconds = number(0, 1e6, what='a time', unit=' s')
     frames.add_argument(
         '--start', type=seconds, default=0.0, help='time of the first frame to import, s'
@@ -192,58 +197,77 @@ def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) 
         '--every', type=whole_number(1), default=1, metavar='N', help='import every N-th frame'
     )
     frames.add_argument(
-        '--first-stamp', type=whole_number(1, 2**62), default=START_NS, metavar='NS',
+        '--first-stamp',
+        type=whole_number(1, 2**62),
+        default=START_NS,
+        metavar='NS',
         help=f'stamp of the first frame of SOURCE, ns (default: {START_NS})',
-    )  # fmt: skip
+    )
     frames.add_argument(
-        '--jpeg-quality', type=whole_number(1, 100), default=90, metavar='Q',
+        '--jpeg-quality',
+        type=whole_number(1, 100),
+        default=90,
+        metavar='Q',
         help='JPEG quality of images that are not JPEG files, 1 to 100 (default: 90)',
-    )  # fmt: skip
+    )
     person = parser.add_argument_group('the person')
     found = person.add_mutually_exclusive_group()
     found.add_argument(
         '--keypoints', type=Path, metavar='PATH', help='what a detector found, see below'
     )
     found.add_argument(
-        '--detector', choices=[MEDIAPIPE],
+        '--detector',
+        choices=[MEDIAPIPE],
         help='find keypoints with MediaPipe Pose, where it is installed',
-    )  # fmt: skip
+    )
     add_keypoint_arguments(person)
     person.add_argument(
-        '--masks', type=Path, metavar='PATH',
+        '--masks',
+        type=Path,
+        metavar='PATH',
         help='masks of the person, bright on black: a folder of images, or a video',
-    )  # fmt: skip
+    )
     person.add_argument(
         '--detector-masks', action='store_true', help='also take the masks of --detector'
     )
     person.add_argument(
-        '--first-number', type=whole_number(0), default=0, metavar='N',
+        '--first-number',
+        type=whole_number(0),
+        default=0,
+        metavar='N',
         help='number of the first frame for keypoints and masks (default: 0)',
-    )  # fmt: skip
+    )
 
 
 def add_keypoint_arguments(parser: argparse._ActionsContainer) -> None:
     """Adds the arguments that say how keypoints are read."""
     parser.add_argument(
-        '--person', type=person_choice, default=Choice(), metavar='WHICH',
+        '--person',
+        type=person_choice,
+        default=Choice(),
+        metavar='WHICH',
         help='person to import if there are several: largest in each frame; nearest to the one '
         'before, from the largest on; at:X,Y or at:X,Y,T, who is there, px, at that time, s; '
         'track:N, the N-th longest track, from 1; id:NAME, as the detector tracks them; or index:N,'
         ' the N-th in the list of each frame, from 0 (default: nearest)',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--keypoints-size', type=image_size, metavar='WxH',
+        '--keypoints-size',
+        type=image_size,
+        metavar='WxH',
         help='size of the images that the keypoints were found in (default: that in their file, or '
         'that of the images)',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--scheme', default=AUTO,
+        '--scheme',
+        default=AUTO,
         help='names or order of the keypoints, see docs/keypoints.md (auto)',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--mirror', action='store_true',
+        '--mirror',
+        action='store_true',
         help='undo a mirrored recording, of a selfie camera: frames, keypoints, masks, sides',
-    )  # fmt: skip
+    )
 
 
 def person_choice(text: str) -> Choice:
@@ -404,9 +428,13 @@ def camera_of(
 
 
 def _write(
-    bag: BagWriter, options: ImportOptions, frames: Iterable[Frame], see: Seer, lifts: bool,
+    bag: BagWriter,
+    options: ImportOptions,
+    frames: Iterable[Frame],
+    see: Seer,
+    lifts: bool,
     tell: Tell,
-) -> Imported:  # fmt: skip
+) -> Imported:
     """Writes frame after frame; one is in memory at a time.
 
     With `lifts` every image has a message with positions, maybe of none.

@@ -71,102 +71,135 @@ def _parser() -> CommandParser:
         EPILOG,
     )
     parser.add_argument(
-        'bags', nargs='+', type=Path, metavar='IN',
+        'bags',
+        nargs='+',
+        type=Path,
+        metavar='IN',
         help='bag: a folder, or a file such as .mcap; several bags or a folder of bags, see below',
-    )  # fmt: skip
+    )
     parser.add_output('OUT', 'bag', 'folder of the new bag, or of the new bags')
     parser.add_argument(
-        '--live', action='store_true',
+        '--live',
+        action='store_true',
         help='run the real nodes, over DDS, one image at a time; the new bag is the same',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--no-smoother', action='store_false', dest='with_smoother',
+        '--no-smoother',
+        action='store_false',
+        dest='with_smoother',
         help='only track; the new bag has no smoothed poses',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--keep-going', action='store_true',
+        '--keep-going',
+        action='store_true',
         help='skip unusable messages, with a warning for the first of each kind of fault, and read '
         'a damaged bag as far as possible (default: stop there)',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--people', action='store_true',
+        '--people',
+        action='store_true',
         help='track several people, found by the detections in the bag, each into topics '
         'humans/bodies/<id>/...; without smoother and BME',
-    )  # fmt: skip
+    )
     parser.add_argument(
-        '--scheduler', metavar='ADDRESS',
+        '--scheduler',
+        metavar='ADDRESS',
         help='replay many bags through Dask: address of a scheduler, or local for all cores of '
         'this machine',
-    )  # fmt: skip
+    )
 
     person = parser.add_argument_group('the person')
     person.add_argument('--subject', type=Path, metavar='FILE', help='subject file, see below')
     person.add_argument(
-        '--bme', nargs='?', const='', metavar='MODEL',
+        '--bme',
+        nargs='?',
+        const='',
+        metavar='MODEL',
         help='also predict poses with a trained model and use them (always without --subject and '
         'keypoints); '
         'without MODEL use the small model that comes with the package',
-    )  # fmt: skip
+    )
     person.add_argument(
-        '--background', type=Path, metavar='FILE',
+        '--background',
+        type=Path,
+        metavar='FILE',
         help='image of the empty scene (default: learned from the images before the track starts)',
-    )  # fmt: skip
+    )
     person.add_argument(
         '--body', metavar='NAME', help='body model: a name or a YAML file (default: human37)'
     )
 
     settings = parser.add_argument_group('settings')
     settings.add_argument(
-        '--config', action='append', default=[], type=Path, metavar='FILE',
+        '--config',
+        action='append',
+        default=[],
+        type=Path,
+        metavar='FILE',
         help='parameter file, such as hmt_ros/config/filter_node.yaml, which lists all parameters '
         'of the filter; sections smoother_node and bme_node are for the other nodes; may be '
         'repeated',
-    )  # fmt: skip
+    )
     settings.add_argument(
-        '--set', action='append', default=[], dest='settings', metavar='NAME=VALUE',
+        '--set',
+        action='append',
+        default=[],
+        dest='settings',
+        metavar='NAME=VALUE',
         help='one parameter of the filter, or smoother.NAME=VALUE, or bme.NAME=VALUE; may be '
         'repeated, and takes precedence over --config',
-    )  # fmt: skip
+    )
     settings.add_argument(
         '--seed', type=int, metavar='N', help='seed of all random numbers (default: 0)'
     )
 
     topics = parser.add_argument_group('topics')
     topics.add_argument(
-        '--image-topic', metavar='NAME',
+        '--image-topic',
+        metavar='NAME',
         help='topic of the images (default: image/compressed, else image, else the only topic of '
         'images)',
-    )  # fmt: skip
+    )
     topics.add_argument(
-        '--camera-info-topic', metavar='NAME',
+        '--camera-info-topic',
+        metavar='NAME',
         help='topic of the calibration (default: camera_info beside the images, else the only one)',
-    )  # fmt: skip
+    )
     topics.add_argument(
-        '--mask-topic', metavar='NAME',
+        '--mask-topic',
+        metavar='NAME',
         help='topic of the masks (default: mask, else mask/compressed)',
-    )  # fmt: skip
+    )
     topics.add_argument(
-        '--depth-topic', metavar='NAME',
+        '--depth-topic',
+        metavar='NAME',
         help='topic of depth images that are registered to the images (default: depth)',
-    )  # fmt: skip
+    )
     topics.add_argument(
-        '--keypoints-topic', metavar='NAME',
+        '--keypoints-topic',
+        metavar='NAME',
         help='topic of the 2D keypoints (default: keypoints)',
-    )  # fmt: skip
+    )
     topics.add_argument(
-        '--times', choices=(STAMPS, LOG_TIMES), default=STAMPS,
+        '--times',
+        choices=(STAMPS, LOG_TIMES),
+        default=STAMPS,
         help='times of the images: their stamps, or log: when they were recorded, where stamps are '
         'missing or wrong (default: stamps)',
-    )  # fmt: skip
+    )
     topics.add_argument(
-        '--namespace', type=_namespace, default='', metavar='NAME',
+        '--namespace',
+        type=_namespace,
+        default='',
+        metavar='NAME',
         help='namespace of the results, such as /humans/bodies/anna (default: the root); topics of '
         'IN in this namespace are preferred to those in the root',
-    )  # fmt: skip
+    )
     topics.add_argument(
-        '--with-images', action='store_true',
+        '--with-images',
+        action='store_true',
         help='also copy images and camera_info into OUT (bags get large)',
-    )  # fmt: skip
+    )
     return parser
 
 

@@ -358,9 +358,12 @@ class LiveNode:
                 raw=True,
             )
         node.create_subscription(
-            player.classes[HANDLED], f'/{self.full_name}/handled', _into(self._answers),
-            player.reliable, raw=True,
-        )  # fmt: skip
+            player.classes[HANDLED],
+            f'/{self.full_name}/handled',
+            _into(self._answers),
+            player.reliable,
+            raw=True,
+        )
         # Created last: discovery announces the topics above to the node before this client.
         self._state = node.create_client(GetState, f'/{self.full_name}/get_state')
         self._state_request = GetState.Request()

@@ -37,9 +37,16 @@ from msg_tools.files.error_line import error_line
 
 # Options that change the new bag, besides the parameters.
 _DECIDING = (
-    'image_topic', 'camera_info_topic', 'mask_topic', 'depth_topic', 'keypoints_topic', 'namespace',
-    'with_images', 'keep_going', 'times',
-)  # fmt: skip
+    'image_topic',
+    'camera_info_topic',
+    'mask_topic',
+    'depth_topic',
+    'keypoints_topic',
+    'namespace',
+    'with_images',
+    'keep_going',
+    'times',
+)
 
 DONE, BEFORE, FAILED = 'done', 'done before', 'failed'
 

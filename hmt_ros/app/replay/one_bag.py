@@ -152,9 +152,15 @@ def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
 
 
 def _play(
-    options: ReplayOptions, bag: BagReader, recorded: RecordedInput, track: PlayedTrack,
-    out: BagWriter, behind: WriteBehind, bar: Progress, tell: Tell,
-) -> Replayed:  # fmt: skip
+    options: ReplayOptions,
+    bag: BagReader,
+    recorded: RecordedInput,
+    track: PlayedTrack,
+    out: BagWriter,
+    behind: WriteBehind,
+    bar: Progress,
+    tell: Tell,
+) -> Replayed:
     """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
     result = Replayed()
     # Small inputs are copied, so that a replay of the new bag has the same as this one.

@@ -112,9 +112,12 @@ class ReplayOptions:
             return None if value is None else Path(rename(str(value)))
 
         return replace(
-            self, subject=path(self.subject), background=path(self.background),
-            bme=self.bme and rename(self.bme), body=self.body and rename(self.body),
-        )  # fmt: skip
+            self,
+            subject=path(self.subject),
+            background=path(self.background),
+            bme=self.bme and rename(self.bme),
+            body=self.body and rename(self.body),
+        )
 
 
 class NodeParameters(NamedTuple):

@@ -50,10 +50,23 @@ class Player:
                 f'--live needs a sourced ROS 2 workspace ({error}): source install/setup.bash'
             ) from error
         kinds = (
-            Body, CameraInfo, CompressedImage, Ground, Handled, Image, JointState, KeepOut,
-            Keypoints2D, Keypoints3D, MarkerArray, PoseMixture, PoseWithCovarianceStamped, String,
-            TFMessage, TrajectoryMixture,
-        )  # fmt: skip
+            Body,
+            CameraInfo,
+            CompressedImage,
+            Ground,
+            Handled,
+            Image,
+            JointState,
+            KeepOut,
+            Keypoints2D,
+            Keypoints3D,
+            MarkerArray,
+            PoseMixture,
+            PoseWithCovarianceStamped,
+            String,
+            TFMessage,
+            TrajectoryMixture,
+        )
         self.classes: dict[str, Any] = {
             f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}': kind for kind in kinds
         }

@@ -201,9 +201,12 @@ class LiveTrack(PlayedTrack):
                     BME, self._parameters.bme, inputs={}, topics=bme_session.TOPICS, sensors=sensors
                 )
             self._filter = live(
-                FILTER, self._parameters.filter, inputs=inputs, topics=track_messages.TOPICS,
+                FILTER,
+                self._parameters.filter,
+                inputs=inputs,
+                topics=track_messages.TOPICS,
                 sensors=sensors,
-            )  # fmt: skip
+            )
             if self._parameters.smoother is not None:
                 self._smoother = live(
                     SMOOTHER, self._parameters.smoother, inputs={}, topics=smoothed_messages.TOPICS
@@ -300,6 +303,9 @@ def _together(one: Handled | None, other: Handled) -> Handled:
     if one is None:
         return other
     return Handled(
-        one.source, one.stamp_ns, one.faults + other.faults, one.warnings + other.warnings,
+        one.source,
+        one.stamp_ns,
+        one.faults + other.faults,
+        one.warnings + other.warnings,
         one.published + other.published,
-    )  # fmt: skip
+    )

@@ -21,8 +21,15 @@ from msg_tools.messages.images import decode_image, encode_jpeg
 
 # Width in px and quality, from the best to the smallest.
 _LEVELS = (
-    (640, 80), (640, 65), (480, 65), (480, 50), (360, 50), (320, 40), (240, 35), (160, 30),
-)  # fmt: skip
+    (640, 80),
+    (640, 65),
+    (480, 65),
+    (480, 50),
+    (360, 50),
+    (320, 40),
+    (240, 35),
+    (160, 30),
+)
 
 
 @dataclass(frozen=True)

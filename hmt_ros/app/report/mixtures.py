@@ -39,8 +39,14 @@ KEPT_TRAJECTORIES = 8
 BANDED = ('posterior', 'smoothed')
 _TRAJECTORIES = 'trajectories'
 _ORDER = (
-    'posterior', 'smoothed', 'forecast', 'likelihood', 'prediction', 'ground_truth', _TRAJECTORIES,
-)  # fmt: skip
+    'posterior',
+    'smoothed',
+    'forecast',
+    'likelihood',
+    'prediction',
+    'ground_truth',
+    _TRAJECTORIES,
+)
 
 
 def angles_of(body: Body | None) -> tuple[str, ...]:

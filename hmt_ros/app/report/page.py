@@ -400,10 +400,11 @@ def _scores(content: Content) -> dict[str, Any] | None:
             if levels is None
             else [_rounded(coverage(levels, q), 4) for q in PROBABILITIES]
             for kind, levels in (
-                ('together', topic.scores.levels), ('each', topic.scores.joint_levels),
+                ('together', topic.scores.levels),
+                ('each', topic.scores.joint_levels),
                 ('absolute', topic.scores.absolute_levels),
             )
-        }  # fmt: skip
+        }
     result['probabilities'] = PROBABILITIES.tolist()
     return result
 

@@ -172,9 +172,14 @@ def _draw_free_energy(path: Path, layers: Sequence[Layer[Window]]) -> None:
             for which, style, label in ((0, ':', 'first'), (-1, '-', 'last')):
                 values = [window.free_energy[which] for window in windows]
                 axes.plot(
-                    seconds, values, color=colour, linestyle=style, marker='.', markersize=3,
+                    seconds,
+                    values,
+                    color=colour,
+                    linestyle=style,
+                    marker='.',
+                    markersize=3,
                     label=f'{layer.topic}, {label} iteration',
-                )  # fmt: skip
+                )
         axes.set(xlabel='end of the window, s', ylabel='free energy, nats')
         axes.legend(frameon=False, fontsize=8)
         save_picture(figure, path)

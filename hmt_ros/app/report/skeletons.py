@@ -65,9 +65,15 @@ def bones_of(names: Sequence[str]) -> list[tuple[int, int, str]]:
 
 
 def draw_overview(
-    path: Path, track: Track, camera: Camera, images: dict[int, Image], truth: Truth | None,
-    *, width: float = 9.0, dpi: int = 110,
-) -> None:  # fmt: skip
+    path: Path,
+    track: Track,
+    camera: Camera,
+    images: dict[int, Image],
+    truth: Truth | None,
+    *,
+    width: float = 9.0,
+    dpi: int = 110,
+) -> None:
     """Images with the heaviest modes, and under each the same person from the side, all modes.
 
     Args:
@@ -102,9 +108,13 @@ def draw_overview(
         axes[1, len(moments) // 2].set_xlabel('towards the camera, m')
         _add_legend(figure, truth is not None)
         figure.subplots_adjust(
-            left=0.65 / width, right=1 - 0.1 / width, top=1 - 0.25 / figure.get_figheight(),
-            bottom=0.75 / figure.get_figheight(), wspace=0.06, hspace=0.06,
-        )  # fmt: skip
+            left=0.65 / width,
+            right=1 - 0.1 / width,
+            top=1 - 0.25 / figure.get_figheight(),
+            bottom=0.75 / figure.get_figheight(),
+            wspace=0.06,
+            hspace=0.06,
+        )
         save_picture(figure, path)
 
 
@@ -139,9 +149,15 @@ def save_picture(figure: Figure, path: Path) -> None:
 
 
 def _draw_sheet(
-    path: Path, track: Track, moments: list[Moment], ratio: float,
-    draw: Callable[[Any, Moment], None], title: str, *, truth: bool,
-) -> None:  # fmt: skip
+    path: Path,
+    track: Track,
+    moments: list[Moment],
+    ratio: float,
+    draw: Callable[[Any, Moment], None],
+    title: str,
+    *,
+    truth: bool,
+) -> None:
     columns = min(4, len(moments))
     rows = -(-len(moments) // columns)
     cell = 2.4
@@ -162,9 +178,13 @@ def _draw_sheet(
         figure.text(0.02, 1 - 0.1 / height, title, va='top', fontsize=10)
         _add_legend(figure, truth)
         figure.subplots_adjust(
-            left=0.5 / width, right=0.99, top=1 - 0.5 / height, bottom=0.4 / height, wspace=0.08,
+            left=0.5 / width,
+            right=0.99,
+            top=1 - 0.5 / height,
+            bottom=0.4 / height,
+            wspace=0.08,
             hspace=0.25 / (cell * ratio),
-        )  # fmt: skip
+        )
         save_picture(figure, path)
 
 
@@ -175,10 +195,13 @@ def _draw_on_image(
     for rank in reversed(range(min(ON_IMAGE, len(moment.weights)))):
         share = moment.weights[rank] / moment.weights[0]
         _add_skeleton(
-            axes, track.joint_names, camera.project(moment.joints[rank]),
-            2.4 if rank == 0 else 1.4, 1.0 if rank == 0 else FAINTEST + 0.6 * share,
+            axes,
+            track.joint_names,
+            camera.project(moment.joints[rank]),
+            2.4 if rank == 0 else 1.4,
+            1.0 if rank == 0 else FAINTEST + 0.6 * share,
             halo=rank == 0,
-        )  # fmt: skip
+        )
     left, top, right, bottom = box
     axes.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[])
     for spine in axes.spines.values():
@@ -225,9 +248,16 @@ class _SideView:
 
 
 def _add_skeleton(
-    axes: Any, names: tuple[str, ...], points: Array, width: float, alpha: float,
-    *, colour: str | None = None, style: Any = 'solid', halo: bool = False,
-) -> None:  # fmt: skip
+    axes: Any,
+    names: tuple[str, ...],
+    points: Array,
+    width: float,
+    alpha: float,
+    *,
+    colour: str | None = None,
+    style: Any = 'solid',
+    halo: bool = False,
+) -> None:
     bones = [(points[[a, b]], own) for a, b, own in bones_of(names)]
     bones = [(line, own) for line, own in bones if np.isfinite(line).all()]
     lines = LineCollection(

@@ -371,9 +371,13 @@ def _map_and_moments(mask: Bytes) -> tuple[Array, Array]:
         ]
     )
     cells = cv2.warpAffine(
-        distance.astype(np.float32), to_map, (MAP, MAP), flags=cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT, borderValue=-FURTHEST,
-    )  # fmt: skip
+        distance.astype(np.float32),
+        to_map,
+        (MAP, MAP),
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=-FURTHEST,
+    )
     second = np.array([m['mu20'], m['mu02'], m['mu11']]) / (area * radius**2)
     third = np.array([m['mu30'], m['mu21'], m['mu12'], m['mu03']]) / (area * radius**3)
     proportions = [

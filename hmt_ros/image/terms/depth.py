@@ -111,8 +111,10 @@ def trace_front(flesh, wanted, lens, columns, origins, parts, points, cosines, n
         valid: (2R,) whether the point faces the camera.
     """
     part_segments, ring_parts, ring_centres = (
-        flesh.part_segments, flesh.ring_parts, flesh.ring_centres,
-    )  # fmt: skip
+        flesh.part_segments,
+        flesh.ring_parts,
+        flesh.ring_centres,
+    )
     ring_radii, ring_slopes, ring_leans = flesh.ring_radii, flesh.ring_slopes, flesh.ring_leans
     ring_exponents, ring_noise = flesh.ring_exponents, flesh.ring_noise
     rings = len(ring_parts)
@@ -174,9 +176,17 @@ def add_depth(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
     valid, covered = np.empty(count, np.bool_), np.empty(count, np.bool_)
     hidden = np.empty(count, np.bool_)
     trace_front(
-        flesh, view.traced, view.lens, view.columns, view.origins,
-        parts, points, cosines, noise, valid,
-    )  # fmt: skip
+        flesh,
+        view.traced,
+        view.lens,
+        view.columns,
+        view.origins,
+        parts,
+        points,
+        cosines,
+        noise,
+        valid,
+    )
     pixel, j = np.empty((count, 2)), np.empty((count, 2, 3))
     for i in range(count):
         if valid[i]:
@@ -205,12 +215,18 @@ def add_depth(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
         rho, pull, curvature = geman_mcclure(error, term.scale, each)
         energy += rho
         add_residual(
-            wrenches, stiffnesses, owners[parts[i]], points[i, 0], points[i, 1], points[i, 2],
+            wrenches,
+            stiffnesses,
+            owners[parts[i]],
+            points[i, 0],
+            points[i, 1],
+            points[i, 2],
             (gu * j[i, 0, 0] + gv * j[i, 1, 0]) * inverse,
             (gu * j[i, 0, 1] + gv * j[i, 1, 1]) * inverse,
             (gu * j[i, 0, 2] + gv * j[i, 1, 2] - 1.0) * inverse,
-            pull, curvature,
-        )  # fmt: skip
+            pull,
+            curvature,
+        )
     return energy
 
 

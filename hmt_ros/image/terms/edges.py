@@ -32,9 +32,12 @@ EDGE_LOW, EDGE_HIGH = 40.0, 100.0
 # Edges further outside the silhouette than this belong to the background, px.
 MARGIN = 4
 _DISC = np.array(
-    [[x * x + y * y <= (MARGIN + 0.5) ** 2 for x in range(-MARGIN, MARGIN + 1)]
-     for y in range(-MARGIN, MARGIN + 1)], dtype=np.uint8,
-)  # fmt: skip
+    [
+        [x * x + y * y <= (MARGIN + 0.5) ** 2 for x in range(-MARGIN, MARGIN + 1)]
+        for y in range(-MARGIN, MARGIN + 1)
+    ],
+    dtype=np.uint8,
+)
 # Distance to an edge that is assumed where somebody else hides the edges, px.
 HIDDEN = 2.0
 # Fewer visible points than this do not make each of them count more.
@@ -103,8 +106,11 @@ def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
     edges, term, contour = inputs.distances, inputs.term, view.contour
     values, left, top = edges.values, edges.left, edges.top
     parts, points, pixels, projections = (
-        contour.parts, contour.points, contour.pixels, contour.projections,
-    )  # fmt: skip
+        contour.parts,
+        contour.points,
+        contour.pixels,
+        contour.projections,
+    )
     normals, valid, hidden, noise = contour.normals, contour.valid, contour.hidden, contour.noise
     owners, count = view.owners, view.contour_points * 6 // 10
     if count == 0:
@@ -122,9 +128,17 @@ def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
         rho, pull, curvature = geman_mcclure(value / sigma, term.scale, each)
         energy += rho
         add_contour_residual(
-            wrenches, stiffnesses, owners[parts[i]], points, projections, i, gu / sigma, gv / sigma,
-            pull, curvature,
-        )  # fmt: skip
+            wrenches,
+            stiffnesses,
+            owners[parts[i]],
+            points,
+            projections,
+            i,
+            gu / sigma,
+            gv / sigma,
+            pull,
+            curvature,
+        )
     return energy
 
 

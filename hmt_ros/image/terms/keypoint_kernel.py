@@ -205,9 +205,18 @@ def add_lifted(  # type: ignore[no-untyped-def]
                 pull += precision * slope
                 curvature += precision * precision * bend
         add_residual(
-            wrenches, stiffnesses, lifted.segments[k], places[1 + k, 0], places[1 + k, 1],
-            places[1 + k, 2], ray[0], ray[1], ray[2], pull, curvature,
-        )  # fmt: skip
+            wrenches,
+            stiffnesses,
+            lifted.segments[k],
+            places[1 + k, 0],
+            places[1 + k, 1],
+            places[1 + k, 2],
+            ray[0],
+            ray[1],
+            ray[2],
+            pull,
+            curvature,
+        )
     assemble_pose(tree, own_axes, own_origins, wrenches, stiffnesses, gradient, hessian)
 
 
@@ -269,9 +278,14 @@ def list_keypoints(  # type: ignore[no-untyped-def]
         lifted_energies(inputs.lifted, columns, origins, behind, joints, shares, lifted)
         lifted *= inputs.lifted.weight
     exchange_log_posterior(
-        energies, lifted, weights, exchanged, inputs.lifted.readings, inputs.log_priors[0],
+        energies,
+        lifted,
+        weights,
+        exchanged,
+        inputs.lifted.readings,
+        inputs.log_priors[0],
         posterior,
-    )  # fmt: skip
+    )
     likeliest = exchanged[np.argmax(posterior)]
     m = 0
     for k in range(len(groups)):
@@ -307,9 +321,13 @@ def lifted_room(lifted):  # type: ignore[no-untyped-def]
 def _list_room(count):  # type: ignore[no-untyped-def]
     """Room for the list of the residuals of so many keypoints."""
     return (
-        np.empty((count, 2)), np.empty((2 * count, 2), np.intp), np.empty((2 * count, 3)),
-        np.empty((2 * count, 3)), np.empty(2 * count), np.empty(2 * count),
-    )  # fmt: skip
+        np.empty((count, 2)),
+        np.empty((2 * count, 2), np.intp),
+        np.empty((2 * count, 3)),
+        np.empty((2 * count, 3)),
+        np.empty(2 * count),
+        np.empty(2 * count),
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -404,17 +422,32 @@ def add_keypoints(  # type: ignore[no-untyped-def]
                     residual += w1 * (pixels[0, 1] - seen[k, 1])
                     _, pull, curvature = geman_mcclure(residual, scale, share)
                     add_residual(
-                        wrenches, stiffnesses, segments[k, e], place[0], place[1], place[2],
+                        wrenches,
+                        stiffnesses,
+                        segments[k, e],
+                        place[0],
+                        place[1],
+                        place[2],
                         w0 * projections[0, 0, 0] + w1 * projections[0, 1, 0],
                         w0 * projections[0, 0, 1] + w1 * projections[0, 1, 1],
-                        w0 * projections[0, 0, 2] + w1 * projections[0, 1, 2], pull, curvature,
-                    )  # fmt: skip
+                        w0 * projections[0, 0, 2] + w1 * projections[0, 1, 2],
+                        pull,
+                        curvature,
+                    )
         assemble_pose(tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradient[n], hessian[n])
         if lifted.weight > 0.0:
             readings[:] = 0.0
             for e in range(len(exchanged)):
                 readings[lifted.readings[e]] += np.exp(posterior[e])
             add_lifted(
-                lifted, tree, readings, behind, joints, components, axes[n], dof_origins[n],
-                gradient[n], hessian[n],
-            )  # fmt: skip
+                lifted,
+                tree,
+                readings,
+                behind,
+                joints,
+                components,
+                axes[n],
+                dof_origins[n],
+                gradient[n],
+                hessian[n],
+            )

@@ -133,10 +133,15 @@ class Keypoints:
         }
         names = tuple(self.names[i] for i in which)
         return Keypoints(
-            names, self.pixels[which], self.covariances[which], self.confidences[which], **more,
+            names,
+            self.pixels[which],
+            self.covariances[which],
+            self.confidences[which],
+            **more,
             landmarks=None if self.landmarks is None else tuple(self.landmarks[i] for i in which),
-            scheme=self.scheme, lifted=self.lifted,
-        )  # fmt: skip
+            scheme=self.scheme,
+            lifted=self.lifted,
+        )
 
     def named_for(self, body: Body, scheme: str = 'auto') -> tuple[Keypoints, list[str]]:
         """Keypoints at joints of a body, under the body's names, and the names of the others.
@@ -236,9 +241,14 @@ class KeypointTerm:
         inputs = self.compiled
         chosen = rows if len(inputs.log_priors) > 1 else np.zeros(n, dtype=np.intp)
         add_keypoints(
-            inputs, inputs.log_priors[chosen], *frames.by_pose(), *frames.dofs_by_pose(), value,
-            gradient, hessian,
-        )  # fmt: skip
+            inputs,
+            inputs.log_priors[chosen],
+            *frames.by_pose(),
+            *frames.dofs_by_pose(),
+            value,
+            gradient,
+            hessian,
+        )
         return Energy(value, gradient, hessian) if derivatives else Energy(value)
 
     @property
@@ -247,10 +257,15 @@ class KeypointTerm:
         exchanges = np.zeros((1, 1)) if self.exchanges is None else self.exchanges
         measured = self.measured
         return KeypointInputs(
-            measured.points, self._lifted(), tree_of(self.skeleton), lens_of(self.camera),
-            float(self.settings.scale), self.weights,
-            EXCHANGED[: exchanges.shape[1]], np.ascontiguousarray(exchanges, dtype=np.float64),
-        )  # fmt: skip
+            measured.points,
+            self._lifted(),
+            tree_of(self.skeleton),
+            lens_of(self.camera),
+            float(self.settings.scale),
+            self.weights,
+            EXCHANGED[: exchanges.shape[1]],
+            np.ascontiguousarray(exchanges, dtype=np.float64),
+        )
 
     def exchanged(self, frames: Frames, rows: Index) -> Array:
         """Log probabilities (N, E) of the exchanges at the frames of N poses."""
@@ -263,16 +278,25 @@ class KeypointTerm:
         columns, origins = frames.by_pose()
         for n in range(frames.count):
             group_energies(
-                measured.points, lens_of(self.camera), float(self.settings.scale), columns[n],
-                origins[n], energies,
-            )  # fmt: skip
+                measured.points,
+                lens_of(self.camera),
+                float(self.settings.scale),
+                columns[n],
+                origins[n],
+                energies,
+            )
             whole = np.zeros(2)
             if lifted.weight > 0:
                 lifted_energies(lifted, columns[n], origins[n], behind, joints, shares, whole)
             exchange_log_posterior(
-                energies, lifted.weight * whole, self.weights, exchanged,
-                lifted.readings[: len(exchanged)], priors[n], result[n],
-            )  # fmt: skip
+                energies,
+                lifted.weight * whole,
+                self.weights,
+                exchanged,
+                lifted.readings[: len(exchanged)],
+                priors[n],
+                result[n],
+            )
         return result
 
     def residuals(self, frames: Frames) -> tuple[Index, Array, Array, Array, Array]:
@@ -381,9 +405,17 @@ def _whitened(keypoints: Keypoints, sigma: float, magnification: float) -> tuple
 
 
 NOT_LIFTED = Lifted(
-    np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(1),
-    np.zeros((2, 1, 0)), np.zeros((2, 1, 0)), np.zeros(len(EXCHANGED), np.int64), 0.0, 1.0,
-)  # fmt: skip
+    np.zeros(0, np.int64),
+    np.zeros((0, 3)),
+    np.zeros(3),
+    np.array([0.0, 0.0, 1.0]),
+    np.zeros(1),
+    np.zeros((2, 1, 0)),
+    np.zeros((2, 1, 0)),
+    np.zeros(len(EXCHANGED), np.int64),
+    0.0,
+    1.0,
+)
 
 
 @lru_cache(maxsize=16)
@@ -401,11 +433,17 @@ def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lift
     depths = np.stack([x.sized(skeleton)[:, :, 2] for x in both])
     deviations = sigma * np.stack([x.deviations[:, :, 2] for x in both])
     return Lifted(
-        skeleton.joint_segments[joints].astype(np.int64), skeleton.joint_offsets[joints],
-        middle_of_hips(skeleton), np.ascontiguousarray(poses.axes[2]),
-        poses.log_weights - np.log(deviations[0]).sum(1), np.ascontiguousarray(depths),
-        np.ascontiguousarray(1.0 / deviations), EXCHANGED.min(1), LIFTED_WEIGHT, LIFTED_SCALE,
-    )  # fmt: skip
+        skeleton.joint_segments[joints].astype(np.int64),
+        skeleton.joint_offsets[joints],
+        middle_of_hips(skeleton),
+        np.ascontiguousarray(poses.axes[2]),
+        poses.log_weights - np.log(deviations[0]).sum(1),
+        np.ascontiguousarray(depths),
+        np.ascontiguousarray(1.0 / deviations),
+        EXCHANGED.min(1),
+        LIFTED_WEIGHT,
+        LIFTED_SCALE,
+    )
 
 
 def group_of(skeleton: Skeleton, segment: int) -> int:

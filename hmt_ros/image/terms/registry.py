@@ -93,10 +93,17 @@ def new_view(model):  # type: ignore[no-untyped-def]
     """
     segments = len(model.tree.parents)
     return PoseView(
-        np.zeros(1, np.int64), empty_contour(len(model.flesh.ring_parts)), model.contour_points,
-        model.flesh.part_segments, model.lens, np.empty((segments, 3, 3)), np.empty((segments, 3)),
-        model.flesh, model.traced, model.occluders,
-    )  # fmt: skip
+        np.zeros(1, np.int64),
+        empty_contour(len(model.flesh.ring_parts)),
+        model.contour_points,
+        model.flesh.part_segments,
+        model.lens,
+        np.empty((segments, 3, 3)),
+        np.empty((segments, 3)),
+        model.flesh,
+        model.traced,
+        model.occluders,
+    )
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -107,9 +114,16 @@ def look(view, number, shape):  # type: ignore[no-untyped-def]
         contour = view.contour
         trace_contour(view.flesh, view.traced, view.lens, view.columns, view.origins, contour)
         mark_visibility(
-            view.flesh, view.occluders, view.columns, view.origins, contour.parts, contour.points,
-            contour.valid, contour.covered, contour.hidden,
-        )  # fmt: skip
+            view.flesh,
+            view.occluders,
+            view.columns,
+            view.origins,
+            contour.parts,
+            contour.points,
+            contour.valid,
+            contour.covered,
+            contour.hidden,
+        )
 
 
 @njit(cache=True, nogil=True)
@@ -140,9 +154,14 @@ def add_energies(  # type: ignore[no-untyped-def]
         run_terms(view, inputs, 0, energies[n], wrenches, stiffnesses)
         if len(hessians) > 0:
             assemble_pose(
-                model.tree, placement.axes[n], placement.dof_origins[n], wrenches, stiffnesses,
-                gradients[n], hessians[n],
-            )  # fmt: skip
+                model.tree,
+                placement.axes[n],
+                placement.dof_origins[n],
+                wrenches,
+                stiffnesses,
+                gradients[n],
+                hessians[n],
+            )
 
 
 @njit(cache=True, nogil=True)

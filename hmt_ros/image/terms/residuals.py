@@ -153,10 +153,18 @@ def add_contour_residual(  # type: ignore[no-untyped-def]
     by column and row.
     """
     add_residual(
-        wrenches, stiffnesses, s, p[i, 0], p[i, 1], p[i, 2],
-        gu * j[i, 0, 0] + gv * j[i, 1, 0], gu * j[i, 0, 1] + gv * j[i, 1, 1],
-        gu * j[i, 0, 2] + gv * j[i, 1, 2], pull, curvature,
-    )  # fmt: skip
+        wrenches,
+        stiffnesses,
+        s,
+        p[i, 0],
+        p[i, 1],
+        p[i, 2],
+        gu * j[i, 0, 0] + gv * j[i, 1, 0],
+        gu * j[i, 0, 1] + gv * j[i, 1, 1],
+        gu * j[i, 0, 2] + gv * j[i, 1, 2],
+        pull,
+        curvature,
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -217,16 +217,32 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
         segment = part_segments[parts[i]]
         nx, ny = normals[m, 0] * inverse[i], normals[m, 1] * inverse[i]
         add_residual(
-            wrenches, stiffnesses, segment, p[i, 0], p[i, 1], p[i, 2],
-            nx * j[i, 0, 0] + ny * j[i, 1, 0], nx * j[i, 0, 1] + ny * j[i, 1, 1],
-            nx * j[i, 0, 2] + ny * j[i, 1, 2], curvature * across[m], curvature,
-        )  # fmt: skip
+            wrenches,
+            stiffnesses,
+            segment,
+            p[i, 0],
+            p[i, 1],
+            p[i, 2],
+            nx * j[i, 0, 0] + ny * j[i, 1, 0],
+            nx * j[i, 0, 1] + ny * j[i, 1, 1],
+            nx * j[i, 0, 2] + ny * j[i, 1, 2],
+            curvature * across[m],
+            curvature,
+        )
         if beyond[m] != 0.0:
             add_residual(
-                wrenches, stiffnesses, segment, p[i, 0], p[i, 1], p[i, 2],
-                nx * j[i, 1, 0] - ny * j[i, 0, 0], nx * j[i, 1, 1] - ny * j[i, 0, 1],
-                nx * j[i, 1, 2] - ny * j[i, 0, 2], curvature * beyond[m], curvature,
-            )  # fmt: skip
+                wrenches,
+                stiffnesses,
+                segment,
+                p[i, 0],
+                p[i, 1],
+                p[i, 2],
+                nx * j[i, 1, 0] - ny * j[i, 0, 0],
+                nx * j[i, 1, 1] - ny * j[i, 0, 1],
+                nx * j[i, 1, 2] - ny * j[i, 0, 2],
+                curvature * beyond[m],
+                curvature,
+            )
     return energy
 
 

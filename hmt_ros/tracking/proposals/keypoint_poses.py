@@ -74,9 +74,12 @@ class KeypointPoses:
         """See `Proposal`."""
         pose = _by_keypoints(search, None)
         return Hypotheses(
-            pose, sources.log_weights[:1], sources.ancestors[:1], pose,
+            pose,
+            sources.log_weights[:1],
+            sources.ancestors[:1],
+            pose,
             np.zeros(pose.shape, dtype=np.bool_),
-        )  # fmt: skip
+        )
 
 
 def _by_keypoints(search: Search, before: Array | None) -> Array:

@@ -147,18 +147,25 @@ class KinematicJumps:
         for group in groups[: plan.groups]:
             likely = prior[group].max() > prior.max() - LIKELY
             products = LimbProducts.of(
-                body, base.x[group],
+                body,
+                base.x[group],
                 self._search(limbs, search, base.x[group[0]], sources.ancestors[group[0]], rng)
-                if likely else {},
-                price['limb_flip'], apart=DISTINCT, most=plan.alternatives,
-            ).at_most(left)  # fmt: skip
+                if likely
+                else {},
+                price['limb_flip'],
+                apart=DISTINCT,
+                most=plan.alternatives,
+            ).at_most(left)
             alone = products.alone
             left -= len(alone)
             best = products.best(
                 self.posterior.values(alone, search.observation),
-                sources.log_weights[group], exchange=price['exchange'], flip=price['trunk_flip'],
-                share=share, count=plan.combinations,
-            )  # fmt: skip
+                sources.log_weights[group],
+                exchange=price['exchange'],
+                flip=price['trunk_flip'],
+                share=share,
+                count=plan.combinations,
+            )
             everything.append((best.poses, group[best.parents], best.energies))
         others = [k for group in groups[plan.groups :] for k in group]
         if others:

@@ -52,9 +52,11 @@ def read_arrays(path: Path) -> FoundPersons:
         seen = None
         if detected[t]:
             seen = person(
-                names, content['pixels'][t], None if sure is None else sure[t],
+                names,
+                content['pixels'][t],
+                None if sure is None else sure[t],
                 None if world is None else world[t],
-            )  # fmt: skip
+            )
         found.add(t, seen)
     return found
 

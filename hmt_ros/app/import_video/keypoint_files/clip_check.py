@@ -211,8 +211,10 @@ def bone_deviation(names: Sequence[str], pixels: Array, scheme: str = AUTO) -> f
         pixels: (N, n, 2) px of persons; NaN where a point was not seen.
     """
     marks = [x.name if x else '' for x in landmarks_of(names, (), scheme)]
-    where = {x.replace('centre_of_left', 'left').replace('centre_of_right', 'right'): i
-             for i, x in enumerate(marks)}  # fmt: skip
+    where = {
+        x.replace('centre_of_left', 'left').replace('centre_of_right', 'right'): i
+        for i, x in enumerate(marks)
+    }
     bones = [(where[a], where[b], *x) for (a, b), x in bone_lengths().items() if {a, b} <= {*where}]
     if len(bones) < _BONES:
         return math.nan

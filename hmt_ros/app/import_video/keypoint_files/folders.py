@@ -87,7 +87,10 @@ def _add_labels(found: FoundPersons, file: Path, number: int) -> None:
         tail = [*values[len(values) - rest :]] if rest else []
         track = str(int(tail.pop())) if tail and tail[-1] >= 1 and tail[-1].is_integer() else ''
         seen = person(
-            None, points[:, :2], points[:, 2] if width == 3 else None, track=track,
+            None,
+            points[:, :2],
+            points[:, 2] if width == 3 else None,
+            track=track,
             score=tail[0] if tail else 1.0,
-        )  # fmt: skip
+        )
         found.add(number, seen)

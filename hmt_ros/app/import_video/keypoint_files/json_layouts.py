@@ -207,10 +207,12 @@ def person_in(
     told = _get(entry, _SCORE, box[4] if isinstance(box, list) and len(box) > 4 else None)
     told = told[0] if isinstance(told, list) and told else told
     return person(
-        names, values[:, :2], confidences,
+        names,
+        values[:, :2],
+        confidences,
         track='' if track in (None, -1, []) else str(track),
         score=float(told) if isinstance(told, (int, float)) and abs(told) < 1e9 else 1.0,
-    )  # fmt: skip
+    )
 
 
 def _list(content: dict[str, Any], name: str) -> list[Any]:
