@@ -24,8 +24,9 @@ from benchmarks.command import benchmark_parser, show, told
 from benchmarks.machine import best_time, description
 from benchmarks.runs import Record, recorded
 from benchmarks.tracking_scores import scores_of
-from hmt_ros.app.make_bag import MotionOptions, motion_of
-from hmt_ros.app.rendered_bag import write_bag
+from hmt_learning.app.make_bag import MotionOptions, motion_of
+from hmt_learning.app.rendered_bag import write_bag
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
@@ -33,7 +34,6 @@ from hmt_ros.body.shape import ShapeSpace
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import observe
-from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings, read_subject
 from msg_tools import BagReader
 from msg_tools.messages.images import decode_depth

@@ -13,10 +13,10 @@ from benchmarks.clips import ROOT, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.experts_motion import BEST_OF, COLUMNS, Learned, SeenMotion
 from benchmarks.machine import best_time
+from hmt_learning.training.predictor_learning import kinds
+from hmt_learning.training.training_set import procedural_sequence
 from hmt_ros.body import Camera, load_body
-from hmt_ros.experts.predictor_learning import kinds
-from hmt_ros.experts.training_set import procedural_sequence
-from hmt_ros.rendering.renderer import render_silhouettes
+from hmt_ros.body.rasterisation import render_silhouettes
 
 STAGES = ('toy', 'oracle', 'learning', 'motion', 'clips', 'start', 'speed', 'figures')
 SAMPLES = 6000

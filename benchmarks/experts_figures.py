@@ -29,19 +29,19 @@ from benchmarks.experts_motion import (
     sequence_mixtures,
     wrapped,
 )
-from hmt_ros.app.report.skeletons import STYLE, bones_of
-from hmt_ros.app.train import write_report
-from hmt_ros.body import Body
-from hmt_ros.body.mirror import root_rotations
-from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
-from hmt_ros.experts.pose_predictor import ALONE, BY_DYNAMICS, PosePredictor, load_predictor
-from hmt_ros.experts.predictor_learning import described
-from hmt_ros.experts.training_set import (
+from hmt_learning.app.train import write_report
+from hmt_learning.training.predictor_learning import described
+from hmt_learning.training.training_set import (
     PoseSequence,
     TrainingSettings,
     seen_from,
     training_set,
 )
+from hmt_ros.app.report.skeletons import STYLE, bones_of
+from hmt_ros.body import Body
+from hmt_ros.body.mirror import root_rotations
+from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
+from hmt_ros.experts.pose_predictor import ALONE, BY_DYNAMICS, PosePredictor, load_predictor
 from hmt_ros.inference.arrays import Array
 
 # Motions of people left out that stand for those of the paper; heading, degrees.

@@ -19,6 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.clips import ROOT
+from hmt_learning.training.predictor_learning import (
+    KINDS,
+    Described,
+    described,
+    kinds,
+    learned_predictor,
+    new_model,
+    target_basis,
+)
+from hmt_learning.training.training_set import (
+    PoseSequence,
+    TrainingSettings,
+    motion_files,
+    random_build,
+    recorded_sequence,
+    seen_from,
+    training_set,
+    typical_body,
+)
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
 from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
@@ -29,25 +48,6 @@ from hmt_ros.experts.pose_predictor import (
     BY_EXPERTS,
     JITTER,
     PosePredictor,
-)
-from hmt_ros.experts.predictor_learning import (
-    KINDS,
-    Described,
-    described,
-    kinds,
-    learned_predictor,
-    new_model,
-    target_basis,
-)
-from hmt_ros.experts.training_set import (
-    PoseSequence,
-    TrainingSettings,
-    motion_files,
-    random_build,
-    recorded_sequence,
-    seen_from,
-    training_set,
-    typical_body,
 )
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.calibration import coverage

@@ -18,6 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.rendering.renderer import render_frames
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
@@ -32,9 +35,6 @@ from hmt_ros.image.surface import lens_of
 from hmt_ros.image.surface_points import seen_points
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.energy import Derivatives, Quadratic
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_frames
-from hmt_ros.rendering.scene import Scene
 
 Array = NDArray[np.float64]
 CAMERA = Camera(660.0, 660.0, 319.5, 239.5, 640, 480)

@@ -26,6 +26,9 @@ from benchmarks.command import benchmark_parser, show
 from benchmarks.kernel_flops import ALL, KINDS, PLACING, counts, energies
 from benchmarks.machine import best_time, description, dgemm_rate
 from benchmarks.smoothing_relations import CLOSE, layers_of
+from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.rendering.renderer import render_frames
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
@@ -36,9 +39,6 @@ from hmt_ros.image.observation import observe
 from hmt_ros.inference import gaussian_pairs
 from hmt_ros.inference.block_tridiagonal import add_band_product
 from hmt_ros.inference.energy import Derivatives
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_frames
-from hmt_ros.rendering.scene import Scene
 from hmt_ros.smoothing.component_overlaps import add_overlaps
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.tracking.selection import choose_hypotheses

@@ -27,10 +27,9 @@ from benchmarks.machine import description
 from benchmarks.runs import GIVEN, UNKNOWN, in_processes, recorded
 from benchmarks.tracking_means import GROUPS, group_of
 from benchmarks.tracking_scores import detector_scores, scores_of
-from hmt_ros.app.learn_lifter import PELVIS, SCORED, lifter_scores
-from hmt_ros.app.learn_motion import read_motions, shares_of
-from hmt_ros.body import load_body
-from hmt_ros.experts.keypoint_training import (
+from hmt_learning.app.learn_lifter import PELVIS, SCORED, lifter_scores
+from hmt_learning.app.learn_motion import read_motions, shares_of
+from hmt_learning.training.keypoint_training import (
     JOINTS,
     VARIANTS,
     KeypointTracks,
@@ -38,10 +37,11 @@ from hmt_ros.experts.keypoint_training import (
     keypoint_tracks,
     training_windows,
 )
+from hmt_learning.training.predictor_learning import kinds, new_model
+from hmt_learning.training.training_set import motion_files, recorded_sequence
+from hmt_ros.body import load_body
 from hmt_ros.experts.lifted_fit import UNKNOWN_SIZE, lift_poses, poses_of
 from hmt_ros.experts.lifter import SHIPPED, KeypointHistory, Lifter, load_lifter
-from hmt_ros.experts.predictor_learning import kinds, new_model
-from hmt_ros.experts.training_set import motion_files, recorded_sequence
 from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints

@@ -22,9 +22,10 @@ from scipy.stats import chi2
 from benchmarks.clips import ROOT
 from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import description
+from hmt_learning.training.training_set import motion_files, recorded_sequence
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.motion_prior import motion_prior
-from hmt_ros.experts.training_set import RATE, motion_files, recorded_sequence
+from hmt_ros.experts.pose_predictor import RATE
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.tracking.motion_states import PredictedStates
 

@@ -19,8 +19,8 @@ import numpy as np
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show, told
 from benchmarks.machine import description
-from hmt_ros.app.make_bag import main as make_bag
-from hmt_ros.app.rendered_bag import PEOPLE
+from hmt_learning.app.make_bag import main as make_bag
+from hmt_learning.app.rendered_bag import PEOPLE
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.truth import read_truth

@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from benchmarks.clips import KEYPOINT_SIGMA, Clip, read_clip, table
 from benchmarks.runs import JOINTS, in_processes, joints_of, true_joints
 from benchmarks.tracking_scores import interval
+from hmt_learning.motion.inverse_kinematics import solve_joint_positions
+from hmt_learning.motion.retarget import hip_drop_share
 from hmt_ros.body import Body, load_body
-from hmt_ros.body.inverse_kinematics import solve_joint_positions
+from hmt_ros.body.limb_angles import trunk_start
 from hmt_ros.evaluation.pose_scores import HIPS, ORIGIN
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import minimise
-from hmt_ros.motion.limb_angles import trunk_start
-from hmt_ros.motion.retarget import hip_drop_share
 from hmt_ros.tracking import read_subject
 
 Array = NDArray[np.float64]

@@ -24,6 +24,9 @@ from benchmarks.command import benchmark_parser, show
 from benchmarks.flips import random_poses
 from benchmarks.machine import description
 from benchmarks.runs import keypoints_only
+from hmt_learning.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
+from hmt_learning.rendering.renderer import render_frames
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
@@ -34,9 +37,6 @@ from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, minimise
-from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
-from hmt_ros.rendering.renderer import render_frames
-from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.evaluation_plan import ACCURATE
 from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples

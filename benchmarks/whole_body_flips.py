@@ -22,8 +22,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_learning.motion.inverse_kinematics import solve_joint_positions
 from hmt_ros.body.body import Body
-from hmt_ros.body.inverse_kinematics import solve_joint_positions
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.self_intersection import _axes_of, _far, _overlap, _pairs, _place_centres
 from hmt_ros.flips.interpretation_tree import _ends, _grown, distinct_poses, enumerate_flips

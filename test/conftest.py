@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from hmt_ros.app import make_bag, progress
+from hmt_learning.app import make_bag
+from hmt_ros.app import progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.detectors.blazepose_models import has_networks, has_runtime
 from hmt_ros.image.keypoint_schemes import schemes
@@ -35,7 +36,7 @@ LONGEST = (
     'test_benchmarks.py',
     'tracking/test_bad_input.py',
     'app/report/test_command.py',
-    'app/test_train.py',
+    'learning/app/test_train.py',
     'test_docs.py',
     'test_tracking_benchmark.py',
     'test_launch.py',

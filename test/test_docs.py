@@ -16,7 +16,8 @@ import pytest
 import yaml
 
 from benchmarks import BENCHMARKS
-from hmt_ros.app import COMMANDS
+from hmt_learning import app as learning
+from hmt_ros import app
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import Scores
 from hmt_ros.sessions import (
@@ -63,6 +64,8 @@ NODES = {
         | {hri_session.body_topic('<id>', name): x for name, x in hri_session.BODY_TOPICS.items()},
     ),
 }
+# Commands of each package.
+COMMANDS = {'hmt_ros': app.COMMANDS, 'hmt_learning': learning.COMMANDS}
 # Programs that are not part of this repository.
 FOREIGN = {
     'export',
@@ -135,8 +138,8 @@ def test_python_of_a_page_runs(page, workplace, capsys):
 def test_commands_are_understood(page):
     targets = set(re.findall(r'^([a-z]+):', (ROOT / 'Makefile').read_text('utf-8'), re.MULTILINE))
     for words, _ in commands(page):
-        if words[:3] == ['python', '-m', 'hmt_ros']:
-            parse(words[3:])
+        if words[:2] == ['python', '-m'] and words[2] in COMMANDS:
+            parse(words[2], words[3:])
         elif words[:3] == ['python', '-m', 'benchmarks']:
             assert words[3] in BENCHMARKS
         elif words[0] == 'python':
@@ -147,8 +150,8 @@ def test_commands_are_understood(page):
             assert set(named) <= targets, words
         else:
             assert words[0] in FOREIGN, words
-        if words[:3] == ['ros2', 'run', 'hmt_ros'] and words[3] in COMMANDS:
-            parse(words[3:])
+        if words[:3] == ['ros2', 'run', 'hmt_ros'] and words[3] in app.COMMANDS:
+            parse('hmt_ros', words[3:])
         elif words[:3] == ['ros2', 'run', 'hmt_ros']:
             given = {b.partition(':=')[0] for a, b in pairwise(words) if a == '-p'}
             together = [node for node in words if node in NODES] or [*NODES]
@@ -156,11 +159,11 @@ def test_commands_are_understood(page):
             assert given <= {p.name for every in known for p in every}
 
 
-def parse(words: list[str]) -> None:
-    """Fails where a command of the package does not know the arguments."""
+def parse(package: str, words: list[str]) -> None:
+    """Fails where a command of a package does not know the arguments."""
     if words == ['--help']:
         return
-    module = importlib.import_module(COMMANDS[words[0]][0])
+    module = importlib.import_module(COMMANDS[package][words[0]][0])
     module._parser().parse_args(words[1:])
 
 
@@ -169,8 +172,8 @@ def test_marked_commands_run(workplace, capsys):
     ran = []
     for words, run in commands(ROOT / 'README.md'):
         if run:
-            assert words[:3] == ['python', '-m', 'hmt_ros']
-            module = importlib.import_module(COMMANDS[words[3]][0])
+            assert words[:2] == ['python', '-m']
+            module = importlib.import_module(COMMANDS[words[2]][words[3]][0])
             assert module.main(words[4:]) == 0, capsys.readouterr().err
             ran.append(words[3])
     assert ran == ['make-bag', 'replay', 'evaluate', 'evaluate', 'report']
@@ -257,11 +260,13 @@ def test_the_readme_is_short():
 
 @pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)
 def test_modules_exist(page):
-    """Dotted names and paths of the two packages lead to a module, a folder or a name in one."""
+    """Dotted names and paths of the packages lead to a module, a folder or a name in one."""
     text = page.read_text('utf-8')
-    for name in re.findall(r'`((?:hmt_ros|msg_tools)(?:\.\w+)+)`', text):
+    for name in re.findall(r'`((?:hmt_ros|hmt_learning|msg_tools)(?:\.\w+)+)`', text):
         assert pkgutil.resolve_name(name), name
-    for name in re.findall(r'`((?:hmt_ros|msg_tools|test|benchmarks)/[\w/.*]*)`', text):
+    for name in re.findall(
+        r'`((?:hmt_ros|hmt_learning|msg_tools|test|benchmarks)/[\w/.*]*)`', text
+    ):
         assert list(ROOT.glob(name.rstrip('/'))), name
 
 

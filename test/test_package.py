@@ -1,10 +1,11 @@
-"""The shape of the two packages: layers, metadata, and what is installed."""
+"""The shape of the packages: layers, metadata, and what is installed."""
 
 from __future__ import annotations
 
 import ast
 import importlib
 import os
+import re
 import runpy
 import shutil
 import subprocess
@@ -31,6 +32,7 @@ INTERFACES = sorted([*HMT_MSGS.glob('msg/*.msg'), *HMT_MSGS.glob('srv/*.srv')])
 
 # An import points to the right, never to the left.
 LAYERS = [
+    'hmt_learning',
     'hmt_ros.app',
     'hmt_ros.nodes',
     'hmt_ros.sessions',
@@ -40,8 +42,6 @@ LAYERS = [
     'hmt_ros.smoothing',
     'hmt_ros.experts',
     'hmt_ros.detectors',
-    'hmt_ros.rendering',
-    'hmt_ros.motion',
     'hmt_ros.image',
     'hmt_ros.flips',
     'hmt_ros.body',
@@ -51,9 +51,9 @@ LAYERS = [
 
 
 def modules() -> dict[str, Path]:
-    """Every module of the two Python packages, by name."""
+    """Every module of the Python packages, by name."""
     found = {}
-    for package in ('hmt_ros', 'msg_tools'):
+    for package in ('hmt_ros', 'msg_tools', 'hmt_learning'):
         for path in sorted((ROOT / package).rglob('*.py')):
             parts = path.relative_to(ROOT).with_suffix('').parts
             found['.'.join(parts).removesuffix('.__init__')] = path
@@ -98,6 +98,42 @@ def test_layers_import_downwards_only(module: str) -> None:
     assert upwards == set()
 
 
+def names_learning(text: str) -> list[str]:
+    """Imports of hmt_learning anywhere in a source, and strings that name its modules."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        named = []
+        if isinstance(node, ast.ImportFrom):
+            named = [str(node.module)]
+        elif isinstance(node, ast.Import):
+            named = [alias.name for alias in node.names]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            # What importlib or a subprocess may be given; a sentence has blanks.
+            named = [node.value] if ' ' not in node.value.strip() else []
+        found += [name for name in named if re.match(r'hmt_learning\b', name)]
+    return found
+
+
+@pytest.mark.parametrize('module', [x for x in MODULES if not x.startswith('hmt_learning')])
+def test_nothing_that_a_robot_has_imports_learning(module: str) -> None:
+    assert names_learning(MODULES[module].read_text('utf-8')) == []
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'import numpy, hmt_learning.motion.rig',
+        'def f():\n    from hmt_learning.app import main',
+        "importlib.import_module('hmt_learning.app.train')",
+        "importlib.import_module(f'hmt_learning.app.{name}')",
+        "COMMANDS = {'train': ('hmt_learning.app.train', 'learn')}",
+        "__import__('hmt_learning')",
+    ],
+)
+def test_imports_of_learning_are_found(text: str) -> None:
+    assert len(names_learning(text)) == 1
+
+
 def test_every_module_belongs_to_a_layer() -> None:
     outside = {name for name in MODULES if layer_of(name) is None}
     assert outside <= {'hmt_ros', 'hmt_ros.__main__', 'hmt_ros.compiled_code'}
@@ -120,10 +156,13 @@ def test_all_but_the_nodes_imports_without_ros_and_nothing_slow_before_it_is_nee
         'import importlib, sys\n'
         'for missing in ("rclpy", "hmt_msgs", "std_msgs", "sensor_msgs", "geometry_msgs"):\n'
         '    sys.modules[missing] = None\n'
+        'sys.modules["hmt_learning"] = None\n'
         'import hmt_ros.app.replay.command, hmt_ros.app.evaluate\n'
         'import hmt_ros.experts, hmt_ros.smoothing, hmt_ros.tracking\n'
         'print([name for name in ("scipy.stats", "matplotlib") if name in sys.modules])\n'
         'for name in sys.argv[1:]:\n'
+        '    if name == "hmt_learning":\n'
+        '        del sys.modules[name]\n'
         '    importlib.import_module(name)\n'
         'print(len(sys.argv) - 1)\n'
     )
@@ -254,7 +293,10 @@ def test_a_wheel_requires_opencv_where_there_is_none(
 
 def test_a_wheel_has_the_library_and_one_command(tmp_path: Path) -> None:
     sources = tmp_path / 'sources'
-    for name in ('hmt_ros', 'msg_tools', 'resource', 'launch', 'rviz', 'foxglove', 'security'):
+    for name in (
+        *('hmt_ros', 'msg_tools', 'hmt_learning', 'resource'),
+        *('launch', 'rviz', 'foxglove', 'security'),
+    ):
         ignored = shutil.ignore_patterns('__pycache__')
         shutil.copytree(ROOT / name, sources / name, ignore=ignored)
     for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml'):
@@ -267,6 +309,7 @@ def test_a_wheel_has_the_library_and_one_command(tmp_path: Path) -> None:
     (path,) = tmp_path.glob('*.whl')
     with zipfile.ZipFile(path) as archive:
         archive.extractall(tmp_path / 'site')
+    assert not (tmp_path / 'site' / 'hmt_learning').exists()
     (text,) = (x.read_text('utf-8') for x in tmp_path.glob('site/*.dist-info/entry_points.txt'))
     assert text.split() == ['[console_scripts]', 'hmt_ros', '=', 'hmt_ros.app:main']
     program = (

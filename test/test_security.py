@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from hmt_learning.motion import rig
 from hmt_ros.body import model_file
-from hmt_ros.motion import rig
 from hmt_ros.sessions import camera_session, parameter_file
 from hmt_ros.tracking import subject
 from msg_tools.bags import bag_metadata, mcap_records

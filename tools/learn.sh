@@ -24,10 +24,10 @@ learn() {  # name of the result, then the command
   echo "learn: $1"
   python -m "${@:2}" >"$out/$1.txt"
 }
-learn lengths hmt_ros learn-lengths "$mocap"/train "$mocap"/train_more --people "${people[@]}"
-learn prior hmt_ros learn-prior "$mocap"/train "$mocap"/train_more --people "${people[@]}" --test "$mocap"/dev \
+learn lengths hmt_learning learn lengths "$mocap"/train "$mocap"/train_more --people "${people[@]}"
+learn prior hmt_learning learn prior "$mocap"/train "$mocap"/train_more --people "${people[@]}" --test "$mocap"/dev \
   --without "${mirrored[@]}" --components 8 --source "$source $thanks" -o "$out/human37_prior.npz" --overwrite
-learn motion hmt_ros learn-motion "$mocap"/train "$mocap"/train_more --without "${mirrored[@]}" \
+learn motion hmt_learning learn motion "$mocap"/train "$mocap"/train_more --without "${mirrored[@]}" \
   --acknowledgement "$thanks" -o "$out/human37_motion.npz" --overwrite
 learn keypoint_noise benchmarks keypoint_noise
 learn contour_noise benchmarks contour_noise
@@ -37,9 +37,9 @@ if python -c 'import jax, optax' 2>/dev/null; then
   # People of the clips that experts are scored on; what ships did not have the last motion either.
   others=('cmu_02_*' 'cmu_07_*' 'cmu_10_*' 'cmu_13_*' "${mirrored[@]}" prmd_s08_m10x_shscaption)
   folders=("$mocap"/train "$mocap"/train_more "$mocap"/train_wide)
-  learn experts hmt_ros train --mocap "${folders[@]}" --without "${others[@]}" --alike prmd --test "$mocap"/dev \
+  learn experts hmt_learning train --mocap "${folders[@]}" --without "${others[@]}" --alike prmd --test "$mocap"/dev \
     --samples 80000 --acknowledgement "$source $thanks $prmd" -o "$out/silhouettes.npz" --overwrite
-  learn lifter hmt_ros learn-lifter "${folders[@]}" --without "${others[@]}" --alike prmd --test "$mocap"/dev \
+  learn lifter hmt_learning learn lifter "${folders[@]}" --without "${others[@]}" --alike prmd --test "$mocap"/dev \
     --acknowledgement "$source $thanks $prmd" -o "$out/keypoints.npz" --overwrite
 else
   echo "learn: experts and lifter left out: they need jax and optax" >&2

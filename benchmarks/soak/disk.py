@@ -13,7 +13,7 @@ from benchmarks.clips import ROOT
 from benchmarks.soak.faults import place
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import CLIP
-from hmt_ros.app import make_bag
+from hmt_learning.app import make_bag
 from hmt_ros.app.replay import command as replay
 from hmt_ros.experts import load_predictor
 from hmt_ros.experts.model_file import read_arrays, write_arrays

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-
-import hmt_ros
-from hmt_ros.app.command_line import until_nobody_reads
+from hmt_ros.app.command_line import run_program
 
 # Command: (module, description). A module is imported when its command runs.
 COMMANDS = {
@@ -25,7 +21,6 @@ COMMANDS = {
         'hmt_ros.app.recover',
         'copy the undamaged messages of a damaged bag into a new bag',
     ),
-    'make-bag': ('hmt_ros.app.make_bag', 'render a motion into a bag with ground truth'),
     'compile': (
         'hmt_ros.app.compile_kernels',
         'compile all kernels, so that no first image waits for it',
@@ -33,23 +28,6 @@ COMMANDS = {
     'install-detector': (
         'hmt_ros.app.install_detector',
         'install MediaPipe Pose, a detector of keypoints',
-    ),
-    'train': ('hmt_ros.app.train', 'learn a predictor of poses from silhouettes'),
-    'learn-prior': (
-        'hmt_ros.app.learn_prior',
-        'learn the prior of the joint angles from motion files',
-    ),
-    'learn-motion': (
-        'hmt_ros.app.learn_motion',
-        'learn how poses move, from recorded motions',
-    ),
-    'learn-lifter': (
-        'hmt_ros.app.learn_lifter',
-        'learn experts that tell depths from keypoints, from recorded motions',
-    ),
-    'learn-lengths': (
-        'hmt_ros.app.learn_lengths',
-        'learn how lengths vary over people, from the skeletons of motion files',
     ),
     'report': (
         'hmt_ros.app.report.command',
@@ -62,45 +40,13 @@ COMMANDS = {
     'evaluate': ('hmt_ros.app.evaluate', 'compare the mixtures in a bag with ground truth'),
 }
 
-HELP = """\
-usage: python -m hmt_ros <command> [arguments]
-
-Monocular 3D human motion tracking with mixtures.
-
-commands:
-{commands}
-
-python -m hmt_ros <command> --help lists the arguments of a command. ROS 2 runs the same commands,
-ros2 run hmt_ros <command>, and the nodes filter_node, smoother_node and bme_node.
-
-options:
-  -h, --help  show this help
-  --version   show the version
+ABOUT = 'Monocular 3D human motion tracking with mixtures.'
+MORE = """\
+ROS 2 runs the same commands, ros2 run hmt_ros <command>, and the nodes filter_node, smoother_node
+and bme_node. In a checkout python -m hmt_learning has the commands that render and learn.
 """
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs a command; 0: done, 1: bad input, which one line on stderr explains."""
-    return until_nobody_reads(lambda: _run(sys.argv[1:] if argv is None else argv))
-
-
-def _run(arguments: list[str]) -> int:
-    command, *rest = arguments or ['']
-    if command in ('-h', '--help'):
-        print(_help(), end='')
-        return 0
-    if command == '--version':
-        print(f'hmt_ros {hmt_ros.__version__}')
-        return 0
-    if command not in COMMANDS:
-        seen = f'no command {command!r}' if command else 'no command given'
-        print(f'hmt_ros: {seen}, wanted one of {", ".join(COMMANDS)}', file=sys.stderr)
-        return 1
-    module = importlib.import_module(COMMANDS[command][0])
-    return int(module.main(rest))
-
-
-def _help() -> str:
-    width = max(len(name) for name in COMMANDS)
-    lines = [f'  {name:{width}}  {what}' for name, (_, what) in COMMANDS.items()]
-    return HELP.format(commands='\n'.join(lines))
+    return run_program('hmt_ros', COMMANDS, ABOUT, MORE, argv)

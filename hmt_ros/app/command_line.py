@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import math
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
+import hmt_ros
 from msg_tools.files.error_line import error_line
 
 # Exit codes of programs that the interrupt key or SIGPIPE has ended, as shells report them.
@@ -179,6 +181,61 @@ def model_file(output: Path, *, overwrite: bool) -> Path:
     if not output.parent.is_dir():
         raise ValueError(f'there is no folder {output.parent} for {output.name}')
     return output
+
+
+PROGRAM_HELP = """\
+usage: python -m {program} <command> [arguments]
+
+{about}
+
+commands:
+{commands}
+
+python -m {program} <command> --help lists the arguments of a command.
+{more}
+options:
+  -h, --help  show this help
+  --version   show the version
+"""
+
+
+def run_program(
+    program: str,
+    commands: Mapping[str, tuple[str, str]],
+    about: str,
+    more: str = '',
+    argv: Sequence[str] | None = None,
+) -> int:
+    """Runs one of the commands of a package.
+
+    Args:
+        program: name of the package.
+        commands: module and description by name; a module is imported when its command runs.
+        about, more: texts of the help, before and after the commands.
+        argv: name and arguments of the command; None: those of the process.
+
+    Returns:
+        The exit code: 0: done, 1: bad input, which one line on stderr explains.
+    """
+
+    def run() -> int:
+        command, *rest = (sys.argv[1:] if argv is None else argv) or ['']
+        if command in ('-h', '--help'):
+            width = max(map(len, commands))
+            lines = '\n'.join(f'  {name:{width}}  {what}' for name, (_, what) in commands.items())
+            text = PROGRAM_HELP.format(program=program, about=about, commands=lines, more=more)
+            print(text, end='')
+            return 0
+        if command == '--version':
+            print(f'{program} {hmt_ros.__version__}')
+            return 0
+        if command not in commands:
+            seen = f'no command {command!r}' if command else 'no command given'
+            print(f'{program}: {seen}, wanted one of {", ".join(commands)}', file=sys.stderr)
+            return 1
+        return int(importlib.import_module(commands[command][0]).main(rest))
+
+    return until_nobody_reads(run)
 
 
 def run_command(

@@ -23,8 +23,8 @@ from hmt_ros.app.progress import show_progress
 from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics, read_grounds
 from hmt_ros.app.truth import mixture_topics
 from hmt_ros.body import Body
+from hmt_ros.body.moving_skeleton import CAMERA_TO_ROOM, MovingSkeleton, bvh_text
 from hmt_ros.inference.arrays import Array
-from hmt_ros.motion.moving_skeleton import CAMERA_TO_ROOM, MovingSkeleton, bvh_text
 from msg_tools import BagReader, MessageError
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import (

@@ -35,7 +35,6 @@ from hmt_ros.app.import_video.keypoint_files.reading import (
     read_keypoints,
 )
 from hmt_ros.app.progress import show_progress, tell_user
-from hmt_ros.app.rendered_bag import START_NS
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.experts.lifted_fit import lift_poses
@@ -45,7 +44,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds
 from hmt_ros.sessions.camera_frames import unit_vector
-from hmt_ros.sessions.camera_session import CAMERA_INFO, FRAME_ID
+from hmt_ros.sessions.camera_session import CAMERA_INFO
 from hmt_ros.sessions.image_inputs import PREDICTION
 from hmt_ros.sessions.track_reports import reversed_gravity
 from hmt_ros.tracking import read_subject
@@ -55,7 +54,7 @@ from hmt_ros.tracking.initialisation import start_from_keypoints
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.detections import NO_KEYPOINTS
-from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.headers import FRAME_ID, SECOND_NS, START_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 LIFTED, REPORT = 'lifted', 'report'
@@ -141,7 +140,7 @@ def _parser() -> CommandParser:
         '--lifter',
         default=SHIPPED,
         metavar='MODEL',
-        help='file that learn-lifter wrote (default: the one that ships)',
+        help='file that "learn lifter" wrote (default: the one that ships)',
     )
     return parser
 

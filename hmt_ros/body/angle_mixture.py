@@ -192,7 +192,7 @@ def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f'{path}: no such file; learn one with `learn-prior`')
+        raise FileNotFoundError(f'{path}: no such file; learn one with `learn prior`')
     arrays = _read(path)
     skeleton, mounts = body.skeleton, arrays['mounts']
     name = str(arrays['body'])
@@ -204,7 +204,7 @@ def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
     ):
         raise ValueError(
             f'{path}: a pose prior of the body {name!r}, wanted one of {body.name!r} with the same '
-            'frames at rest; learn one with `learn-prior --body`'
+            'frames at rest; learn one with `learn prior --body`'
         )
     try:
         return _mixture_of(arrays, skeleton)
@@ -218,12 +218,12 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     except (OSError, ValueError) as fault:
         text = ' '.join(str(fault).split())
         raise ValueError(
-            f'{path}: not a pose prior ({text}); learn one with `learn-prior`'
+            f'{path}: not a pose prior ({text}); learn one with `learn prior`'
         ) from fault
     missing = [name for name in _ARRAYS if name not in arrays]
     if missing or str(arrays['format']) != FORMAT:
         seen = f'it lacks {missing[0]}' if missing else f'its format is {str(arrays["format"])!r}'
-        raise ValueError(f'{path}: not a pose prior ({seen}); learn one with `learn-prior`')
+        raise ValueError(f'{path}: not a pose prior ({seen}); learn one with `learn prior`')
     version = str(arrays['version'])
     if version != str(VERSION):
         raise ValueError(

@@ -53,7 +53,7 @@ def model_names() -> list[str]:
 def load_body(source: str | Path) -> Body:
     """The body of a YAML file, or of a name that ships: 'human37', 'human34' or 'human32'.
 
-    That of a motion file is read by `hmt_ros.motion.motion_file.read_skeleton`.
+    That of a motion file is read by `hmt_learning.motion.motion_file.read_skeleton`.
 
     Raises:
         FileNotFoundError: neither a file nor a known name.

@@ -111,13 +111,13 @@ def read_motion_prior(path: str | Path) -> LearnedMotion:
         ValueError: the file is no motion prior, or damaged; one line.
     """
     if not Path(path).is_file():
-        raise FileNotFoundError(f'{path}: no such file; `learn-motion` makes one')
+        raise FileNotFoundError(f'{path}: no such file; `learn motion` makes one')
     try:
         return _checked(read_archive(path, LARGEST_FILE))
     except (OSError, KeyError, TypeError, ValueError, IndexError) as fault:
         text = ' '.join(str(fault).split())
         raise ValueError(
-            f'{path}: not a motion prior ({text}); make one with `learn-motion`'
+            f'{path}: not a motion prior ({text}); make one with `learn motion`'
         ) from fault
 
 

@@ -95,15 +95,16 @@ class ConditionalDensity(ABC):
         if 'kind' in cls.__dict__:
             cls.kinds[cls.kind] = cls
 
-    @abstractmethod
     def fit(
         self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> Self:
         """Learns from inputs (N, p) and targets (N, D), optionally with weights (N,).
 
         Raises:
-            ValueError: shapes are wrong, values are not finite, or there are too few samples.
+            ValueError: shapes are wrong, values are not finite, there are too few samples, or the
+                model only predicts, such as a network outside hmt_learning.
         """
+        raise ValueError(f'{type(self).__name__} predicts only: it learns in hmt_learning')
 
     @abstractmethod
     def components(self, inputs: ArrayLike) -> Components:

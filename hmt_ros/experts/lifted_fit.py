@@ -20,6 +20,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera, roll
 from hmt_ros.body.kinematics import forward, point_energy
+from hmt_ros.body.limb_angles import limb_angles
 from hmt_ros.body.mirror import relevelled
 from hmt_ros.body.pose_prior import LEARNED, pose_prior
 from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_offsets, landmark_rays
@@ -30,7 +31,6 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.inference.energy import Energy, EnergyFunction, add_energies
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.motion.limb_angles import limb_angles
 
 # Where the hips are until they are placed, m before the camera.
 AWAY = np.array([0.0, 0.0, 5.0])

@@ -40,7 +40,7 @@ from hmt_ros.experts.model_file import (
     read_arrays,
     write_arrays,
 )
-from hmt_ros.experts.network_learning import Floats, Layers
+from hmt_ros.experts.network_experts import Floats, Layers
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.image.keypoint_schemes import AUTO, landmarks, landmarks_of, position_deviations
 from hmt_ros.image.lifted_poses import LiftedPoses, bone_lengths, from_positions

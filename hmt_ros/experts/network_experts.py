@@ -6,12 +6,14 @@ A kernel model keeps samples, and grows with them; the size of a network does no
 that it can learn from all motions, seen from everywhere. Here c_i may be below 1: an expert itself
 predicts how certain it is.
 
-Learning needs JAX and Optax (`network_learning`), prediction neither.
+It learns in `hmt_learning.training.network_learning`. `Layers` have units that leak; each layer is
+added to the last.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,26 +22,73 @@ from numpy.typing import ArrayLike, NDArray
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.model_file import Arrays
-from hmt_ros.experts.network_learning import (
-    Descent,
-    Layers,
-    first_layers,
-    layer_outputs,
-    learned_network,
-)
-from hmt_ros.experts.training_pairs import Standardisation, checked_pairs
-from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.clustering import k_means, squared_distances
+from hmt_ros.experts.training_pairs import Standardisation
+from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.clustering import squared_distances
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 # Limits of log sqrt(c).
 WIDTHS = 2.0
-# Least number of samples; clusters that give the support of an input, and samples for them.
-FEWEST, CENTRES, FOR_CENTRES = 20, 200, 20_000
-# Factor a on the distances of means, and exponent b of densities in the responsibilities.
-DISTANCE, SHARPNESS = 5.0, 0.5
+LEAK = 0.1  # slope of a unit below 0
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Layers:
+    """Layers of H units, after which come O numbers.
+
+    Attributes:
+        first, first_bias: (p, H), (H,).
+        hidden, hidden_biases: (M, H, H), (M, H).
+        last, last_bias: (H, O), (O,).
+    """
+
+    first: Floats
+    first_bias: Floats
+    hidden: Floats
+    hidden_biases: Floats
+    last: Floats
+    last_bias: Floats
+
+    def outputs(self, inputs: Floats) -> Floats:
+        """The numbers (N, O) at inputs (N, p) that are whitened."""
+        units = _leaky(inputs @ self.first + self.first_bias)
+        for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
+            units = units + _leaky(units @ weights + bias)
+        result: Floats = units @ self.last + self.last_bias
+        return result
+
+    def jacobians(self, inputs: Floats, which: slice | Index) -> Floats:
+        """Derivatives (N, o, p) of some of the numbers by inputs (N, p) that are whitened."""
+        before = inputs @ self.first + self.first_bias
+        units = _leaky(before)
+        slopes = _slopes(before)[:, :, None] * self.first.T
+        for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
+            before = units @ weights + bias
+            units = units + _leaky(before)
+            slopes = slopes + _slopes(before)[:, :, None] * (weights.T @ slopes)
+        result: Floats = self.last[:, which].T @ slopes
+        return result
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays for a file: in half precision, except single rows."""
+        return {
+            name: np.asarray(value, dtype=np.float16 if value.ndim > 1 else np.float32)
+            for name, value in vars(self).items()
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
+        """The layers that `to_arrays` stored.
+
+        Raises:
+            KeyError, ValueError: arrays are missing or do not fit.
+        """
+        names = cls.__dataclass_fields__
+        return cls(**{name: np.asarray(arrays[name], dtype=np.float32) for name in names})
 
 
 class NetworkExperts(ConditionalDensity):
@@ -77,27 +126,6 @@ class NetworkExperts(ConditionalDensity):
         self.jitter = jitter
         self.seed = seed
 
-    def fit(
-        self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
-    ) -> Self:
-        """Learns from samples; see `ConditionalDensity.fit`.
-
-        Raises:
-            ValueError: as there, or JAX or Optax is missing.
-        """
-        pairs = checked_pairs(inputs, targets, sample_weight, at_least=FEWEST, what='to learn from')
-        self.n_inputs_, self.n_outputs_ = pairs.inputs.shape[1], pairs.targets.shape[1]
-        of_inputs = Standardisation.of(pairs.inputs, pairs.weights)
-        of_targets = Standardisation.of(pairs.targets, pairs.weights, 'common')
-        x = of_inputs.apply(pairs.inputs).astype(np.float32)
-        y = of_targets.apply(pairs.targets).astype(np.float32)
-        found = self._descended(x, y, pairs.weights / pairs.weights.sum())
-        factors = _triangular(found.pop('factors').astype(np.float64), np)
-        noise = np.linalg.inv(factors.transpose(0, 2, 1) @ factors) * of_targets.scale[0] ** 2
-        noise = 0.5 * (noise + noise.transpose(0, 2, 1))
-        self.set_parts(Layers(**found), of_inputs, of_targets, noise, *self._clusters(x))
-        return self
-
     def set_parts(
         self,
         layers: Layers,
@@ -118,47 +146,12 @@ class NetworkExperts(ConditionalDensity):
         self._layers, self._of_inputs, self._of_targets = layers, of_inputs, of_targets
         self.noise_, self._centres, self._spacing = noise, centres, spacing
 
-    def _descended(self, x: Any, y: Any, share: Array) -> dict[str, Any]:
-        m, d, jitter = self.n_experts, self.n_outputs_, np.float32(self.jitter)
-
-        def drawn(step: int) -> tuple[Any, Any]:
-            rng = np.random.default_rng([self.seed, step])
-            rows = rng.choice(len(x), self.batch, p=share)
-            noise = rng.standard_normal((self.batch, x.shape[1]), dtype=np.float32)
-            return x[rows] + jitter * noise, y[rows]
-
-        def terms(p: Any, seen: Any, true: Any) -> tuple[Any, Any, Any]:
-            import jax
-            import jax.numpy as jnp
-
-            gates, means, widths = _read(layer_outputs(p, seen), m, d)
-            widths = jnp.clip(widths, -WIDTHS, WIDTHS)
-            off = true[:, None] - means
-            whitened = jnp.einsum('mij,nmj->nmi', _triangular(p['factors'], jnp), off)
-            logs = jnp.diagonal(p['factors'], axis1=1, axis2=2).sum(1)
-            density = logs - d * widths - 0.5 * (whitened**2).sum(2) * jnp.exp(-2.0 * widths)
-            distance = jnp.sqrt((off * off).mean(2) + 1e-6)
-            return jax.nn.log_softmax(gates), density, distance
-
-        first = first_layers(x.shape[1], self.units, self.layers, m * (2 + d), self.seed)
-        first['factors'] = np.zeros((m, d, d), np.float32)
-        descent = Descent(self.steps, self.rate, DISTANCE, SHARPNESS)
-        return learned_network(first, terms, d, drawn, descent)
-
-    def _clusters(self, x: Any) -> tuple[Array, float]:
-        """Clusters of inputs, and their spread."""
-        rng = np.random.default_rng(self.seed)
-        some = x[np.sort(rng.permutation(len(x))[:FOR_CENTRES])].astype(np.float64)
-        centres, own = k_means(some, min(CENTRES, len(some)), rng, iterations=5)
-        spread = float(np.sqrt(((some - centres[own]) ** 2).sum(1).mean()))
-        return centres, max(spread, 1e-9)
-
     def components(self, inputs: ArrayLike) -> Components:
         """The mixtures at inputs (n, p)."""
         of_targets = self._of_targets
         seen = self._of_inputs.apply(self._checked(inputs)).astype(np.float32)
         out = self._layers.outputs(seen).astype(np.float64)
-        gates, means, widths = _read(out, self.n_experts, self.n_outputs_)
+        gates, means, widths = read_outputs(out, self.n_experts, self.n_outputs_)
         return Components(
             log_softmax(gates),
             means * of_targets.scale + of_targets.centre,
@@ -205,14 +198,16 @@ class NetworkExperts(ConditionalDensity):
         )
 
 
-def _read(out: Any, m: int, d: int) -> tuple[Any, Any, Any]:
+def read_outputs(out: Any, m: int, d: int) -> tuple[Any, Any, Any]:
     """Gates, means (n, M, D) and log widths from outputs of the last layer (n, M (2 + D))."""
     return out[:, :m], out[:, 2 * m :].reshape(len(out), m, d), out[:, m : 2 * m]
 
 
-def _triangular(factors: Any, np_: Any) -> Any:
-    """Lower triangular matrices (M, D, D) with positive diagonals."""
-    d = factors.shape[1]
-    return np_.tril(factors, -1) + np_.exp(np_.diagonal(factors, axis1=1, axis2=2))[
-        :, :, None
-    ] * np_.eye(d)
+def _leaky(x: Floats) -> Floats:
+    """Outputs of leaky units."""
+    result: Floats = np.maximum(x, np.float32(LEAK) * x)
+    return result
+
+
+def _slopes(x: Floats) -> Floats:
+    return np.where(x > 0, np.float32(1.0), np.float32(LEAK))

@@ -43,7 +43,6 @@ from hmt_ros.experts.root_placement import (
     place_roots,
     placed_gaussians,
 )
-from hmt_ros.experts.training_set import RATE
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import share_of_time
@@ -57,6 +56,7 @@ KIND = 'pose_predictor'
 MAX_COMPONENTS = 8
 LIGHTEST = 1e-3  # weight below which a component is dropped
 # Time step of the sequences that rule (1) learns from, s.
+RATE = 30.0  # of the step that dynamics learn, Hz
 STEP = 1.0 / RATE
 JITTER = 1e-9  # variance that is added to poses, m^2 and rad^2
 # How a mixture is propagated: by rule (9), by rule (1), or not at all.

@@ -41,7 +41,7 @@ class BmeParameters(CameraNodeParameters):
             needed), or 'both'. With 'both' an image waits for its keypoints; silhouettes serve
             where these show nobody.
         lifter: Experts that predict from keypoints, 'keypoints', which ships, or a file that
-            learn-lifter wrote.
+            'learn lifter' wrote.
         propagation: How a prediction depends on the one before: 'none', 'dynamics' or 'experts'.
             Dynamics are rule (9) of the paper with the motion prior; experts are rule (1), trained
             with --dynamics.

@@ -58,7 +58,7 @@ class TrackerSettings:
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         estimate_shape: Whether lengths and flesh of the person are estimated while the track lasts.
         lifter: Experts that tell from the keypoints of the last images how deep the joints are:
-            'keypoints', which ships, or a file that learn-lifter wrote; if empty, keypoints count
+            'keypoints', which ships, or a file that 'learn lifter' wrote; if empty, keypoints count
             by themselves.
         threads: Number of threads that share the poses of an image; 0 takes one a core, 8 at most,
             and leaves one core to others.

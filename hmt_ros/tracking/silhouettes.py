@@ -19,11 +19,11 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.background import BackgroundModel, SceneWatch, Silhouette, one_person
 from hmt_ros.image.empty_scene import EmptyScene
 from hmt_ros.image.observation import Box
 from hmt_ros.inference.arrays import Array, Image, Mask
-from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.camera_motion import SHIFTED, CameraPose
 
 # Least share of the person that is foreground before a background without the person.

@@ -8,6 +8,8 @@ from typing import Any
 from msg_tools.messages.message_types import MessageFactory
 
 SECOND_NS = 1_000_000_000
+FRAME_ID = 'camera_optical_frame'  # of a camera whose messages name no frame
+START_NS = 1_700_000_000 * SECOND_NS  # stamp of the first image of what no clock has stamped
 EARLIEST_NS = -(2**31) * SECOND_NS  # that a message can hold
 _STAMP_AT, _STAMP_SIZE = 4, 8  # bytes of CDR
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.app import learn_motion
-from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
+from hmt_learning.app.rendered_bag import ground_truth
 from hmt_ros.app.report import command as report
 from hmt_ros.body import Camera, load_body
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.headers import FRAME_ID, START_NS
 from msg_tools.messages.images import compressed_image_message, encode_jpeg, jpeg_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
@@ -144,28 +144,6 @@ def make(out, folder, *options):
     """The report's page, as text."""
     assert report.main([str(out), '-o', str(folder), '--quiet', *map(str, options)]) == 0
     return (folder / 'report.html').read_text('utf-8')
-
-
-class ThisProcess:
-    """What stands in for a pool of processes, each of which takes a second to start."""
-
-    def __init__(self, *_):
-        pass
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    def map(self, work, items, **_):
-        return map(work, items)
-
-
-@pytest.fixture
-def read_here(monkeypatch):
-    """Function after which commands read motions in this process."""
-    return lambda: monkeypatch.setattr(learn_motion, 'ProcessPoolExecutor', ThisProcess)
 
 
 @pytest.fixture

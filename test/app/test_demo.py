@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.app import make_bag
+from hmt_learning.app import make_bag
 from hmt_ros.app.demo import main
 from hmt_ros.app.report.mixtures import Layer, Moment, read_mixtures
 from hmt_ros.app.report.skeletons import LEFT, RIGHT, draw_overview

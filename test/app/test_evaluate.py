@@ -7,15 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_learning.app.rendered_bag import ground_truth
 from hmt_ros.app import progress
 from hmt_ros.app.evaluate import main
-from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, joint_mixtures, score
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.ground import GroundState, ground_message
+from msg_tools.messages.headers import FRAME_ID, START_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from hmt_learning.motion.motion_file import read_motion
 from hmt_ros.app import export
-from hmt_ros.app.rendered_bag import FRAME_ID
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.motion.motion_file import read_motion
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.ground import GroundState, ground_message
+from msg_tools.messages.headers import FRAME_ID
 from msg_tools.messages.pose_mixtures import (
     POSE_MIXTURE,
     MixtureKind,

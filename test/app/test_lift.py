@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import yaml
 
+from hmt_learning.training.training_set import procedural_sequence
 from hmt_ros.app import lift
 from hmt_ros.app.export import read_tracked_motion
-from hmt_ros.app.rendered_bag import START_NS
 from hmt_ros.body import Camera, load_body
-from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader
+from msg_tools.messages.headers import START_NS
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
 BODY = load_body('human37')

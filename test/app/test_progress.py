@@ -10,7 +10,8 @@ import time
 
 import pytest
 
-from hmt_ros.app import make_bag, progress, recover
+from hmt_learning.app import make_bag
+from hmt_ros.app import progress, recover
 from hmt_ros.app.progress import INTERVAL, ProgressLines, show_progress, with_progress
 
 

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 
 from hmt_ros.app import subject
-from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.body import Camera
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.tracking import read_subject
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.headers import FRAME_ID, START_NS
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.keypoints import keypoints_message
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hmt_learning.motion.motion_file import read_skeleton
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.kinematics import (
     assemble,
@@ -17,7 +18,6 @@ from hmt_ros.body.kinematics import (
     point_jacobians,
     segment_sums,
 )
-from hmt_ros.motion.motion_file import read_skeleton
 
 BODIES = {name: load_body(name) for name in ('human37', 'human34', 'human32')}
 STEP = 1e-6

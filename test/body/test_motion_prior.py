@@ -71,7 +71,7 @@ def test_bodies_without_a_file_walk_randomly(human32, human37):
 
 
 def test_a_file_that_is_not_there(path):
-    with pytest.raises(FileNotFoundError, match='learn-motion'):
+    with pytest.raises(FileNotFoundError, match='learn motion'):
         read_motion_prior(path)
 
 

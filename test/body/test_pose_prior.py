@@ -270,7 +270,7 @@ def test_faults_of_a_file_are_named(tmp_path, change, message):
 
 
 def test_damaged_and_missing_files(tmp_path):
-    with pytest.raises(FileNotFoundError, match='learn-prior'):
+    with pytest.raises(FileNotFoundError, match='learn prior'):
         read_pose_prior(tmp_path / 'none.npz', HUMAN)
     whole = shipped_path().read_bytes()
     path = tmp_path / 'cut.npz'

@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hmt_ros.app.learn_lifter import LearningSettings, learn_lifter, lifter_scores
-from hmt_ros.body import Camera, load_body
-from hmt_ros.body.kinematics import forward
-from hmt_ros.body.mirror import root_angles, root_rotations
-from hmt_ros.experts.keypoint_training import (
+from hmt_learning.app.learn_lifter import LearningSettings, learn_lifter, lifter_scores
+from hmt_learning.training.keypoint_training import (
     JOINTS,
     WindowSettings,
     keypoint_tracks,
     training_windows,
     with_errors,
 )
+from hmt_learning.training.training_set import procedural_sequence
+from hmt_ros.body import Camera, load_body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import root_angles, root_rotations
 from hmt_ros.experts.lifted_fit import lift_poses, poses_of
 from hmt_ros.experts.lifter import (
     LANDMARKS,
@@ -37,7 +38,6 @@ from hmt_ros.experts.lifter import (
     window_inputs,
 )
 from hmt_ros.experts.pose_encoding import ray_rotations
-from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths, from_positions, pooled
 from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints

@@ -7,8 +7,8 @@ import importlib.util
 import numpy as np
 import pytest
 
-from hmt_ros.experts.network_experts import NetworkExperts
-from hmt_ros.experts.network_learning import Layers, first_layers
+from hmt_learning.training.network_learning import LearningNetwork, first_layers
+from hmt_ros.experts.network_experts import Layers, NetworkExperts
 from hmt_ros.experts.training_pairs import Standardisation
 
 needs_jax = pytest.mark.skipif(
@@ -86,10 +86,10 @@ def test_a_file_whose_layers_do_not_fit_is_refused(tmp_path):
 
 
 def test_without_jax_learning_says_what_is_missing(monkeypatch):
-    monkeypatch.setattr('hmt_ros.experts.network_learning.find_spec', lambda _: None)
+    monkeypatch.setattr('hmt_learning.training.network_learning.find_spec', lambda _: None)
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match='pip install jax optax'):
-        NetworkExperts(steps=1).fit(rng.normal(size=(30, 2)), rng.normal(size=(30, 2)))
+        LearningNetwork(steps=1).fit(rng.normal(size=(30, 2)), rng.normal(size=(30, 2)))
 
 
 @needs_jax
@@ -99,12 +99,12 @@ def test_both_branches_are_learned():
     r = rng.uniform(-1.0, 1.0, (1500, 1))
     x = rng.choice([-1.0, 1.0], (1500, 1)) * (1.0 + np.sin(3.0 * r))
     x += 0.05 * rng.normal(size=x.shape)
-    fitted = NetworkExperts(2, units=32, steps=800, batch=128, jitter=0.0, seed=1).fit(r, x)
+    fitted = LearningNetwork(2, units=32, steps=800, batch=128, jitter=0.0, seed=1).fit(r, x)
     at = np.linspace(-0.4, 0.9, 9)[:, None]
     weights, means, _ = fitted.predict_arrays(at)
     np.testing.assert_allclose(weights, 0.5, atol=0.2)
     means = np.sort(means[:, :, 0], axis=1)
     branch = 1.0 + np.sin(3.0 * at[:, 0])
     np.testing.assert_allclose(means, np.stack([-branch, branch], axis=1), atol=0.15)
-    again = NetworkExperts(2, units=32, steps=800, batch=128, jitter=0.0, seed=1).fit(r, x)
+    again = LearningNetwork(2, units=32, steps=800, batch=128, jitter=0.0, seed=1).fit(r, x)
     assert np.array_equal(fitted.components(at).means, again.components(at).means)

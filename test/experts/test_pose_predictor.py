@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_learning.training.predictor_learning import Described, described, learned_predictor
+from hmt_learning.training.training_set import TrainingSettings, procedural_sequence, training_set
 from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 from hmt_ros.experts import LocalExperts, NearestNeighbours
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor
 from hmt_ros.experts.pose_predictor import ALONE, BY_EXPERTS, PosePredictor
-from hmt_ros.experts.predictor_learning import Described, described, learned_predictor
-from hmt_ros.experts.training_set import TrainingSettings, procedural_sequence, training_set
-from hmt_ros.rendering.renderer import render_silhouettes
 
 CAMERA = Camera(400.0, 400.0, 199.5, 149.5, 400, 300)
 

@@ -3,13 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
+from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.experts.descriptor.contour import PersonBlob, person_blob
 from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.root_placement import place_roots, placed_gaussians
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_silhouettes
 
 CAMERA = Camera(660.0, 660.0, 319.5, 239.5, 640, 480)
 

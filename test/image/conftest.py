@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.rendering.renderer import render_frames
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_frames
-from hmt_ros.rendering.scene import Scene
 
 VIEW = Viewpoint(distance=3.2)
 

@@ -6,6 +6,8 @@ from itertools import product
 import numpy as np
 import pytest
 
+from hmt_learning.rendering.renderer import render, sensed_depth
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
 from hmt_ros.body.flesh import signed_power
 from hmt_ros.body.kinematics import forward
@@ -23,8 +25,6 @@ from hmt_ros.image.terms.depth import (
     usable_depths,
 )
 from hmt_ros.image.terms.image_term import TermSettings
-from hmt_ros.rendering.renderer import render, sensed_depth
-from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 
 ALONE = LikelihoodSettings.of_terms(depth=DEPTH.settings)

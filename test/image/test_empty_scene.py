@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.rendering.renderer import render_frames
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body.camera import Camera, Viewpoint
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.empty_scene import KNOWN, STILL, STILLEST, UNSEEN, EmptyScene
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_frames
-from hmt_ros.rendering.scene import Scene
 
 SECOND = 1_000_000_000
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)

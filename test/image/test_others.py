@@ -4,14 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.rendering.renderer import render, render_people
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body.camera import Camera, Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import observe
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render, render_people
-from hmt_ros.rendering.scene import Scene
 
 VIEW = Viewpoint(distance=3.2)
 SCENE = Scene(viewpoint=VIEW, seed=2)

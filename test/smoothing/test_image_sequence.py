@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.image.likelihood import ImageLikelihood
@@ -12,7 +13,6 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives
-from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
 from hmt_ros.smoothing.likelihood import ImageSequence
 

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.rendering.renderer import render_frames
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_frames
-from hmt_ros.rendering.scene import Scene
 
 KeypointsOf = Callable[..., Keypoints]
 Filmed = Callable[..., tuple[np.ndarray, list[np.ndarray], np.ndarray]]

@@ -7,14 +7,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.rendering.renderer import render_frames, render_people
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.skeleton import other_side
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_frames, render_people
-from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker, TrackerSettings
 
 SETTINGS = TrackerSettings(

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body.camera import Camera, Viewpoint
 from hmt_ros.body.mirror import left_directions
+from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.empty_scene import UNSEEN
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking import Status, Tracker, TrackerSettings
 from hmt_ros.tracking.beginning import (
     FARTHEST,

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
-from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings
 from hmt_ros.tracking.camera_motion import LONGEST_GUESS, CameraMotion, CameraPath, CameraPose
 from hmt_ros.tracking.contact import FootContacts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.mirror import left_directions
 from hmt_ros.image.keypoint_schemes import usual_exchanges
@@ -11,7 +12,6 @@ from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import KEYPOINTS
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import Tracker, TrackerSettings
 from hmt_ros.tracking.posterior import Posterior, SideExchanges
 from test.image.test_keypoints import BODY, CAMERA, exchanged, seen

@@ -8,10 +8,10 @@ from datetime import datetime, timedelta, timezone
 import numpy as np
 import pytest
 
+from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.inference.markov_chain import update
-from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.appearance import Motion
 from hmt_ros.tracking.existence import (
     ABSENT,

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.ground_terms import GroundSettings, sole_points, soles
@@ -15,7 +16,6 @@ from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.error_model import ERRORS
-from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.contact import FootContacts

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
+from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import observe
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.initialisation import (
     poses_from_keypoints,
     poses_from_outline,

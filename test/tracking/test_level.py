@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import roll
 from hmt_ros.image.likelihood import OFF
 from hmt_ros.image.terms.registry import TERMS
-from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import KnownGround, Tracker, TrackerSettings
 
 UP = np.array([0.0, -1.0, 0.0])

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_learning.training.training_set import procedural_sequence
 from hmt_ros.body import Camera, load_body
-from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.image.likelihood import OFF
 from hmt_ros.image.terms.keypoints import Keypoints

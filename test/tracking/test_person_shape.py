@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_ros.rendering.renderer import render_silhouettes
+from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.tracking.person_shape import (
     covered,
     largest_person,

@@ -9,6 +9,9 @@ import pytest
 
 from benchmarks import numpy_likelihood as oracle
 from benchmarks.numpy_contour import occluding_contour
+from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.rendering.renderer import render_frames
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
@@ -18,9 +21,6 @@ from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.error_model import ERRORS
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_frames
-from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.posterior import WIDEST, Posterior
 from hmt_ros.tracking.shape_estimation import (

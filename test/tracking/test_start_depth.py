@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.rendering.renderer import render_frames, sensed_depth
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_frames, sensed_depth
-from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.beginning import Shown, first_start
 from hmt_ros.tracking.existence import Existence

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint, shortest_turn
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_rotations
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import KnownGround, Tracker, TrackerSettings
 from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.initialisation import start_from_keypoints

@@ -16,10 +16,10 @@ import numpy as np
 from avatar import Avatar
 from scipy.spatial.transform import Rotation
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
-from hmt_ros.motion.procedural_motion import procedural_motion
 
 FPS = 15.0
 SOLE = 0.012  # m, of a shoe

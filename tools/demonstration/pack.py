@@ -13,9 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hmt_ros.app.rendered_bag import (
-    FRAME_ID,
-    START_NS,
+from hmt_learning.app.rendered_bag import (
     Take,
     ground_truth,
     subject_text,
@@ -27,6 +25,7 @@ from hmt_ros.body.camera import Viewpoint
 from hmt_ros.detectors.blazepose import BlazePose
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.headers import FRAME_ID, START_NS
 from msg_tools.messages.images import compressed_image_message, decode_image
 from msg_tools.messages.keypoints import keypoints_message, positions_message
 

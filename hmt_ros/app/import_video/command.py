@@ -33,7 +33,6 @@ from hmt_ros.app.import_video.keypoint_files.reading import (
     read_keypoints,
 )
 from hmt_ros.app.progress import tell_user, with_progress
-from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.body import Camera
 from hmt_ros.detectors.blazepose import BlazePose
 from hmt_ros.image.keypoint_schemes import AUTO
@@ -43,6 +42,7 @@ from hmt_ros.sessions.camera_file import camera_of_view, read_camera
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.detections import NO_KEYPOINTS
+from msg_tools.messages.headers import FRAME_ID, START_NS
 from msg_tools.messages.images import encode_jpeg, image_message, jpeg_message
 from msg_tools.messages.keypoints import keypoints_message, positions_message
 

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from hmt_learning.training.training_set import procedural_sequence
 from hmt_ros.app.import_video.frames import FrameSource
 from hmt_ros.app.import_video.keypoint_files.choice import Choice
 from hmt_ros.app.import_video.keypoint_files.clip_check import bone_deviation, check_clip
@@ -16,7 +17,6 @@ from hmt_ros.app.import_video.keypoint_files.reading import (
 )
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.keypoint_schemes import schemes
 
 BODY = load_body('human37')

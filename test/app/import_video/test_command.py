@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from hmt_ros.app.import_video import command
-from hmt_ros.app.rendered_bag import START_NS
 from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
-from msg_tools.messages.headers import time_ns
+from msg_tools.messages.headers import START_NS, time_ns
 from msg_tools.messages.images import decode_image, decode_mask
 
 NAMES = ('left_hip', 'right_hip', 'left_knee')

@@ -7,8 +7,8 @@ from contextlib import redirect_stderr, redirect_stdout
 
 import pytest
 
+from hmt_learning.app.make_bag import main as make_bag
 from hmt_ros.app import progress
-from hmt_ros.app.make_bag import main as make_bag
 from hmt_ros.app.replay import many_bags
 from hmt_ros.app.replay.command import main
 from msg_tools import BagReader

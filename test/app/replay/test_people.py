@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.people import scores, tracks_in
-from hmt_ros.app.make_bag import main as make_bag
-from hmt_ros.app.rendered_bag import PEOPLE, crossing_takes
+from hmt_learning.app.make_bag import main as make_bag
+from hmt_learning.app.rendered_bag import PEOPLE, crossing_takes
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import load_body

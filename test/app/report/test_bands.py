@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from hmt_ros.app.rendered_bag import FRAME_ID
 from hmt_ros.app.report.mixtures import PROBABILITIES, ground_at, intervals, marginals_of
 from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.ground import GroundState
+from msg_tools.messages.headers import FRAME_ID
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 from test.app.conftest import FRAMES, STAMPS, data_of, make, write_out
 from test.app.report.test_command import UP, with_ground

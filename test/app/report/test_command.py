@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from hmt_ros.app.evaluate import score_bag
-from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.app.report import command as report
 from hmt_ros.app.report.images import ImageSource, film_strip
 from hmt_ros.app.report.mixtures import ENDS, KEPT_TRAJECTORIES, read_mixtures
@@ -19,7 +18,7 @@ from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.ground import GroundState, ground_message
-from msg_tools.messages.headers import time_message, time_ns
+from msg_tools.messages.headers import FRAME_ID, START_NS, time_message, time_ns
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of

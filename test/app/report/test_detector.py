@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from hmt_ros.app.rendered_bag import FRAME_ID
 from hmt_ros.app.report import command as report
 from hmt_ros.app.report.mixtures import read_mixtures
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools import BagReader, BagWriter
 from msg_tools.messages.detections import NO_KEYPOINTS
-from msg_tools.messages.headers import header_message
+from msg_tools.messages.headers import FRAME_ID, header_message
 from msg_tools.messages.keypoints import positions_message
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 from test.app.conftest import FRAMES, MESSAGES, STAMPS, data_of, make, write_out

@@ -4,15 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
+from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
+from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError, centred_view, person_blob
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
     SilhouetteDescriptor,
     silhouette_parts,
 )
-from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.rendering.renderer import render_silhouettes
 
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
 

@@ -1,0 +1,234 @@
+"""learn-lengths: learns how the lengths of a body vary over people, from motion files.
+
+learn-lengths FILES... --people index.csv
+
+It prints the entries `lengths` and `stature_spread` of the body's YAML file, and how likely they
+make people left out.
+
+Lengths vary by a common stature and by proportions, which are learned from skeletons:
+
+    x_ni = log l_ni - mean_n log l_ni = s_n + e_ni,    s_n ~ N(0, t^2),  e_ni ~ N(0, p_i^2)
+    t^2  <- (m t0^2 + sum_n E[s_n^2]) / (m + N - 1)
+    p_i^2 <- (m p0_i^2 + sum_n E[(x_ni - s_n)^2]) / (m + N - 1)
+
+EM for one factor with equal loadings; t0 and p0 are the usual spreads, which count as m people. An
+additive length (`shoulder_rise`, which may be negative) has its difference from the mean over the
+length of the model in place of the logarithm. Means are not learned: skeletons place trunk, neck
+and hips each in a way of their own.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hmt_learning.app.learn_motion import chosen_motions, read_motions
+from hmt_learning.app.learn_prior import add_people_tables, people_in, person_of
+from hmt_learning.motion.motion_file import read_motion
+from hmt_learning.motion.retarget import body_from_motion
+from hmt_ros.app.command_line import CommandParser, run_command
+from hmt_ros.body import Body, load_body
+from hmt_ros.inference.arrays import Array
+
+# Number of frames of a motion that its lengths are measured on.
+FRAMES = 60
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
+    return run_command(_parser(), _learn, argv)
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser(
+        prog='learn-lengths',
+        description='Learns how lengths vary over people, from the skeletons of motion files.',
+    )
+    parser.add_motions()
+    add_people_tables(parser)
+    return parser
+
+
+def _learn(arguments: argparse.Namespace) -> int:
+    body = load_body(arguments.body)
+    usual, owners = usual_spread(body), people_in(arguments.people)
+    found = read_motions(
+        'learn-lengths', chosen_motions(arguments.motions, []), arguments.body, _lengths
+    )
+    people = [person_of(name, owners) for name, _ in found]
+    rows = np.array([lengths for _, lengths in found])
+    names, relative = own_skeletons(body, people, rows)
+    spread = learned_spread(relative, usual)
+    print(f'# {len(names)} people with a skeleton of their own: {", ".join(names)}')
+    if len(names) > 2:
+        learned, plain = held_out(relative, usual)
+        print(f'# people left out: {learned.mean():.2f} nats, model file {plain.mean():.2f}')
+    print('lengths:')
+    for (name, value), own in zip(body.segment_lengths.items(), spread.proportions, strict=True):
+        print(f'  {name}: [{value:.3f}, {own:.3f}]')
+    print(f'stature_spread: {spread.stature:.3f}')
+    return 0
+
+
+def _lengths(path: Path, body: Body) -> tuple[str, Array]:
+    """Name of a motion without suffix, and the lengths of its skeleton, m."""
+    motion = read_motion(path)
+    motion = motion.part(0, None, max(len(motion.poses) // FRAMES, 1))
+    lengths = body_from_motion(motion, body).skeleton.lengths
+    relative_lengths(body, lengths[None])
+    return path.stem, lengths
+
+
+# Number of people that the spreads of the body model count as.
+USUAL_PEOPLE = 10.0
+ADDITIVE = ('shoulder_rise',)
+# Lengths that do not change with the pose in any skeleton, and how alike they are in copies of one.
+RIGID, ALIKE = ('thigh', 'shin', 'upper_arm', 'forearm'), 0.02
+ITERATIONS = 500
+
+
+@dataclass(frozen=True, eq=False)
+class LengthSpread:
+    """How lengths vary over people.
+
+    Attributes:
+        stature: relative standard deviation of the stature.
+        proportions: (L,) relative standard deviations of the proportions.
+    """
+
+    stature: float
+    proportions: Array
+
+    @property
+    def covariance(self) -> Array:
+        """(L, L) of relative lengths."""
+        count = len(self.proportions)
+        result: Array = np.diag(self.proportions**2) + np.full((count, count), self.stature**2)
+        return result
+
+
+def usual_spread(body: Body) -> LengthSpread:
+    """The spread in the file of a body model.
+
+    Raises:
+        ValueError: a body whose lengths have no common stature and proportions.
+    """
+    lengths = body.skeleton.lengths
+    relative = body.length_covariance / np.outer(lengths, lengths)
+    common = relative[~np.eye(len(lengths), dtype=bool)]
+    own = np.diagonal(relative) - common.min(initial=np.inf)
+    if not (len(common) and np.allclose(common, common[0]) and common[0] > 0 and (own > 0).all()):
+        raise ValueError(f'{body.name} has no spreads of stature and proportions to start from')
+    return LengthSpread(float(np.sqrt(common[0])), np.sqrt(own))
+
+
+def relative_lengths(body: Body, lengths: Array) -> Array:
+    """Lengths (N, L) in m as logarithms, the additive ones over the model's.
+
+    Raises:
+        ValueError: a length that is not positive.
+    """
+    names = body.skeleton.length_names
+    additive = np.array([name in ADDITIVE for name in names])
+    bad = np.argwhere((lengths <= 0) & ~additive)
+    if len(bad):
+        row, column = bad[0]
+        raise ValueError(
+            f'{names[column]} must be positive, saw {lengths[row, column]:.3f} m: the joints of '
+            f'this skeleton are not those of a person'
+        )
+    logarithms = np.log(np.where(additive, 1.0, lengths))
+    result: Array = np.where(additive, lengths / body.skeleton.lengths, logarithms)
+    return result
+
+
+def own_skeletons(
+    body: Body, people: Sequence[str], lengths: Array
+) -> tuple[tuple[str, ...], Array]:
+    """The people with a skeleton of their own, each once, and its relative lengths (n, L).
+
+    Motions are often put on a skeleton that many share; nothing is learned from such a skeleton.
+
+    Args:
+        people: (N,) whose skeleton each is.
+        lengths: (N, L) m.
+    """
+    relative = relative_lengths(body, lengths)
+    rigid = relative[:, [body.skeleton.length_names.index(name) for name in RIGID]]
+    alike = np.abs(rigid[:, None] - rigid[None]).max(2) < ALIKE
+    own: dict[str, list[Array]] = {}
+    for name, row, copies in zip(people, relative, alike, strict=True):
+        if {people[i] for i in np.flatnonzero(copies).tolist()} == {name}:
+            own.setdefault(name, []).append(row)
+    names = tuple(sorted(own))
+    rows = [np.mean(own[name], axis=0) for name in names]
+    return names, np.array(rows).reshape(len(rows), relative.shape[1])
+
+
+def learned_spread(
+    relative: Array, usual: LengthSpread, usual_people: float = USUAL_PEOPLE
+) -> LengthSpread:
+    """The most probable spread.
+
+    Args:
+        relative: (N, L) relative lengths of N people.
+        usual: before any people.
+        usual_people: number of people that it counts as, m.
+
+    Raises:
+        ValueError: fewer than two people.
+    """
+    if len(relative) < 2:
+        raise ValueError(f'{len(relative)} people have a skeleton of their own, wanted at least 2')
+    x = relative - relative.mean(0)
+    total = usual_people + len(x) - 1
+    stature, own = usual.stature**2, usual.proportions**2
+    for _ in range(ITERATIONS):
+        variance = 1.0 / (1.0 / stature + (1.0 / own).sum())
+        mean = variance * (x / own).sum(1)
+        # N - 1 people are free of the mean.
+        left = variance * (len(x) - 1)
+        stature = (usual_people * usual.stature**2 + mean @ mean + left) / total
+        rest = ((x - mean[:, None]) ** 2).sum(0) + left
+        own = (usual_people * usual.proportions**2 + rest) / total
+    return LengthSpread(float(np.sqrt(stature)), np.sqrt(own))
+
+
+def log_likelihoods(relative: Array, mean: Array, covariance: Array) -> Array:
+    """Log densities (N,) of relative lengths (N, L) under a Gaussian, nats."""
+    off = relative - mean
+    sign, determinant = np.linalg.slogdet(covariance)
+    distance = (off * np.linalg.solve(covariance, off.T).T).sum(1)
+    result: Array = -0.5 * (distance + determinant + off.shape[1] * np.log(2.0 * np.pi))
+    return result if sign > 0 else np.full(len(off), -np.inf)
+
+
+def held_out(
+    relative: Array, usual: LengthSpread, usual_people: float = USUAL_PEOPLE
+) -> tuple[Array, Array]:
+    """Log likelihoods (N,) of each person by the others: learned spreads, usual ones, nats.
+
+    Either is around the mean of the others, which is uncertain by itself.
+
+    Raises:
+        ValueError: fewer than three people.
+    """
+    if len(relative) < 3:
+        raise ValueError(f'{len(relative)} people, wanted at least 3 to leave one out')
+    scores = []
+    for n in range(len(relative)):
+        others = np.delete(relative, n, axis=0)
+        more = 1.0 + 1.0 / len(others)
+        spreads = learned_spread(others, usual, usual_people), usual
+        scores.append(
+            [
+                log_likelihoods(relative[[n]], others.mean(0), more * spread.covariance)[0]
+                for spread in spreads
+            ]
+        )
+    learned, plain = np.array(scores).T
+    return learned, plain

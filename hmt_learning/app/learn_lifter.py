@@ -1,0 +1,286 @@
+"""learn-lifter: learns experts that know depth, from recorded motions.
+
+    learn-lifter FILES_OR_FOLDERS ... -o keypoints.npz --test PEOPLE_LEFT_OUT
+
+The tracker takes the file that lies in `hmt_ros/experts/models` as keypoints.npz; any other one by
+its path.
+
+Distances in the loss (`network_learning`) are those of the joints from their true places, in the
+mean over joints.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp, ndtr
+
+from hmt_learning.app.learn_motion import chosen_motions, data_card, read_motions, shares_of
+from hmt_learning.training.keypoint_training import (
+    JOINTS,
+    KeypointTracks,
+    WindowSettings,
+    keypoint_tracks,
+    training_windows,
+)
+from hmt_learning.training.network_learning import (
+    Descent,
+    check_tools,
+    first_layers,
+    layer_outputs,
+    learned_network,
+)
+from hmt_learning.training.training_set import PoseSequence, recorded_sequence
+from hmt_ros.app.command_line import (
+    CommandParser,
+    add_people,
+    add_seed,
+    add_sources,
+    model_file,
+    run_command,
+    whole_number,
+)
+from hmt_ros.app.progress import show_progress
+from hmt_ros.body import Body, load_body
+from hmt_ros.experts.lifter import MEANS, SPREAD, SPREADS, Lifter, Network
+from hmt_ros.inference.arrays import Array
+
+# Windows that a lifter is scored on.
+SCORED_WINDOWS = 2000
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
+    return run_command(_parser(), _learn, argv)
+
+
+def _parser() -> CommandParser:
+    usual = LearningSettings()
+    parser = CommandParser(
+        prog='learn-lifter',
+        description='Learns to tell the depths of joints from windows of keypoints.',
+    )
+    parser.add_motions()
+    parser.add_model()
+    add_sources(parser)
+    add_people(parser)
+    parser.add_argument(
+        '--steps',
+        type=whole_number(1),
+        default=usual.steps,
+        help=f'number of steps ({usual.steps})',
+    )
+    parser.add_argument(
+        '--batch', type=whole_number(2), default=usual.batch, help=f'windows a step ({usual.batch})'
+    )
+    parser.add_argument(
+        '--experts',
+        type=whole_number(1, 32),
+        default=usual.experts,
+        help=f'number of experts ({usual.experts})',
+    )
+    add_seed(parser)
+    parser.add_argument(
+        '--resume',
+        action='store_true',
+        help='go on with a training that was broken off, marked beside FILE as FILE.resume',
+    )
+    return parser
+
+
+def _learn(options: argparse.Namespace) -> int:
+    output, quiet = model_file(options.output, overwrite=options.overwrite), options.quiet
+    mark = output.with_suffix('.resume')
+    if mark.exists() and not options.resume:
+        raise ValueError(f'{mark} marks a training that was broken off: --resume, or remove it')
+    check_tools()
+    body = load_body(options.body)
+    learned, tested = (
+        read_motions('learn-lifter', paths, options.body, recorded_sequence, quiet=quiet)
+        for paths in (
+            chosen_motions(options.motions, options.without),
+            [] if options.test is None else chosen_motions([options.test], []),
+        )
+    )
+    shares = shares_of(learned, options.alike, options.alike_share)
+    settings = LearningSettings(
+        experts=options.experts, steps=options.steps, batch=options.batch, seed=options.seed
+    )
+    windows = WindowSettings()
+    with show_progress('placing', quiet=quiet):
+        tracks = keypoint_tracks(body, learned, shares, seed=options.seed)
+    notes = {
+        'card': data_card(learned, options.acknowledgement),
+        'scored on': sorted(one.name for one in tested),
+        'learning': asdict(settings),
+        'windows': asdict(windows),
+    }
+    with show_progress('learning', 'steps', options.steps, quiet=quiet) as bar:
+        done = 0
+
+        def told(step: int, _loss: float) -> None:
+            nonlocal done
+            bar.update(step - done)
+            done = step
+
+        lifter = learn_lifter(body, tracks, settings, windows, notes, told, mark)
+    if tested:
+        lifter.notes['scores'] = _scores(body, tested, lifter, windows)
+    lifter.save(output)
+    mark.unlink(missing_ok=True)
+    if not quiet:
+        size = output.stat().st_size / 1e6
+        print(f'{output}: {len(learned)} motions, {size:.1f} MB', flush=True)
+        for name, value in lifter.notes.get('scores', {}).items():
+            print(f'  {name}: {value}', flush=True)
+    return 0
+
+
+def _scores(
+    body: Body, tested: list[PoseSequence], lifter: Lifter, windows: WindowSettings
+) -> dict[str, str]:
+    """Scores on motions of other people, as text by kind of keypoints."""
+    tracks = keypoint_tracks(body, tested, [1.0] * len(tested), variants=1)
+    known = replace(
+        windows, cut=0.0, causal=0.0, gravity_spread=0.0, lengths_spread=0.0, lengths=1.0
+    )
+    kinds = {
+        'clean keypoints': replace(known, noise=0.0),
+        'a detector that errs': known,
+        'the same, causal': replace(known, causal=1.0),
+        'the same, lengths unknown': replace(known, causal=1.0, lengths=0.0),
+    }
+    result = {}
+    for name, kind in kinds.items():
+        drawn = training_windows(tracks, SCORED_WINDOWS, np.random.default_rng(0), kind, 0)
+        s = lifter_scores(lifter, *drawn)
+        result[name] = (
+            f'{1e3 * s.heaviest:.0f} mm heaviest, {1e3 * s.best:.0f} best, '
+            f'{s.log_density:.2f} nats, {100 * s.within:.0f} % within 90'
+        )
+    return result
+
+
+# Joints whose mean distance from the truth, seen from the pelvis, is reported.
+SCORED = tuple(i for i, name in enumerate(JOINTS) if not name.endswith(('toe', 'hand', 'pelvis')))
+PELVIS = JOINTS.index('pelvis')
+# Least scale of an input.
+LEAST_SCALE = 0.1
+
+
+@dataclass(frozen=True)
+class LearningSettings:
+    """How a lifter learns.
+
+    Attributes:
+        units, layers: Width of the layers that experts share, and number of those that add.
+        rate: Of Adam, at its highest.
+        distance_weight: Factor a, 1/m.
+        sharpness: Exponent b of the densities in q.
+    """
+
+    experts: int = 5
+    units: int = 624
+    layers: int = 3
+    steps: int = 30_000
+    batch: int = 1024
+    rate: float = 1e-3
+    distance_weight: float = 9.0
+    sharpness: float = 0.5
+    seed: int = 0
+
+
+def learn_lifter(
+    body: Body,
+    tracks: KeypointTracks,
+    settings: LearningSettings,
+    windows: WindowSettings,
+    notes: dict[str, Any],
+    told: Callable[[int, float], None] | None = None,
+    resume: Path | None = None,
+) -> Lifter:
+    """A lifter that has learned.
+
+    Args:
+        body: with the usual lengths.
+        told: is called after each step, with its number and the loss.
+        resume: file in which the training is marked now and then, and taken up if it is there.
+
+    Raises:
+        ValueError: JAX or Optax is missing, or the file to take up is of another training.
+    """
+    check_tools()
+    import jax
+    import jax.numpy as jnp
+
+    s = settings
+
+    def drawn(step: int) -> tuple[Any, Any]:
+        return training_windows(tracks, s.batch, np.random.default_rng([s.seed, step]), windows)
+
+    inputs, joints = drawn(s.steps)
+    mean, scale = inputs.mean(0), inputs.std(0) + np.float32(LEAST_SCALE)
+    middle = joints.mean(0)
+    k, j = s.experts, len(JOINTS)
+
+    def terms(p: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        out = layer_outputs(p, (x - mean) / scale)
+        means = MEANS * out[:, k : k * (1 + 3 * j)].reshape(-1, k, j, 3) + middle
+        spreads = out[:, k * (1 + 3 * j) :].reshape(-1, k, j, 3)
+        spreads = jnp.clip(spreads + SPREAD, *SPREADS)
+        off = means - y[:, None]
+        density = -(0.5 * (off * jnp.exp(-spreads)) ** 2 + spreads).sum((2, 3))
+        distance = jnp.sqrt((off * off).sum(3) + 1e-6).mean(2)
+        return jax.nn.log_softmax(out[:, :k]), density, distance
+
+    descent = Descent(s.steps, s.rate, s.distance_weight, s.sharpness, told, resume, str(asdict(s)))
+    first = first_layers(inputs.shape[1], s.units, s.layers, k * (1 + 6 * j), s.seed)
+    found = learned_network(first, terms, 3 * j, drawn, descent)
+    return Lifter(Network(mean=mean, scale=scale, middle=middle, **found), JOINTS, body, notes)
+
+
+@dataclass(frozen=True)
+class LifterScores:
+    """Scores of a lifter on windows.
+
+    Attributes:
+        heaviest, best: Mean distance of the scored joints from the truth, from the pelvis, m, of
+            the heaviest expert and of the best one.
+        log_density: Mean log density of the truth, nats a number.
+        within: Share of the true coordinates in the central 90 % of their marginal mixture.
+    """
+
+    heaviest: float
+    best: float
+    log_density: float
+    within: float
+
+
+def lifter_scores(lifter: Lifter, inputs: Any, joints: Any) -> LifterScores:
+    """Scores on windows: inputs (N, p) and joints (N, J, 3)."""
+    gates, means, deviations = lifter.network(inputs)
+    off = means - joints[:, None]
+    each = gates - (0.5 * (off / deviations) ** 2 + np.log(deviations)).sum((2, 3))
+    size = off[0, 0].size
+    density = logsumexp(each, axis=1) / size - 0.5 * np.log(2.0 * np.pi)
+    wanted = joints[:, SCORED] - joints[:, [PELVIS]]
+    seen = means[:, :, SCORED] - means[:, :, [PELVIS]]
+    distance = np.linalg.norm(seen - wanted[:, None], axis=3).mean(2)
+    rows = np.arange(len(gates))
+    return LifterScores(
+        float(distance[rows, gates.argmax(1)].mean()),
+        float(distance.min(1).mean()),
+        float(density.mean()),
+        float(_within(gates, off / deviations).mean()),
+    )
+
+
+def _within(gates: Array, off: Array, share: float = 0.9) -> Array:
+    """Whether truths are in the central share of marginals, by whitened offsets (N, K, J, 3)."""
+    below = np.einsum('nk,nkji->nji', np.exp(gates), ndtr(-off))
+    return np.asarray(np.abs(below - 0.5) <= 0.5 * share)

@@ -1,0 +1,1 @@
+"""Motion files, retargeting to our bodies, and procedural motion."""

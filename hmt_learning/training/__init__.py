@@ -1,0 +1,1 @@
+"""Training sets, and the learning of priors, of motion, and of experts."""

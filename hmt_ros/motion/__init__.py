@@ -1,1 +1,0 @@
-"""Motions: motion capture files, retargeting to our bodies, procedural motion, viewpoints."""

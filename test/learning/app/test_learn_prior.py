@@ -1,0 +1,174 @@
+"""The command on a handful of short motions of a stick figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hmt_learning.app
+from hmt_learning.app import learn_prior
+from hmt_ros.body import load_body
+from hmt_ros.body.angle_mixture import read_pose_prior
+from hmt_ros.body.mirror import mirror
+
+# Joint: (parent, offset in m, y up).
+JOINTS: dict[str, tuple[str | None, tuple[float, float, float]]] = {
+    'Hips': (None, (0, 0, 0)),
+    'LeftUpLeg': ('Hips', (0.1, -0.1, 0)),
+    'LeftLeg': ('LeftUpLeg', (0, -0.42, 0)),
+    'LeftFoot': ('LeftLeg', (0, -0.41, 0)),
+    'LeftToeBase': ('LeftFoot', (0, -0.03, 0.13)),
+    'RightUpLeg': ('Hips', (-0.1, -0.1, 0)),
+    'RightLeg': ('RightUpLeg', (0, -0.42, 0)),
+    'RightFoot': ('RightLeg', (0, -0.41, 0)),
+    'RightToeBase': ('RightFoot', (0, -0.03, 0.13)),
+    'Spine': ('Hips', (0, 0.2, 0)),
+    'Neck': ('Spine', (0, 0.23, 0)),
+    'Head': ('Neck', (0, 0.1, 0)),
+    'LeftShoulder': ('Spine', (0.02, 0.2, 0)),
+    'LeftArm': ('LeftShoulder', (0.15, 0, 0)),
+    'LeftForeArm': ('LeftArm', (0, -0.28, 0)),
+    'LeftHand': ('LeftForeArm', (0, -0.23, 0)),
+    'RightShoulder': ('Spine', (-0.02, 0.2, 0)),
+    'RightArm': ('RightShoulder', (-0.15, 0, 0)),
+    'RightForeArm': ('RightArm', (0, -0.28, 0)),
+    'RightHand': ('RightForeArm', (0, -0.23, 0)),
+}
+ENDS = {'Head': (0, 0.1, 0)}
+
+
+def write_motion(path: Path, seed: int, frames: int = 24) -> Path:
+    """A figure that swings its limbs."""
+    rng = np.random.default_rng(seed)
+    lines: list[str] = ['HIERARCHY']
+    channels: list[str] = []
+
+    def add(name: str, depth: int) -> None:
+        parent, offset = JOINTS[name]
+        word = 'ROOT' if parent is None else 'JOINT'
+        places = 'Xposition Yposition Zposition ' if parent is None else ''
+        count = 6 if parent is None else 3
+        pad = '  ' * depth
+        lines.extend(
+            [
+                f'{pad}{word} {name}',
+                pad + '{',
+                f'{pad}  OFFSET {" ".join(map(str, offset))}',
+                f'{pad}  CHANNELS {count} {places}Zrotation Yrotation Xrotation',
+            ]
+        )
+        channels.append(name)
+        children = [x for x, (above, _) in JOINTS.items() if above == name]
+        for child in children:
+            add(child, depth + 1)
+        if not children:
+            end = ENDS.get(name, (0, -0.1, 0))
+            lines.extend(
+                [f'{pad}  End Site', pad + '  {', f'{pad}    OFFSET {" ".join(map(str, end))}']
+            )
+            lines.append(pad + '  }')
+        lines.append(pad + '}')
+
+    add('Hips', 0)
+    phase = {name: rng.uniform(0, 6) for name in channels}
+    lines += ['MOTION', f'Frames: {frames}', 'Frame Time: 0.0333333']
+    for t in range(frames):
+        row: list[float] = [0.0, 1.0, 0.0]
+        for name in channels:
+            swing = 12.0 * np.sin(0.4 * t + phase[name])
+            if name in ('LeftLeg', 'RightLeg'):
+                row += [0.0, 0.0, 25.0 + swing]
+            elif name in ('LeftForeArm', 'RightForeArm'):
+                row += [0.0, 0.0, -45.0 + swing]
+            elif name in ('LeftHand', 'RightHand'):
+                row += [0.0, 0.0, 0.0]
+            else:
+                row += [0.3 * swing, 0.3 * swing, swing]
+        lines.append(' '.join(f'{x:.4f}' for x in row))
+    path.write_text('\n'.join(lines) + '\n')
+    return path
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    result = tmp_path_factory.mktemp('motions')
+    for i in range(4):
+        write_motion(result / f'lab_{i:02d}_walk.bvh', i)
+    (result / 'lab_00_damaged.bvh').write_text('HIERARCHY\n')
+    return result
+
+
+def test_the_command_learns_chooses_and_tells(
+    folder: Path,
+    tmp_path: Path,
+    read_here: Callable[[], None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    output = tmp_path / 'prior.npz'
+    rest = [str(folder), '--without', 'lab_03_walk', '--folds', '3', '--source', 'stick figures']
+    rest += ['--components', '1', '2', '--test', str(folder / 'lab_03_walk.bvh')]
+    assert hmt_learning.app.main(['learn', 'prior', *rest, '-o', str(output)]) == 0
+    told = capsys.readouterr()
+    assert told.err.count('learn-prior: skipped lab_00_damaged.bvh') == 1
+    assert 'of 3 motions of 3 people' in told.out
+    assert '1 components' in told.out
+    assert '2 components' in told.out
+    assert 'lab_03' in told.out
+    body = load_body('human37')
+    prior = read_pose_prior(output, body)
+    assert prior.card['source'] == 'stick figures'
+    assert 'people: lab_00, lab_01, lab_02' in prior.card['method']
+    # Hands that do not move are not learned, and nothing of the root.
+    assert {'left_elbow', 'right_knee', 'trunk_x'} <= set(prior.dofs)
+    assert not any('root' in name or 'wrist' in name for name in prior.dofs)
+    x = np.tile(body.prior_mean, (5, 1))
+    x[:, 6:] += 0.3 * np.random.default_rng(0).normal(size=(5, 31))
+    assert np.allclose(prior.log_density(x), prior.log_density(mirror(body, x)), atol=1e-6)
+    # The same again, in one process, gives the same bytes; nothing is replaced unasked.
+    read_here()
+    again = tmp_path / 'again'
+    assert learn_prior.main([*rest, '--quiet', '-o', str(again)]) == 0
+    assert again.with_suffix('.npz').read_bytes() == output.read_bytes()
+    assert learn_prior.main([*rest, '-o', str(output)]) == 1
+    assert 'exists: --overwrite replaces it' in capsys.readouterr().err
+
+
+def test_people_come_from_tables(folder: Path, tmp_path: Path) -> None:
+    table = tmp_path / 'index.csv'
+    table.write_text('file,subject,more\ntrain/lab_00_walk.bvh,07?,x\nlab_01_walk.bvh,08,y\n')
+    assert learn_prior.people_in([table]) == {'lab_00_walk': '07', 'lab_01_walk': '08'}
+    table.write_text('name,subject\n')
+    with pytest.raises(ValueError, match=r"index.csv: no column 'file'"):
+        learn_prior.people_in([table])
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['nothing.bvh'], 'none of the 1 motions can be used'),
+        (['ONE', '--folds', '9'], 'motions of 1 people, wanted at least 9'),
+        (['FOLDER', '--folds', '1'], 'wanted a whole number from 2'),
+        (['FOLDER', '--components', '0'], 'wanted a whole number from 1'),
+        (['FOLDER', '--body', 'nobody'], "no body 'nobody'"),
+        (['FOLDER', '--people', 'none.csv'], 'none.csv'),
+    ],
+)
+def test_bad_input_is_one_line(
+    folder: Path,
+    tmp_path: Path,
+    arguments: list[str],
+    message: str,
+    read_here: Callable[[], None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    read_here()
+    places = {'FOLDER': str(folder), 'ONE': str(folder / 'lab_00_walk.bvh')}
+    given = [places.get(x, x) for x in arguments]
+    assert learn_prior.main([*given, '--quiet', '-o', str(tmp_path / 'x.npz')]) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert message in lines[-1]
+    assert lines[-1].startswith('learn-prior: ')
+    assert not (tmp_path / 'x.npz').exists()

@@ -1,0 +1,218 @@
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_learning.app import train
+from hmt_learning.training import rendering_mark, training_set
+from hmt_ros.experts.pose_predictor import PosePredictor
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  End Site
+  {
+    OFFSET 0 10 0
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.033
+0 0 0 0 0 0
+0 0 0 0 0 0
+"""
+
+
+@pytest.fixture(autouse=True)
+def short_motions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, 'PROCEDURAL_SECONDS', 2.5)
+    monkeypatch.setattr(train, 'PROCEDURAL_SEEDS', 2)
+
+
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, 'write_report', lambda *_: [])
+
+
+def test_procedural_motions_give_a_model_and_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / 'model.npz'
+    arguments = ['--motions', 'reach', '--model', 'local', '--samples', '120', '--seed', '3']
+    arguments += ['--dynamics', '--acknowledgement', 'Thanks.']
+    assert train.main([*arguments, '-o', str(output)]) == 0
+    predictor = PosePredictor.load(output)
+    assert predictor.body.name == 'human37'
+    assert predictor.dynamics is not None
+    assert predictor.notes['samples'] == 120
+    assert predictor.notes['card'] == 'Thanks.\nLearned from 2 motions, 5 s: reach 3, reach 4.'
+    figures = sorted(x.name for x in (tmp_path / 'model_report').iterdir())
+    assert figures == ['affinities.png', 'multimodality.png', 'silhouettes.png']
+    for name in figures:
+        assert (tmp_path / 'model_report' / name).read_bytes()[:4] == b'\x89PNG'
+    assert '2 motions, ' in capsys.readouterr().out
+    # The same again, without the figures.
+    monkeypatch.setattr(train, 'write_report', lambda *_: [])
+    again = tmp_path / 'again.npz'
+    assert train.main([*arguments, '-o', str(again), '--quiet']) == 0
+    assert again.read_bytes() == output.read_bytes()
+    assert capsys.readouterr().out == ''
+
+
+def test_a_training_that_was_broken_off_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ['--motions', 'reach', '--model', 'local', '--samples', '120', '--quiet']
+    whole, output = tmp_path / 'whole.npz', tmp_path / 'model.npz'
+    assert train.main([*arguments, '-o', str(whole)]) == 0
+    render, drawn = training_set.render_silhouettes, []
+
+    def breaks_off(*of: object) -> object:
+        drawn.append(of)
+        if len(drawn) == 6:
+            raise KeyboardInterrupt
+        return render(*of)
+
+    monkeypatch.setattr(rendering_mark, 'EVERY', 2)
+    monkeypatch.setattr(training_set, 'render_silhouettes', breaks_off)
+    with pytest.raises(KeyboardInterrupt):
+        train.main([*arguments, '-o', str(output)])
+    assert train.main([*arguments, '-o', str(output)]) == 1
+    assert '--resume, or remove it' in capsys.readouterr().err
+    assert train.main([*arguments, '-o', str(output), '--resume', '--seed', '1']) == 1
+    assert 'a training with other settings' in capsys.readouterr().err
+    drawn.clear()
+    # Two groups had been marked twice; four of eight are left, and a figure.
+    assert train.main([*arguments, '-o', str(output), '--resume']) == 0
+    assert len(drawn) == 5
+    assert output.read_bytes() == whole.read_bytes()
+    assert sorted(x.name for x in tmp_path.iterdir() if not x.is_dir()) == [
+        'model.npz',
+        'whole.npz',
+    ]
+
+
+def test_marks_that_are_damaged_are_told(tmp_path: Path) -> None:
+    mark = rendering_mark.RenderingMark(tmp_path / 'kept.npy', 'these')
+    rng = np.random.default_rng(0)
+    packed, done = mark.begin((4, 2), rng)
+    assert (packed.shape, done) == ((4, 2), 0)
+    mark.keep(rendering_mark.EVERY, rng)
+    assert mark.begin((4, 2), rng)[1] == rendering_mark.EVERY
+    with pytest.raises(ValueError, match=r'shape \(4, 2\): remove it'):
+        mark.begin((3, 2), rng)
+    for text in ('{', '{}', '{"settings": "these", "done": "x", "random": 1}'):
+        (tmp_path / 'kept.json').write_text(text)
+        with pytest.raises(ValueError, match='is damaged'):
+            mark.begin((4, 2), rng)
+
+
+@pytest.mark.usefixtures('no_figures')
+@pytest.mark.parametrize('model', ['nearest', 'joint'])
+def test_models_by_name(model: str, tmp_path: Path) -> None:
+    output = tmp_path / 'model.npz'
+    arguments = ['--motions', 'walk', '--samples', '90', '--model', model, '--experts', '2']
+    assert train.main([*arguments, '-o', str(output), '--no-dynamics', '--quiet']) == 0
+    predictor = PosePredictor.load(output)
+    assert predictor.dynamics is None
+    assert predictor.notes['model'] == model
+
+
+@pytest.mark.usefixtures('no_figures')
+def test_broken_motions_are_skipped_and_counted(
+    mocap_walk: Path,
+    tmp_path: Path,
+    read_here: Callable[[], None],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(train, 'TESTED', 100)
+    folder = tmp_path / 'motions'
+    (folder / 'deeper').mkdir(parents=True)
+    (folder / 'deeper' / 'fine_walk.bvh').write_bytes(mocap_walk.read_bytes())
+    (folder / 'broken.bvh').write_text('HIERARCHY\nROOT Hips\n{\n')
+    (folder / 'unknown.bvh').write_text(BVH)
+    (folder / 'alone.amc').write_text(':DEGREES\n1\nroot 0 0 0 0 0 0\n')
+    output = tmp_path / 'model.npz'
+    arguments = ['--mocap', str(folder), '-o', str(output), '--samples', '60', '--model', 'local']
+    assert train.main(arguments) == 0
+    captured = capsys.readouterr()
+    warnings = [x for x in captured.err.splitlines() if x.startswith('train: skipped')]
+    assert sorted(x.split()[2] for x in warnings) == ['alone.amc:', 'broken.bvh:', 'unknown.bvh:']
+    assert '1 motions, 3 skipped' in captured.out
+    assert 'Learned from 1 motions' in PosePredictor.load(output).notes['card']
+    read_here()
+    # People are left out by their names, and others are what it is scored on.
+    more = ['--without', 'broke*', '--test', str(folder / 'deeper'), '--overwrite']
+    assert train.main([*arguments, *more]) == 0
+    assert '1 motions, 2 skipped' in capsys.readouterr().out
+    notes = PosePredictor.load(output).notes
+    assert notes['scored on'] == ['fine_walk']
+    assert re.match(r'\d+ mm heaviest, \d+ best of 5, ', notes['scores'])
+
+
+@pytest.fixture(scope='module')
+def mocap_walk() -> Path:
+    import os
+
+    root = Path(__file__).resolve().parents[3]
+    folder = Path(os.environ.get('HMT_SHARED', root / '..' / 'shared')) / 'mocap'
+    path = folder / 'train' / 'cmu_07_01_walk.bvh'
+    if not path.is_file():
+        pytest.skip(f'no development motions in {folder} (set HMT_SHARED)')
+    return path
+
+
+def _fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert train.main([*arguments, '--model', 'local']) == 1
+    error = capsys.readouterr().err.strip().splitlines()
+    assert error[-1].startswith('train: ')
+    return error[-1]
+
+
+def test_bad_input_is_one_line(
+    tmp_path: Path, read_here: Callable[[], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    read_here()
+    output = str(tmp_path / 'm.npz')
+    empty = tmp_path / 'empty'
+    empty.mkdir()
+    cases = [
+        (['-o', output], 'nothing to learn from'),
+        (['-o', output, '--mocap', str(empty)], 'has no motion'),
+        (['-o', output, '--mocap', str(tmp_path / 'absent')], 'wanted a folder or a motion'),
+        (['-o', output, '--motions', 'swim'], "no motion 'swim'"),
+        (['-o', str(tmp_path / 'x' / 'm.npz'), '--motions', 'walk'], 'no folder'),
+        (['-o', output, '--motions', 'walk', '--samples', '3'], 'from 50'),
+        (['-o', output, '--motions', 'walk', '--body', 'nobody'], 'nobody'),
+        (['--motions', 'walk'], '-o'),
+    ]
+    for arguments, wanted in cases:
+        assert wanted in _fails(arguments, capsys)
+    (empty / 'broken.bvh').write_text('nothing')
+    given = ['-o', output, '--mocap', str(empty)]
+    assert 'none of the 1 motions' in _fails(given, capsys)
+    assert "no motion is called 'x*'" in _fails([*given, '--without', 'x*'], capsys)
+    assert not Path(output).exists()
+
+
+def test_a_network_needs_what_learns_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('hmt_learning.training.network_learning.find_spec', lambda _: None)
+    assert train.main(['-o', str(tmp_path / 'm.npz'), '--motions', 'walk']) == 1
+    assert 'pip install jax optax' in capsys.readouterr().err
+
+
+def test_a_model_that_is_there_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / 'm.npz'
+    np.savez(output, a=np.zeros(3))
+    before = output.read_bytes()
+    assert '--overwrite' in _fails(['-o', str(output), '--motions', 'walk'], capsys)
+    assert output.read_bytes() == before

@@ -1,0 +1,27 @@
+"""What the tests of learning share."""
+
+import pytest
+
+from hmt_learning.app import learn_motion
+
+
+class ThisProcess:
+    """What stands in for a pool of processes, each of which takes a second to start."""
+
+    def __init__(self, *_):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def map(self, work, items, **_):
+        return map(work, items)
+
+
+@pytest.fixture
+def read_here(monkeypatch):
+    """Function after which commands read motions in this process."""
+    return lambda: monkeypatch.setattr(learn_motion, 'ProcessPoolExecutor', ThisProcess)

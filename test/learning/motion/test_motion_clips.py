@@ -1,0 +1,222 @@
+"""Every development motion against a plain evaluation of its file, and against the index."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_learning.motion.motion_file import Motion, read_motion, read_skeleton
+from hmt_ros.body import load_body
+
+FRAMES = 6  # of each clip are evaluated the plain way
+
+
+@pytest.fixture(scope='module')
+def clips(mocap) -> dict[str, tuple[dict[str, str], Motion]]:
+    """Row of the index and motion of every clip."""
+    with (mocap / 'index.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 40
+    return {
+        row['file']: (row, read_motion(mocap / row['file'], unit_to_m=float(row['unit_to_m'])))
+        for row in rows
+    }
+
+
+def turn(letter: str, degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    rows = {
+        'X': [[1, 0, 0], [0, c, -s], [0, s, c]],
+        'Y': [[c, 0, s], [0, 1, 0], [-s, 0, c]],
+        'Z': [[c, -s, 0], [s, c, 0], [0, 0, 1]],
+    }
+    result = np.eye(4)
+    result[:3, :3] = rows[letter]
+    return result
+
+
+def shift(v) -> np.ndarray:
+    result = np.eye(4)
+    result[:3, 3] = v
+    return result
+
+
+def plain_bvh(path: Path, frames: np.ndarray) -> dict[str, np.ndarray]:
+    """Joint positions by name, file units; nested 4 x 4 products down the hierarchy."""
+    header, motion = path.read_text().split('MOTION')
+    rows = motion.strip().splitlines()[2:]
+    values = np.array([[float(x) for x in rows[f].split()] for f in frames])
+    places: dict[str, list] = {}
+    tokens = iter(header.split())
+    column = 0
+
+    def joint(name: str, above: list) -> None:
+        nonlocal column
+        assert next(tokens) == '{'
+        assert next(tokens) == 'OFFSET'
+        offset = [float(next(tokens)) for _ in range(3)]
+        own = [t @ shift(offset) for t in above]
+        while (word := next(tokens)) != '}':
+            if word == 'CHANNELS':
+                for _ in range(int(next(tokens))):
+                    channel = next(tokens)
+                    for i, row in enumerate(values):
+                        if channel.endswith('position'):
+                            step = np.zeros(3)
+                            step['XYZ'.index(channel[0])] = row[column]
+                            own[i] = own[i] @ shift(step)
+                        else:
+                            own[i] = own[i] @ turn(channel[0], row[column])
+                    column += 1
+            elif word == 'JOINT':
+                joint(next(tokens), own)
+            else:  # End Site
+                assert next(tokens) == 'Site'
+                joint(f'{name}_end', own)
+        places[name] = [t[:3, 3] for t in own]
+
+    assert next(tokens) == 'HIERARCHY'
+    assert next(tokens) == 'ROOT'
+    joint(next(tokens), [np.eye(4)] * len(frames))
+    assert column == values.shape[1]
+    return {name: np.array(place) for name, place in places.items()}
+
+
+def plain_amc(path: Path, frames: np.ndarray) -> dict[str, np.ndarray]:
+    """Joint positions by name of the bone that starts there, file units."""
+    text = path.with_suffix('.asf').read_text()
+    bones = {}
+    for block in re.findall(r'begin\s+id(.*?)end', text, re.DOTALL):
+        name = re.search(r'name (\S+)', block)[1]
+        direction, axis = (
+            np.array(re.search(rf'{key} (\S+) (\S+) (\S+)', block).groups(), dtype=float)
+            for key in ('direction', 'axis')
+        )
+        length = float(re.search(r'length (\S+)', block)[1])
+        dof = re.search(r'dof (.*)', block)
+        bones[name] = (direction * length, axis, dof[1].split() if dof else [])
+    children = {}
+    for line in text.split(':hierarchy')[1].splitlines():
+        words = line.split()
+        if len(words) > 1:
+            children[words[0]] = words[1:]
+    blocks = re.split(r'\n\d+\s*\n', path.read_text())[1:]
+    places: dict[str, list] = {}
+    for f in frames:
+        values = {w[0]: [float(x) for x in w[1:]] for w in map(str.split, blocks[f].splitlines())}
+        x = values['root']
+        root = shift(x[:3]) @ turn('Z', x[5]) @ turn('Y', x[4]) @ turn('X', x[3])
+
+        def bone(name: str, above: np.ndarray, values=values) -> None:
+            span, axis, dof = bones[name]
+            places.setdefault(name, []).append(above[:3, 3])
+            c = turn('Z', axis[2]) @ turn('Y', axis[1]) @ turn('X', axis[0])
+            angles = dict(zip(dof, values.get(name, [])))
+            m = np.eye(4)
+            for letter in 'XYZ':
+                m = turn(letter, angles.get(f'r{letter.lower()}', 0.0)) @ m
+            own = above @ c @ m @ np.linalg.inv(c) @ shift(span)
+            for child in children.get(name, []):
+                bone(child, own)
+            if name not in children:
+                places.setdefault(f'{name}_end', []).append(own[:3, 3])
+
+        places.setdefault('root', []).append(root[:3, 3])
+        for child in children['root']:
+            bone(child, root)
+    return {name: np.array(place) for name, place in places.items()}
+
+
+def test_forward_kinematics_equal_a_plain_evaluation_of_the_file(clips, mocap):
+    for name, (row, motion) in clips.items():
+        assert len(motion) == int(row['frames'])
+        frames = np.linspace(0, len(motion) - 1, FRAMES).astype(int)
+        plain = (plain_bvh if name.endswith('.bvh') else plain_amc)(mocap / name, frames)
+        joints = motion.body.joint_positions(motion.poses[frames])
+        skeleton = motion.body.skeleton
+        starts = len(skeleton.segment_names)
+        assert len(plain) == joints.shape[1]
+        for j, segment in enumerate(skeleton.joint_segments):
+            own = skeleton.segment_names[segment] + ('' if j < starts else '_end')
+            expected = plain[own] * motion.unit_to_m
+            np.testing.assert_allclose(joints[:, j], expected, atol=1e-9, err_msg=f'{name} {own}')
+
+
+def test_bone_lengths_are_those_of_the_index(clips):
+    bones = {
+        'thigh_m': ('hip', 'knee'), 'shin_m': ('knee', 'ankle'),
+        'upperarm_m': ('shoulder', 'elbow'), 'forearm_m': ('elbow', 'wrist'),
+    }  # fmt: skip
+    for name, (row, motion) in clips.items():
+        for column, (a, b) in bones.items():
+            some = motion.part(step=max(1, len(motion) // 20))
+            place = some.joint_positions([f'left_{a}', f'left_{b}'])
+            span = np.linalg.norm(place[:, 0] - place[:, 1], axis=1)
+            assert np.ptp(span) < 1e-9
+            assert span[0] == pytest.approx(float(row[column]), abs=5.1e-4), (name, column)
+
+
+def test_axes_rates_and_units_are_found(clips, mocap):
+    for name, (row, motion) in clips.items():
+        assert motion.world_from_file[2]['xyz'.index(row['up_axis'])] == 1.0
+        if name.endswith('.bvh'):
+            assert motion.fps == pytest.approx(float(row['fps']), rel=1e-4)
+        automatic = read_motion(mocap / name)
+        ratio = automatic.unit_to_m / float(row['unit_to_m'])
+        exact = row['unit_to_m'] in {'0.056444', '0.01'}
+        assert ratio == pytest.approx(1.0, abs=1e-5 if exact else 0.2), name
+        assert 1.4 < automatic.body.stature < 2.0
+        np.testing.assert_array_equal(automatic.world_from_file, motion.world_from_file)
+
+
+def test_every_clip_has_the_standard_joints_and_limbs(clips):
+    standard = {'pelvis', 'neck', 'head'} | {
+        f'{s}_{j}'
+        for s in ('left', 'right')
+        for j in ('hip', 'knee', 'ankle', 'toe', 'shoulder', 'elbow', 'wrist', 'hand')
+    }
+    for name, (_, motion) in clips.items():
+        assert standard <= set(motion.body.joint_names), name
+        assert set(motion.body.chains) == {
+            'neck', 'left_arm', 'right_arm', 'left_leg', 'right_leg',
+        }  # fmt: skip
+        place = dict(zip(sorted(standard), motion.joint_positions(sorted(standard)).mean(0)))
+        assert place['head'][2] > place['neck'][2] > place['pelvis'][2] > place['left_knee'][2]
+        # Facing: with z up, left is to the left of where the toes point.
+        for side in ('left', 'right'):
+            ahead = place[f'{side}_toe'] - place[f'{side}_ankle']
+            across = place[f'{side}_hip'] - place['pelvis']
+            towards_left = ahead[0] * across[1] - ahead[1] * across[0]
+            if name != 'train/cmu_60_12_salsa.bvh':  # turns about twice: no mean heading
+                assert (towards_left > 0) == (side == 'left'), name
+
+
+def test_every_clip_has_the_rates_of_human37_at_its_joints(clips):
+    person = load_body('human37')
+    known = dict(zip(person.dof_names, person.rates))
+    joints = {'hip': 'hip_x', 'knee': 'knee', 'ankle': 'ankle_x', 'shoulder': 'shoulder_x'}
+    for _, motion in clips.values():
+        skeleton, rates = motion.body.skeleton, motion.body.rates
+        assert rates.shape == (motion.body.dimension,)
+        for joint, dof in joints.items():
+            for side in ('left', 'right'):
+                segment = skeleton.joint_segments[skeleton.joint_index((f'{side}_{joint}',))[0]]
+                own = [j for j in skeleton.segment_dofs[segment] if skeleton.dof_is_rotation[j]]
+                assert (rates[own] == known[f'{side}_{dof}']).all()
+        moves = skeleton.dof_is_rotation & (skeleton.dof_segments == 0)
+        assert (rates[moves] == known['root_z']).all()
+        assert (rates[~skeleton.dof_is_rotation] == known['root_tx']).all()
+        assert set(person.trunk_joints) <= set(motion.body.trunk_joints)
+        assert sorted(motion.body.chain_pairs) == sorted(person.chain_pairs)
+
+
+def test_an_asf_has_limits_and_56_degrees_of_freedom_of_the_joints(mocap):
+    body = read_skeleton(mocap / 'train' / 'cmu_07_05_slowwalk.asf')
+    assert body.dimension == 6 + 56
+    knee = body.dof_names.index('ltibia_x')
+    np.testing.assert_allclose(np.degrees([body.lower[knee], body.upper[knee]]), [-10, 170])
+    assert body.stature == pytest.approx(1.7, abs=0.1)

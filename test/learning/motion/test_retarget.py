@@ -1,0 +1,204 @@
+"""Retargeting: exact where the body can follow, close on recorded people, within limits always."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_learning.motion.motion_file import Motion, read_motion, read_skeleton
+from hmt_learning.motion.retarget import body_from_motion, retarget
+from hmt_ros.body import load_body
+from hmt_ros.body.limb_angles import limb_angles
+
+HUMAN = load_body('human37')
+PAIRED = ('hip', 'knee', 'ankle', 'shoulder', 'elbow', 'wrist')
+MAIN = ('neck', *(f'{side}_{joint}' for side in ('left', 'right') for joint in PAIRED))
+
+# A camera 4 m before the origin, which looks along the world's y axis.
+ROTATION = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+CAMERA = (ROTATION, np.array([0.0, 1.0, 4.0]))
+
+
+def moving(body, frames: int = 40, seed: int = 0, bent: float = 0.6) -> np.ndarray:
+    """Smooth poses well inside the limits, with bent elbows and knees."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0, 2 * np.pi, frames)[:, None]
+    lower, upper = np.maximum(body.lower, -1.0), np.minimum(body.upper, 1.0)
+    swing = 0.25 * (upper - lower) * np.sin(t + rng.uniform(0, 6, body.dimension))
+    poses = 0.5 * (lower + upper) + swing
+    poses[:, :6] = 0.0
+    poses[:, 0] = 0.3 * np.sin(t[:, 0])
+    poses[:, 2] = 4.0
+    poses[:, 3] = np.linspace(2.0, 2.0 + 3 * np.pi, frames)  # one and a half turns
+    for i, name in enumerate(body.dof_names):
+        if name.endswith('clavicle_y'):
+            poses[:, i] = 0.0  # they would blur the width of the shoulders
+        if name.endswith('elbow'):
+            poses[:, i] = bent + 0.3 * np.sin(t[:, 0])
+        if name.endswith('knee'):
+            poses[:, i] = -bent - 0.3 * np.sin(t[:, 0] + 1)
+    return poses
+
+
+def as_motion(body, poses: np.ndarray, fps: float = 30.0) -> Motion:
+    """Poses of one of our bodies as if recorded: the world is its camera's, y down."""
+    return Motion('own', body, poses, fps, np.eye(3), 1.0)
+
+
+@pytest.mark.parametrize('name', ['human37', 'human34', 'human32'])
+def test_a_body_follows_its_own_motion(name):
+    body = load_body(name).with_segment_lengths({'thigh': 0.44, 'forearm': 0.26, 'trunk': 0.40})
+    poses = moving(body)
+    motion = as_motion(body, poses)
+    measured = body_from_motion(motion, load_body(name))
+    for length, value in body.segment_lengths.items():
+        assert measured.segment_lengths[length] == pytest.approx(value, abs=1e-9)
+    result = retarget(motion, body, (np.eye(3), np.zeros(3)))
+    error = np.linalg.norm(body.joint_positions(result) - body.joint_positions(poses), axis=2)
+    assert np.median(error) < 0.001
+    assert error.max() < 0.006
+    assert (result >= body.lower).all()
+    assert (result <= body.upper).all()
+    # The angles themselves come back, in the same turn.
+    rotations = body.skeleton.dof_is_rotation
+    off = (result - poses)[:, rotations]
+    off -= 2 * np.pi * np.round(np.median(off, axis=0) / (2 * np.pi))
+    assert np.degrees(np.abs(off)).max() < 6.0
+    assert np.median(np.degrees(np.abs(off))) < 0.5
+
+
+def test_closed_form_alone_is_exact_up_to_the_clavicles():
+    body = load_body('human34')
+    poses = moving(body)
+    joints = body.joint_positions(poses)
+    place = dict(zip(body.joint_names, np.moveaxis(joints, 1, 0)))
+    start = limb_angles(body.skeleton, place, 30.0)
+    rigid = [body.dof_names.index(n) for n in ('root_tx', 'root_ty', 'root_tz')]
+    np.testing.assert_allclose(start[:, rigid], poses[:, rigid], atol=1e-9)
+    error = np.linalg.norm(body.joint_positions(start) - joints, axis=2)
+    assert np.median(error) < 0.02
+    assert error.max() < 0.12  # the trunk is found from hips, neck and shoulders together
+
+
+def test_root_turns_on_without_a_jump():
+    body = HUMAN
+    poses = moving(body, frames=80)
+    result = retarget(as_motion(body, poses), body, (np.eye(3), np.zeros(3)))
+    yaw = result[:, body.dof_names.index('root_z')]
+    assert np.ptp(yaw) == pytest.approx(3 * np.pi, abs=0.05)
+    assert np.abs(np.diff(yaw)).max() < 0.3
+
+
+def test_straight_elbow_does_not_twist():
+    """Where the elbow is straight for a while the twist of the arm goes on smoothly."""
+    body = HUMAN
+    poses = moving(body, frames=60)
+    elbow = body.dof_names.index('left_elbow')
+    poses[20:35, elbow] = 0.0
+    poses[:20, elbow] = np.linspace(0.8, 0.0, 20)
+    poses[35:, elbow] = np.linspace(0.0, 0.8, 25)
+    result = retarget(as_motion(body, poses), body, (np.eye(3), np.zeros(3)))
+    twist = body.dof_names.index('left_shoulder_z')
+    assert np.degrees(np.abs(np.diff(result[:, twist]))).max() < 15.0
+    error = np.linalg.norm(body.joint_positions(result) - body.joint_positions(poses), axis=2)
+    assert error.max() < 0.015
+
+
+def test_a_pose_beyond_the_limits_ends_on_them():
+    wide = HUMAN
+    poses = moving(wide)
+    knee = wide.dof_names.index('left_knee')
+    poses[:, knee] = 0.3  # bent the wrong way
+    result = retarget(as_motion(wide, poses), wide, (np.eye(3), np.zeros(3)))
+    assert (result >= wide.lower).all()
+    assert (result <= wide.upper).all()
+    assert (result[:, knee] > wide.upper[knee] - 0.1).all()
+
+
+@pytest.mark.parametrize(
+    ('name', 'median', 'most'),
+    [
+        ('train/cmu_02_01_walk.bvh', 0.004, 0.016),
+        ('train/cmu_run_a.bvh', 0.004, 0.019),
+        ('train/cmu_02_03_run.bvh', 0.004, 0.025),  # rotated rest frames, hands of no length
+        ('train/cmu_131_04_dance.amc', 0.006, 0.012),
+        ('train/cmu_60_12_salsa.bvh', 0.004, 0.020),  # hips above the pelvis
+        ('train/cmu_12_01_walk.bvh', 0.008, 0.030),
+    ],
+)
+def test_recorded_people_are_followed_closely(name, median, most, mocap):
+    motion = read_motion(mocap / name)
+    motion = motion.part(0, 200, 2)
+    body = body_from_motion(motion, HUMAN)
+    pelvis = motion.joint_positions(['pelvis'])[:, 0]
+    translation = -ROTATION @ pelvis.mean(0) + [0, 0, 5.0 + np.ptp(pelvis[:, 1])]
+    poses = retarget(motion, body, (ROTATION, translation))
+    wanted = motion.joint_positions(MAIN) @ ROTATION.T + translation
+    error = np.linalg.norm(
+        body.joint_positions(poses)[:, body.skeleton.joint_index(MAIN)] - wanted, axis=2
+    )
+    assert np.median(error) < median
+    assert np.quantile(error, 0.95) < most
+    assert (poses >= body.lower).all()
+    assert (poses <= body.upper).all()
+    assert (poses[:, 2] > 0).all()
+    angles = poses[:, body.skeleton.dof_is_rotation]
+    # Fast limbs turn by a few hundred degrees a second; a flip would be thousands.
+    assert np.degrees(np.abs(np.diff(angles, axis=0))).max() * motion.fps < 1500
+    again = retarget(motion, body, (ROTATION, translation))
+    np.testing.assert_array_equal(poses, again)
+
+
+def test_a_hand_that_the_file_does_not_have_keeps_its_proportion(mocap):
+    motion = read_motion(mocap / 'train' / 'cmu_02_03_run.bvh')
+    lengths = body_from_motion(motion, HUMAN).segment_lengths
+    own = HUMAN.segment_lengths
+    assert lengths['hand'] / lengths['forearm'] == pytest.approx(own['hand'] / own['forearm'])
+    assert lengths['forearm'] == pytest.approx(0.257, abs=6e-4)
+
+
+def test_hips_above_the_pelvis_have_a_negative_drop(mocap):
+    motion = read_motion(mocap / 'train' / 'cmu_60_12_salsa.bvh')
+    assert body_from_motion(motion, HUMAN).segment_lengths['hip_drop'] < 0
+
+
+def test_a_motion_of_one_frame_can_be_followed():
+    poses = moving(HUMAN)[:1]
+    result = retarget(as_motion(HUMAN, poses), HUMAN, (np.eye(3), np.zeros(3)))
+    error = np.linalg.norm(HUMAN.joint_positions(result) - HUMAN.joint_positions(poses), axis=2)
+    assert error.max() < 0.006
+
+
+@pytest.mark.parametrize(
+    ('camera', 'message'),
+    [
+        ((np.eye(2), np.zeros(3)), r'shapes \(\(2, 2\), \(3,\)\), wanted \(3, 3\) and \(3,\)'),
+        ((np.eye(3), np.zeros(2)), 'wanted'),
+        ((2 * np.eye(3), np.zeros(3)), 'must be a rotation'),
+        ((np.diag([1.0, 1.0, -1.0]), np.zeros(3)), 'must be a rotation'),
+        ((np.full((3, 3), np.nan), np.zeros(3)), 'must be a rotation'),
+        ((np.eye(3), [0, 0, np.nan]), 'must be a rotation and a translation'),
+        ((np.eye(3), [0, 0, -4.2]), 'pelvis is at depth -0.20 m in frame 0, wanted more than 0.30'),
+    ],
+)
+def test_a_camera_that_can_not_be_is_refused(camera, message):
+    motion = as_motion(HUMAN, moving(HUMAN)[:2])
+    with pytest.raises(ValueError, match=message):
+        retarget(motion, HUMAN, camera)
+
+
+def test_skeletons_and_bodies_that_do_not_fit_are_refused(tmp_path):
+    path = tmp_path / 'rod.bvh'
+    path.write_text(
+        'HIERARCHY\nROOT rod\n{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n'
+        'End Site\n{\nOFFSET 0 1 0\n}\n}\n'
+        'MOTION\nFrames: 1\nFrame Time: 0.1\n0\n'
+    )
+    rod = read_motion(path)
+    with pytest.raises(ValueError, match=r'rod lacks joints .*pelvis.*names are known'):
+        retarget(rod, HUMAN, CAMERA)
+    with pytest.raises(ValueError, match='rod lacks joints'):
+        body_from_motion(rod, HUMAN)
+    motion = as_motion(HUMAN, moving(HUMAN)[:2])
+    with pytest.raises(ValueError, match=r'rod has no lengths .*thigh.* like human37'):
+        body_from_motion(motion, read_skeleton(path))
