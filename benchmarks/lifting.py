@@ -27,8 +27,7 @@ from benchmarks.machine import description
 from benchmarks.runs import GIVEN, UNKNOWN, in_processes, recorded
 from benchmarks.tracking_means import GROUPS, group_of
 from benchmarks.tracking_scores import detector_scores, scores_of
-from hmt_learning.app.learn_lifter import PELVIS, SCORED, lifter_scores
-from hmt_learning.app.learn_motion import read_motions, shares_of
+from hmt_learning.app.motions import read_motions, shares_of
 from hmt_learning.training.keypoint_training import (
     JOINTS,
     VARIANTS,
@@ -37,6 +36,7 @@ from hmt_learning.training.keypoint_training import (
     keypoint_tracks,
     training_windows,
 )
+from hmt_learning.training.lifter_learning import PELVIS, SCORED, lifter_scores
 from hmt_learning.training.predictor_learning import kinds, new_model
 from hmt_learning.training.training_set import motion_files, recorded_sequence
 from hmt_ros.body import load_body

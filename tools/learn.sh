@@ -26,7 +26,7 @@ learn() {  # name of the result, then the command
 }
 learn lengths hmt_learning learn lengths "$mocap"/train "$mocap"/train_more --people "${people[@]}"
 learn prior hmt_learning learn prior "$mocap"/train "$mocap"/train_more --people "${people[@]}" --test "$mocap"/dev \
-  --without "${mirrored[@]}" --components 8 --source "$source $thanks" -o "$out/human37_prior.npz" --overwrite
+  --without "${mirrored[@]}" --components 8 --acknowledgement "$source $thanks" -o "$out/human37_prior.npz" --overwrite
 learn motion hmt_learning learn motion "$mocap"/train "$mocap"/train_more --without "${mirrored[@]}" \
   --acknowledgement "$thanks" -o "$out/human37_motion.npz" --overwrite
 learn keypoint_noise benchmarks keypoint_noise

@@ -9,7 +9,6 @@ A report beside the model shows affinities, multimodality and silhouettes of the
 from __future__ import annotations
 
 import argparse
-import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,7 +17,18 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from hmt_learning.app.learn_motion import chosen_motions, data_card, read_motions, shares_of
+from hmt_learning.app.motions import (
+    add_alike,
+    add_model,
+    add_seed,
+    add_sources,
+    add_test,
+    chosen_motions,
+    data_card,
+    model_file,
+    read_motions,
+    shares_of,
+)
 from hmt_learning.motion.procedural_motion import PROCEDURAL_MOTIONS
 from hmt_learning.training.network_learning import check_tools
 from hmt_learning.training.predictor_learning import (
@@ -30,7 +40,6 @@ from hmt_learning.training.predictor_learning import (
     multimodality,
     new_model,
 )
-from hmt_learning.training.rendering_mark import RenderingMark
 from hmt_learning.training.training_set import (
     PoseSequence,
     TrainingSet,
@@ -44,10 +53,6 @@ from hmt_learning.training.training_set import (
 from hmt_ros.app.command_line import (
     CommandParser,
     add_body,
-    add_people,
-    add_seed,
-    add_sources,
-    model_file,
     run_command,
     whole_number,
 )
@@ -82,7 +87,8 @@ def _parser() -> CommandParser:
     parser = CommandParser(
         prog='train', description='Learns to predict poses from silhouettes of motions.'
     )
-    parser.add_model()
+    add_model(parser)
+    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
     add_seed(parser)
     parser.add_argument(
         '--report', type=Path, metavar='DIR', help='folder for the figures (FILE_report)'
@@ -98,7 +104,8 @@ def _parser() -> CommandParser:
         help='folders of recorded motions (.bvh, or .amc beside its .asf) with their subfolders',
     )
     add_sources(motion)
-    add_people(motion)
+    add_test(motion)
+    add_alike(motion)
     motion.add_argument(
         '--motions',
         metavar='NAMES',
@@ -130,11 +137,6 @@ def _parser() -> CommandParser:
         default=False,
         help='learn p(x_t | x_t-1, r_t) as well, for rule (1) (no)',
     )
-    learning.add_argument(
-        '--resume',
-        action='store_true',
-        help='go on with a training that was broken off; its silhouettes are kept beside FILE',
-    )
     return parser
 
 
@@ -142,9 +144,6 @@ def _train(options: argparse.Namespace) -> int:
     output = model_file(options.output, overwrite=options.overwrite)
     if options.model == 'network':
         check_tools()
-    kept = output.with_suffix('.silhouettes.npy')
-    if kept.exists() and not options.resume:
-        raise ValueError(f'{kept} is of a training that was broken off: --resume, or remove it')
     body = load_body(options.body)
     if not body.shapes:
         raise ValueError(f'body {options.body} has no flesh: wanted one such as human37')
@@ -153,9 +152,8 @@ def _train(options: argparse.Namespace) -> int:
     settings = TrainingSettings(samples=options.samples, seed=options.seed)
     bar = _bars(options.quiet)
     shares = shares_of(sequences, options.alike, options.alike_share)
-    mark = RenderingMark(kept, f'{settings}, {_named(sequences, shares)}')
-    pairs = training_set(body, sequences, settings, bar('rendering', GROUPS), shares, mark)
-    training = described(body, pairs, progress=bar('describing', SILHOUETTES))
+    pairs = training_set(body, sequences, settings, bar('rendering', 'groups'), shares)
+    training = described(body, pairs, progress=bar('describing', 'silhouettes'))
     kind, count = KINDS[options.model], len(pairs)
     model = new_model(options.model, options.experts, options.seed, count)
     dynamics = None
@@ -173,8 +171,8 @@ def _train(options: argparse.Namespace) -> int:
     _say(options, f'learning {options.model} from {len(pairs)} silhouettes')
     with show_progress('learning', quiet=options.quiet):
         predictor = learned_predictor(body, seen, model, dynamics, notes, options.seed)
-    if options.test is not None:
-        files = chosen_motions([options.test], [])
+    if options.test:
+        files = chosen_motions(options.test, [])
         tested = read_motions('train', files, options.body, recorded_sequence, quiet=options.quiet)
         predictor.notes['scored on'] = sorted(one.name for one in tested)
         with show_progress('scoring', quiet=options.quiet):
@@ -184,7 +182,6 @@ def _train(options: argparse.Namespace) -> int:
     report.mkdir(parents=True, exist_ok=True)
     with show_progress('drawing', quiet=options.quiet):
         figures = write_report(report, body, sequences, pairs, training)
-    mark.remove()
     skips = f', {skipped} skipped' if skipped else ''
     _say(
         options, f'{output}: {len(sequences)} motions{skips}, {output.stat().st_size / 1e6:.1f} MB'
@@ -194,9 +191,6 @@ def _train(options: argparse.Namespace) -> int:
     for path, what in figures:
         _say(options, f'  {path}: {what}')
     return 0
-
-
-GROUPS, SILHOUETTES = 'groups', 'silhouettes'
 
 
 def _bars(quiet: bool) -> Callable[[str, str], Callable[[Iterable[Item], int], Iterable[Item]]]:
@@ -228,14 +222,6 @@ def _sequences(options: argparse.Namespace, body: Body) -> tuple[list[PoseSequen
     files = chosen_motions(options.mocap, options.without)
     read = read_motions('train', files, options.body, recorded_sequence, quiet=options.quiet)
     return [*sequences, *read], len(files) - len(read)
-
-
-def _named(sequences: list[PoseSequence], shares: list[float]) -> str:
-    """A name that identifies motions and their shares."""
-    state = hashlib.sha256()
-    for one, share in zip(sequences, shares, strict=True):
-        state.update(f'{one.name} {share}'.encode() + one.poses.tobytes())
-    return f'{len(sequences)} motions {state.hexdigest()[:12]}'
 
 
 def _scores(predictor: PosePredictor, tested: list[PoseSequence]) -> str:

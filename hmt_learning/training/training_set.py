@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from hmt_learning.motion.motion_file import read_motion
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_learning.motion.retarget import body_from_motion, retarget
-from hmt_learning.training.rendering_mark import RenderingMark
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.mirror import mirror, root_angles, root_rotations
 from hmt_ros.body.rasterisation import render_silhouettes
@@ -209,18 +208,15 @@ def training_set(
     settings: TrainingSettings | None = None,
     progress: Progress[Index] | None = None,
     shares: Sequence[float] | None = None,
-    mark: RenderingMark | None = None,
 ) -> TrainingSet:
     """Pairs of silhouettes and poses from motions.
 
     Args:
         body: Body of the poses, with flesh.
         shares: Share of the poses of each motion that are taken; None: all.
-        mark: Keeps rendered silhouettes, and returns them after an interrupted rendering.
 
     Raises:
-        ValueError: there are no motions, the body has no flesh or another root, or the mark is of
-            another training set.
+        ValueError: there are no motions, or the body has no flesh or another root.
     """
     s = settings or TrainingSettings()
     if not sequences:
@@ -245,18 +241,13 @@ def training_set(
     groups = [np.arange(i, min(i + GROUP, len(poses))) for i in range(0, len(poses), GROUP)]
     distances = np.repeat(rng.uniform(*s.distances, len(groups)), GROUP)[: len(poses)]
     poses, previous = _seen(body, poses, previous, view, distances)
-    shape = (len(poses), SIDE, SIDE // 8)
-    packed, done = (np.empty(shape, np.uint8), 0) if mark is None else mark.begin(shape, rng)
-    left: Iterable[Index] = groups[done:]
-    for rows in left if progress is None else progress(left, len(groups) - done):
+    packed = np.empty((len(poses), SIDE, SIDE // 8), np.uint8)
+    for rows in groups if progress is None else progress(groups, len(groups)):
         person = random_build(body, s, rng)
         masks = render_silhouettes(person, poses[rows], _fitting_camera(person, poses[rows]))
         for row, mask in zip(rows, masks, strict=True):
             noisy = _uneven(mask.view(np.uint8), s.boundary_noise, rng)
             packed[row] = np.packbits(noisy, axis=1)
-        done += 1
-        if mark is not None:
-            mark.keep(done, rng)
     activities = tuple(sequences[i].activity for i in which.tolist())
     return TrainingSet(poses, previous, packed, activities, which, frames)
 

@@ -61,25 +61,6 @@ class CommandParser(argparse.ArgumentParser):
             'forward (default: not known)',
         )
 
-    def add_motions(self) -> None:
-        """Adds the motions and the body of a command that learns from recorded motions."""
-        self.add_argument(
-            'motions',
-            nargs='+',
-            type=Path,
-            metavar='MOTION',
-            help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
-        )
-        add_body(self)
-
-    def add_model(self) -> None:
-        """Adds --output, --overwrite and --quiet of a command that learns a model."""
-        self.add_argument(
-            '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
-        )
-        self.add_argument('--overwrite', action='store_true', help='replace an existing file')
-        self.add_argument('--quiet', action='store_true', help='no progress, no summary')
-
     def add_mixtures(self, verb: str) -> None:
         """Adds the bag, --truth, --topic and --body of a command that reads mixtures.
 
@@ -119,68 +100,9 @@ def add_body(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def add_seed(parser: argparse._ActionsContainer) -> None:
-    """Adds --seed."""
-    parser.add_argument(
-        '--seed', type=whole_number(0), default=0, help='seed of all random numbers (default: 0)'
-    )
-
-
-def add_sources(parser: argparse._ActionsContainer, said: str = '--acknowledgement') -> None:
-    """Adds --without, and the note on the motions, of a command that learns from motions."""
-    parser.add_argument(
-        '--without',
-        nargs='+',
-        default=[],
-        metavar='NAME',
-        help='motions to leave out, names of files without suffix; * stands for any letters',
-    )
-    parser.add_argument(
-        said,
-        default='',
-        metavar='TEXT',
-        help='what the motions are, their licence and whom to acknowledge; kept in the file',
-    )
-
-
-def add_people(parser: argparse._ActionsContainer) -> None:
-    """Adds --test, --alike and --alike-share of a command that learns from people."""
-    parser.add_argument(
-        '--test', type=Path, metavar='DIR', help='motions of other people to score on'
-    )
-    parser.add_argument(
-        '--alike',
-        default='',
-        metavar='PREFIX',
-        help='motions whose names start with it are few exercises, each done many times',
-    )
-    parser.add_argument(
-        '--alike-share',
-        type=number(0.0, 1.0),
-        default=0.35,
-        metavar='SHARE',
-        help='factor on how often these are drawn (0.35)',
-    )
-
-
 def gravity_of(arguments: argparse.Namespace) -> list[float] | None:
     """The direction of gravity that --level or --gravity tell; None: it is not known."""
     return [0.0, 1.0, 0.0] if arguments.level else arguments.gravity
-
-
-def model_file(output: Path, *, overwrite: bool) -> Path:
-    """The file of a model, with '.npz' where that is missing.
-
-    Raises:
-        ValueError: it exists and is not to be overwritten, or its folder does not.
-    """
-    if output.suffix != '.npz':
-        output = output.with_name(output.name + '.npz')
-    if output.exists() and not overwrite:
-        raise ValueError(f'{output} exists: --overwrite replaces it')
-    if not output.parent.is_dir():
-        raise ValueError(f'there is no folder {output.parent} for {output.name}')
-    return output
 
 
 PROGRAM_HELP = """\

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hmt_learning.app.learn_lifter import LearningSettings, learn_lifter, lifter_scores
 from hmt_learning.training.keypoint_training import (
     JOINTS,
     WindowSettings,
@@ -16,6 +15,7 @@ from hmt_learning.training.keypoint_training import (
     training_windows,
     with_errors,
 )
+from hmt_learning.training.lifter_learning import LearningSettings, learn_lifter, lifter_scores
 from hmt_learning.training.training_set import procedural_sequence
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hmt_learning.app import learn_motion
+from hmt_learning.app import motions
 
 
 class ThisProcess:
@@ -24,4 +24,4 @@ class ThisProcess:
 @pytest.fixture
 def read_here(monkeypatch):
     """Function after which commands read motions in this process."""
-    return lambda: monkeypatch.setattr(learn_motion, 'ProcessPoolExecutor', ThisProcess)
+    return lambda: monkeypatch.setattr(motions, 'ProcessPoolExecutor', ThisProcess)

@@ -1,4 +1,4 @@
-"""`learn-lengths` on motions of stick figures of different sizes."""
+"""`learn lengths` on motions of stick figures of different sizes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hmt_learning.app import learn_lengths
+from hmt_learning.app import learn
 from hmt_ros.body import load_body
 
 LEG = [('UpLeg', (0.1, -0.1, 0)), ('Leg', (0, -0.42, 0)), ('Foot', (0, -0.41, 0))]
@@ -51,7 +51,7 @@ def test_people_give_the_spreads_of_the_yaml_file(tmp_path, capsys):
     table = tmp_path / 'index.csv'
     names = sorted(path.name for path in tmp_path.glob('*.bvh'))
     table.write_text('file,subject\n' + ''.join(f'{x},{x[0]}\n' for x in names))
-    assert learn_lengths.main([str(tmp_path), '--people', str(table)]) == 0
+    assert learn.main(['lengths', str(tmp_path), '--people', str(table)]) == 0
     told = capsys.readouterr()
     assert '# 3 people with a skeleton of their own: a, b, c' in told.out
     assert 'people left out' in told.out
@@ -78,5 +78,5 @@ def test_bad_input_is_one_line(arguments, message, tmp_path, read_here, monkeypa
     write_figure(Path('one.bvh'), 1.0)
     Path('table.csv').write_text('file\none.bvh\n')
     Path('flat.yaml').write_text('name: flat\nextends: human37\nstature_spread: 0\n')
-    assert learn_lengths.main(arguments) == 1
+    assert learn.main(['lengths', *arguments]) == 1
     assert message in capsys.readouterr().err.splitlines()[-1]

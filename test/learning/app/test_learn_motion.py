@@ -1,4 +1,4 @@
-"""`learn-motion` on small motions of a stick figure."""
+"""`learn motion` on small motions of a stick figure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_learning.app import learn_motion
+from hmt_learning.app import learn
 from hmt_ros.body.motion_prior import read_motion_prior
 
 # Joints of a stick figure: name, parent, offset in cm (y up); the T pose faces z.
@@ -70,7 +70,7 @@ def test_motions_give_a_motion_prior(tmp_path, read_here, capsys):
     swing = write_motion(tmp_path / 'swing.bvh', 120, 60.0, 3)
     output = tmp_path / 'learned.npz'
     arguments = [str(folder), str(swing), '--without', 'bad', '--acknowledgement', 'From nobody.']
-    assert learn_motion.main([*arguments, '-o', str(output)]) == 0
+    assert learn.main(['motion', *arguments, '-o', str(output)]) == 0
     told = capsys.readouterr()
     assert '2 motions, 1 skipped' in told.out
     assert 'skipped slow.bvh: 25 frames per second, wanted a multiple of 30' in told.err
@@ -81,7 +81,7 @@ def test_motions_give_a_motion_prior(tmp_path, read_here, capsys):
     # The same in one process.
     read_here()
     again = tmp_path / 'again.npz'
-    assert learn_motion.main([*arguments, '-o', str(again), '--quiet']) == 0
+    assert learn.main(['motion', *arguments, '-o', str(again), '--quiet']) == 0
     assert again.read_bytes() == output.read_bytes()
 
 
@@ -103,6 +103,6 @@ def test_bad_input_is_one_line(arguments, message, tmp_path, read_here, monkeypa
     Path('empty').mkdir()
     Path('there.npz').touch()
     write_motion(Path('short.bvh'), 12, 30.0, 0)
-    assert learn_motion.main(['-o', 'out.npz', '--quiet', *arguments]) == 1
+    assert learn.main(['motion', '-o', 'out.npz', '--quiet', *arguments]) == 1
     assert message in capsys.readouterr().err.splitlines()[-1]
     assert not Path('out.npz').exists()

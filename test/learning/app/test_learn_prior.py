@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import hmt_learning.app
-from hmt_learning.app import learn_prior
+from hmt_learning.app import learn
+from hmt_learning.app.motions import people_in
 from hmt_ros.body import load_body
 from hmt_ros.body.angle_mixture import read_pose_prior
 from hmt_ros.body.mirror import mirror
@@ -108,11 +109,19 @@ def test_the_command_learns_chooses_and_tells(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     output = tmp_path / 'prior.npz'
-    rest = [str(folder), '--without', 'lab_03_walk', '--folds', '3', '--source', 'stick figures']
+    rest = [
+        str(folder),
+        '--without',
+        'lab_03_walk',
+        '--folds',
+        '3',
+        '--acknowledgement',
+        'stick figures',
+    ]
     rest += ['--components', '1', '2', '--test', str(folder / 'lab_03_walk.bvh')]
     assert hmt_learning.app.main(['learn', 'prior', *rest, '-o', str(output)]) == 0
     told = capsys.readouterr()
-    assert told.err.count('learn-prior: skipped lab_00_damaged.bvh') == 1
+    assert told.err.count('learn: skipped lab_00_damaged.bvh') == 1
     assert 'of 3 motions of 3 people' in told.out
     assert '1 components' in told.out
     assert '2 components' in told.out
@@ -130,19 +139,19 @@ def test_the_command_learns_chooses_and_tells(
     # The same again, in one process, gives the same bytes; nothing is replaced unasked.
     read_here()
     again = tmp_path / 'again'
-    assert learn_prior.main([*rest, '--quiet', '-o', str(again)]) == 0
+    assert learn.main(['prior', *rest, '--quiet', '-o', str(again)]) == 0
     assert again.with_suffix('.npz').read_bytes() == output.read_bytes()
-    assert learn_prior.main([*rest, '-o', str(output)]) == 1
+    assert learn.main(['prior', *rest, '-o', str(output)]) == 1
     assert 'exists: --overwrite replaces it' in capsys.readouterr().err
 
 
 def test_people_come_from_tables(folder: Path, tmp_path: Path) -> None:
     table = tmp_path / 'index.csv'
     table.write_text('file,subject,more\ntrain/lab_00_walk.bvh,07?,x\nlab_01_walk.bvh,08,y\n')
-    assert learn_prior.people_in([table]) == {'lab_00_walk': '07', 'lab_01_walk': '08'}
+    assert people_in([table]) == {'lab_00_walk': '07', 'lab_01_walk': '08'}
     table.write_text('name,subject\n')
     with pytest.raises(ValueError, match=r"index.csv: no column 'file'"):
-        learn_prior.people_in([table])
+        people_in([table])
 
 
 @pytest.mark.parametrize(
@@ -167,8 +176,8 @@ def test_bad_input_is_one_line(
     read_here()
     places = {'FOLDER': str(folder), 'ONE': str(folder / 'lab_00_walk.bvh')}
     given = [places.get(x, x) for x in arguments]
-    assert learn_prior.main([*given, '--quiet', '-o', str(tmp_path / 'x.npz')]) == 1
+    assert learn.main(['prior', *given, '--quiet', '-o', str(tmp_path / 'x.npz')]) == 1
     lines = capsys.readouterr().err.strip().splitlines()
     assert message in lines[-1]
-    assert lines[-1].startswith('learn-prior: ')
+    assert lines[-1].startswith('learn: ')
     assert not (tmp_path / 'x.npz').exists()

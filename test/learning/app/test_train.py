@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from hmt_learning.app import train
-from hmt_learning.training import rendering_mark, training_set
 from hmt_ros.experts.pose_predictor import PosePredictor
 
 BVH = """HIERARCHY
@@ -63,54 +62,6 @@ def test_procedural_motions_give_a_model_and_figures(
     assert train.main([*arguments, '-o', str(again), '--quiet']) == 0
     assert again.read_bytes() == output.read_bytes()
     assert capsys.readouterr().out == ''
-
-
-def test_a_training_that_was_broken_off_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    arguments = ['--motions', 'reach', '--model', 'local', '--samples', '120', '--quiet']
-    whole, output = tmp_path / 'whole.npz', tmp_path / 'model.npz'
-    assert train.main([*arguments, '-o', str(whole)]) == 0
-    render, drawn = training_set.render_silhouettes, []
-
-    def breaks_off(*of: object) -> object:
-        drawn.append(of)
-        if len(drawn) == 6:
-            raise KeyboardInterrupt
-        return render(*of)
-
-    monkeypatch.setattr(rendering_mark, 'EVERY', 2)
-    monkeypatch.setattr(training_set, 'render_silhouettes', breaks_off)
-    with pytest.raises(KeyboardInterrupt):
-        train.main([*arguments, '-o', str(output)])
-    assert train.main([*arguments, '-o', str(output)]) == 1
-    assert '--resume, or remove it' in capsys.readouterr().err
-    assert train.main([*arguments, '-o', str(output), '--resume', '--seed', '1']) == 1
-    assert 'a training with other settings' in capsys.readouterr().err
-    drawn.clear()
-    # Two groups had been marked twice; four of eight are left, and a figure.
-    assert train.main([*arguments, '-o', str(output), '--resume']) == 0
-    assert len(drawn) == 5
-    assert output.read_bytes() == whole.read_bytes()
-    assert sorted(x.name for x in tmp_path.iterdir() if not x.is_dir()) == [
-        'model.npz',
-        'whole.npz',
-    ]
-
-
-def test_marks_that_are_damaged_are_told(tmp_path: Path) -> None:
-    mark = rendering_mark.RenderingMark(tmp_path / 'kept.npy', 'these')
-    rng = np.random.default_rng(0)
-    packed, done = mark.begin((4, 2), rng)
-    assert (packed.shape, done) == ((4, 2), 0)
-    mark.keep(rendering_mark.EVERY, rng)
-    assert mark.begin((4, 2), rng)[1] == rendering_mark.EVERY
-    with pytest.raises(ValueError, match=r'shape \(4, 2\): remove it'):
-        mark.begin((3, 2), rng)
-    for text in ('{', '{}', '{"settings": "these", "done": "x", "random": 1}'):
-        (tmp_path / 'kept.json').write_text(text)
-        with pytest.raises(ValueError, match='is damaged'):
-            mark.begin((4, 2), rng)
 
 
 @pytest.mark.usefixtures('no_figures')

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hmt_learning.app.learn_lengths import (
+from hmt_learning.training.length_learning import (
     LengthSpread,
     held_out,
     learned_spread,

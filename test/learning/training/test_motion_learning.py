@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_learning.app.learn_motion import learned_motion, modelled_moments
+from hmt_learning.training.motion_learning import learned_motion, modelled_moments
 from hmt_ros.body.mirror import mirror
 from hmt_ros.inference.damped_velocity import DampedVelocity
 

@@ -1,0 +1,228 @@
+"""Motions that a command learns from: its arguments, the files, and whose motion each is."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import fnmatch
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from hmt_learning.training.training_set import MOTION_SUFFIXES, PoseSequence, motion_files
+from hmt_ros.app.command_line import add_body, number, whole_number
+from hmt_ros.app.progress import tell_user, with_progress
+from hmt_ros.body import Body, load_body
+from hmt_ros.experts.pose_predictor import RATE
+from msg_tools.files.error_line import error_line
+
+Item = TypeVar('Item')
+
+
+def add_motions(parser: argparse._ActionsContainer) -> None:
+    """Adds the motions, the body and --quiet of a command that learns from recorded motions."""
+    parser.add_argument(
+        'motions',
+        nargs='+',
+        type=Path,
+        metavar='MOTION',
+        help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
+    )
+    add_body(parser)
+    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
+
+
+def add_model(parser: argparse._ActionsContainer) -> None:
+    """Adds --output and --overwrite of a command that learns a model, for `model_file`."""
+    parser.add_argument(
+        '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
+    )
+    parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
+
+
+def add_seed(parser: argparse._ActionsContainer) -> None:
+    """Adds --seed."""
+    parser.add_argument(
+        '--seed', type=whole_number(0), default=0, help='seed of all random numbers (default: 0)'
+    )
+
+
+def add_sources(parser: argparse._ActionsContainer) -> None:
+    """Adds --without and --acknowledgement of a command that learns from motions."""
+    parser.add_argument(
+        '--without',
+        nargs='+',
+        default=[],
+        metavar='NAME',
+        help='motions to leave out, names of files without suffix; * stands for any letters',
+    )
+    parser.add_argument(
+        '--acknowledgement',
+        default='',
+        metavar='TEXT',
+        help='what the motions are, their licence and whom to acknowledge; kept in the file',
+    )
+
+
+def add_test(parser: argparse._ActionsContainer) -> None:
+    """Adds --test."""
+    parser.add_argument(
+        '--test',
+        type=Path,
+        nargs='+',
+        default=[],
+        metavar='MOTION',
+        help='motions of other people, or folders of them, to score on',
+    )
+
+
+def add_alike(parser: argparse._ActionsContainer) -> None:
+    """Adds --alike and --alike-share, for `shares_of`."""
+    parser.add_argument(
+        '--alike',
+        default='',
+        metavar='PREFIX',
+        help='motions whose names start with it are few exercises, each done many times',
+    )
+    parser.add_argument(
+        '--alike-share',
+        type=number(0.0, 1.0),
+        default=0.35,
+        metavar='SHARE',
+        help='factor on how often these are drawn (0.35)',
+    )
+
+
+def add_people_tables(parser: argparse._ActionsContainer) -> None:
+    """Adds --people, for `people_in`."""
+    parser.add_argument(
+        '--people',
+        type=Path,
+        nargs='+',
+        default=[],
+        metavar='FILE.csv',
+        help='tables with the columns file and subject: whose motion a file is (default: the first '
+        'two words of its name)',
+    )
+
+
+def model_file(output: Path, *, overwrite: bool) -> Path:
+    """The file of a model, with '.npz' where that is missing.
+
+    Raises:
+        ValueError: it exists and is not to be overwritten, or its folder does not.
+    """
+    if output.suffix != '.npz':
+        output = output.with_name(output.name + '.npz')
+    if output.exists() and not overwrite:
+        raise ValueError(f'{output} exists: --overwrite replaces it')
+    if not output.parent.is_dir():
+        raise ValueError(f'there is no folder {output.parent} for {output.name}')
+    return output
+
+
+def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
+    """Motion files, and those in folders, but some names of files without suffix (cmu_02_*).
+
+    Raises:
+        ValueError: a file that is no motion, a folder without any, or a name of none of them.
+    """
+    found: list[Path] = []
+    for path in motions:
+        if path.is_dir():
+            found += motion_files(path)
+        elif path.suffix.lower() in MOTION_SUFFIXES:
+            found.append(path)
+        else:
+            raise ValueError(f'{path}: wanted a folder or a motion ({", ".join(MOTION_SUFFIXES)})')
+    names = [path.stem for path in found]
+    left_out: set[str] = set()
+    for pattern in without:
+        meant = fnmatch.filter(names, pattern)
+        if not meant:
+            raise ValueError(f'--without: no motion is called {pattern!r}')
+        left_out |= set(meant)
+    return [path for path in found if path.stem not in left_out]
+
+
+def read_motions(
+    command: str,
+    paths: list[Path],
+    body: str,
+    read: Callable[[Path, Body], Item],
+    *,
+    quiet: bool = False,
+) -> list[Item]:
+    """Content of motions, for a body; a line on stderr for each that can not be used.
+
+    Args:
+        read: reads one; errors of input and of arithmetic say that it can not be used.
+
+    Raises:
+        ValueError: there are motions, and none can be used.
+    """
+    found = []
+    # Not by a fork: threads of other libraries may run in this process.
+    context = get_context('spawn')
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, 8), context) as pool:
+        reading = pool.map(partial(_read_one, read=read, body=body), paths, chunksize=2)
+        shown = with_progress(reading, 'reading', 'motions', len(paths), quiet=quiet)
+        for path, (one, why) in zip(paths, shown, strict=True):
+            if one is None:
+                tell_user(command, f'skipped {path.name}: {why}')
+            else:
+                found.append(one)
+    if paths and not found:
+        raise ValueError(f'none of the {len(paths)} motions can be used')
+    return found
+
+
+def _read_one(path: Path, read: Callable[[Path, Body], Item], body: str) -> tuple[Item | None, str]:
+    """Content of a motion; or the reason why it can not be used."""
+    try:
+        return read(path, load_body(body)), ''
+    except (ValueError, OSError, ArithmeticError, np.linalg.LinAlgError) as error:
+        return None, error_line(error)
+
+
+def person_of(name: str, owners: dict[str, str]) -> str:
+    """The person of a motion file, by `people_in`, or else by its name without suffix."""
+    return owners.get(name) or '_'.join(name.split('_')[:2])
+
+
+def people_in(tables: Iterable[Path]) -> dict[str, str]:
+    """The person of each motion file, by the name of the file without folder and suffix.
+
+    Raises:
+        ValueError: a table without the columns file and subject; one line.
+    """
+    found: dict[str, str] = {}
+    for path in tables:
+        with path.open(encoding='utf-8', newline='') as file:
+            rows = csv.DictReader(file)
+            missing = {'file', 'subject'} - set(rows.fieldnames or ())
+            if missing:
+                raise ValueError(f'{path}: no column {sorted(missing)[0]!r}')
+            for row in rows:
+                # A question mark: the person was guessed.
+                found[Path(row['file'] or '').stem] = (row['subject'] or '').rstrip('?')
+    return found
+
+
+def shares_of(sequences: list[PoseSequence], alike: str, share: float) -> list[float]:
+    """How often each motion is drawn: those whose names start with `alike` less often."""
+    return [share if alike and one.name.startswith(alike) else 1.0 for one in sequences]
+
+
+def data_card(sequences: list[PoseSequence], acknowledgement: str) -> str:
+    """Note on the motions that a file was learned from."""
+    seconds = sum(len(one.poses) for one in sequences) / RATE
+    names = ', '.join(sorted(one.name for one in sequences))
+    said = f'{acknowledgement.strip()}\n' if acknowledgement.strip() else ''
+    return f'{said}Learned from {len(sequences)} motions, {seconds:.0f} s: {names}.'
