@@ -21,10 +21,6 @@ COMMANDS = {
         'hmt_ros.app.replay.command',
         'track the person in a bag and write the poses into a new bag',
     ),
-    'recover': (
-        'hmt_ros.app.recover',
-        'copy the undamaged messages of a damaged bag into a new bag',
-    ),
     'make-bag': ('hmt_ros.app.make_bag', 'render a motion into a bag with ground truth'),
     'compile': (
         'hmt_ros.app.compile_kernels',
