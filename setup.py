@@ -233,7 +233,6 @@ setup(
             'track-video = hmt_ros.app.track_video:main',
             'import-video = hmt_ros.app.import_video.command:main',
             'lift = hmt_ros.app.lift:main',
-            'subject = hmt_ros.app.subject:main',
             'keypoints_node = hmt_ros.nodes.keypoints_node:main',
             'hri_node = hmt_ros.nodes.hri_node:main',
             'people_adapter_node = hmt_ros.nodes.people_adapter_node:main',

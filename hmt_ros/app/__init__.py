@@ -16,7 +16,6 @@ COMMANDS = {
         'write a video and the keypoints of a detector into a bag',
     ),
     'lift': ('hmt_ros.app.lift', 'tell the poses of a person from keypoints alone'),
-    'subject': ('hmt_ros.app.subject', 'write the start of a track from keypoints in a bag'),
     'replay': (
         'hmt_ros.app.replay.command',
         'track the person in a bag and write the poses into a new bag',

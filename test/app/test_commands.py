@@ -43,7 +43,7 @@ def test_unknown_commands_are_one_line(arguments, message, capsys):
 @pytest.mark.parametrize(
     'command',
     [
-        'track-video', 'import-video', 'lift', 'subject', 'replay', 'make-bag',
+        'track-video', 'import-video', 'lift', 'replay', 'make-bag',
         'learn-motion', 'learn-lifter', 'learn-lengths', 'report', 'export', 'evaluate',
     ],
 )  # fmt: skip
