@@ -326,7 +326,6 @@ def test_start_that_nothing_explains(good, tmp_path, capsys):
         (['--set', 'max_hypothesis=3'], 'there is no parameter max_hypothesis; is max_hypotheses'),
         (['--set', 'max_hypotheses=many'], "max_hypotheses must be a whole number, saw 'many'"),
         (['--set', 'max_hypotheses=99'], 'max_hypotheses must lie between 1 and 64, saw 99'),
-        (['--set', 'candidates=20'], 'candidates was removed: how much an image is searched'),
         (['--set', 'image_transport=raw'], 'image_transport is decided by replay'),
         (['--set', 'body_model=['], '--set body_model=['),
         (['--image-topic', 'imag'], 'has no topic imag; it has /camera_info, /image'),
