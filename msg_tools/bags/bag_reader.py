@@ -32,7 +32,7 @@ from rosbags.typesys.store import Typestore
 from msg_tools.bags.bag_metadata import BagError, read_file_names, reason
 from msg_tools.bags.storage import Channel, McapFile, SqliteFile, StorageFile, StoredMessage
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.message_types import typestore_of_definition
+from msg_tools.messages.message_types import typestore, typestore_of_definition
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +40,7 @@ _SQLITE_MAGIC = b'SQLite format 3\x00'
 _MCAP_MAGIC = b'\x89MCAP0\r\n'
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
+_OURS = 'hmt_msgs/'
 _NEVER = 2**64  # later than any log time
 
 
@@ -253,6 +254,8 @@ class BagReader(AbstractContextManager['BagReader']):
                     channel.definition_encoding,
                     channel.definition,
                 )
+            if store is not typestore() and stored.msgtype.startswith(_OURS):
+                raise ValueError('it was recorded with another definition of this type')
             # Bags with the compression mode "message". No CDR message starts like this.
             if data[:4] == _ZSTD_MAGIC:
                 data = zstandard.ZstdDecompressor().decompressobj().decompress(data)

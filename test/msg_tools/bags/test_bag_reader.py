@@ -211,11 +211,16 @@ def test_a_type_that_only_the_bag_knows(tmp_path: Path) -> None:
 def test_a_known_type_in_another_version_is_read_by_its_own_definition(tmp_path: Path) -> None:
     path = tmp_path / 'old.mcap'
     data = b'\x00\x01\x00\x00' + b'\x03\x00\x00\x00ab\x00'
-    msgtype = 'hmt_msgs/msg/Keypoints2D'
-    write_mcap(path, [(1, data)], msgtype=msgtype, definition=b'string only_this\n')
-    with BagReader(path) as bag:
-        (stored,) = bag.messages()
-        assert stored.message.only_this == 'ab'
+    for msgtype in (STRING, 'hmt_msgs/msg/Keypoints2D'):
+        write_mcap(path, [(1, data)], msgtype=msgtype, definition=b'string only_this\n')
+        with BagReader(path) as bag:
+            (stored,) = bag.messages()
+            if msgtype == STRING:
+                assert stored.message.only_this == 'ab'
+                continue
+            # Of those of the project every field is read.
+            with pytest.raises(BagError, match='recorded with another definition of this type'):
+                _ = stored.message
 
 
 def test_bytes_behind_a_message_are_ignored(tmp_path: Path, messages: RosbagsMessages) -> None:
