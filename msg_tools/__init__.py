@@ -4,9 +4,9 @@ Nothing here needs ROS: the message types come from `rosbags` and from the .msg 
 `hmt_msgs/`. The same functions serve nodes, which hand over the classes that ROS generates.
 """
 
+from msg_tools.bags.bag_metadata import BagError
 from msg_tools.bags.bag_reader import BagMessage, BagReader, Topic
 from msg_tools.bags.bag_writer import BagWriter
-from msg_tools.bags.contents import BagError
 from msg_tools.messages.message_error import MessageError
 from msg_tools.messages.message_types import (
     GeneratedMessages,

@@ -16,7 +16,7 @@ import yaml
 from mcap.reader import make_reader
 
 from hmt_ros.sessions import smoothed_messages, track_messages
-from msg_tools.bags.contents import absolute_name
+from msg_tools.bags.bag_metadata import absolute_name
 
 ROOT = Path(__file__).parent.parent
 PAGES = ('README.md', 'docs/bags.md', 'docs/views.md')

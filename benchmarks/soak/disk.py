@@ -130,8 +130,8 @@ def _writes_model(target: Path) -> str:
 
 def _is_whole_bag(path: Path) -> None:
     with BagReader(path) as bag:
-        if bag.damage is not None:
-            raise ValueError(bag.damage)
+        if bag.cut_off:
+            raise ValueError(f'{bag.cut_off[0]} breaks off')
         if not sum(1 for _ in bag.messages()):
             raise ValueError('nothing is in it')
 

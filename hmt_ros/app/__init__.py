@@ -12,14 +12,9 @@ COMMANDS = {
         'write a video and the keypoints of a detector into a bag',
     ),
     'lift': ('hmt_ros.app.lift', 'tell the poses of a person from keypoints alone'),
-    'subject': ('hmt_ros.app.subject', 'write the start of a track from keypoints in a bag'),
     'replay': (
         'hmt_ros.app.replay.command',
         'track the person in a bag and write the poses into a new bag',
-    ),
-    'recover': (
-        'hmt_ros.app.recover',
-        'copy the undamaged messages of a damaged bag into a new bag',
     ),
     'compile': (
         'hmt_ros.app.compile_kernels',

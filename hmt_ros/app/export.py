@@ -300,7 +300,6 @@ def read_tracked_motion(
     motions: dict[int, Counter[int]] = {}
     end = 0
     with BagReader(path) as bag:
-        bag.raise_damage()
         name = _topic(bag, topic)
         for content in _mixtures(bag, name, bodies, progress):
             end = max(end, content.stamp_ns)

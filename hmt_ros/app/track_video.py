@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, gravity_of, number, run_command
+from hmt_ros.app.first_subject import find_start, subject_text
 from hmt_ros.app.import_video.command import (
     MEDIAPIPE,
     ImportOptions,
@@ -26,7 +27,6 @@ from hmt_ros.app.progress import tell_user
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import ReportOptions, write_report
-from hmt_ros.app.subject import find_start, subject_text
 from hmt_ros.body import load_body
 from hmt_ros.detectors.blazepose_models import is_installed
 from hmt_ros.sessions.focal_length import USUAL_FOV, USUAL_SIGMA
@@ -38,7 +38,7 @@ USUAL_RATE = 30.0
 EPILOG = """\
 DIR gets
   video/              the bag that import-video writes, see import-video --help
-  subject.yaml        the start of the track, with --stature only, see subject --help
+  subject.yaml        the start of the track, with --stature only, see replay --help
   tracked/            the bag that replay writes, see replay --help
   report/report.html  the page that report writes, for a browser
 
@@ -141,7 +141,7 @@ def _track(arguments: argparse.Namespace) -> int:
             tell(f'{error}: --stature is not used')
         else:
             subject = start
-            start.write_text(subject_text(seen, stature=stature), encoding='utf-8')
+            start.write_text(subject_text(seen, stature), encoding='utf-8')
             say(f'{start}: {len(seen.joints.names)} joints at {seen.stamp_ns} ns')
     options = ReplayOptions(
         overwrite=overwrite,

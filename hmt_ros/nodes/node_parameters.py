@@ -16,7 +16,6 @@ from rclpy.parameter import Parameter
 from hmt_ros.sessions.declared_parameters import (
     AT_LAUNCH,
     EFFECTS,
-    REMOVED,
     DeclaredParameter,
     Value,
 )
@@ -78,9 +77,6 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
     names = sorted(known)
     texts = []
     for name in sorted(set(given) - set(names)):
-        if name in REMOVED:
-            texts.append(f'parameter {name!r} was removed, it is ignored: {REMOVED[name]}')
-            continue
         near = difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
         hint = f'; did you mean {near[0]!r}?' if near else ', it is ignored'
         texts.append(f'unknown parameter {name!r}{hint}')

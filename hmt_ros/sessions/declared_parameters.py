@@ -51,44 +51,6 @@ OWN_KEYPOINTS = 'keypoints'
 # Scheme of keypoints that come without names, unless another is named.
 USUAL_ORDER = 'coco17'
 
-# Parameters that were removed, and their replacements.
-_TRACKER = 'programs set it in TrackerSettings'
-_LIKELIHOOD = 'programs set it in LikelihoodSettings'
-_BACKGROUND = 'programs set it in BackgroundSettings'
-REMOVED = {
-    'scheme': 'keypoint_scheme tells the order of keypoints without names, too',
-    'merge_distance': 'modes of an image nearer than 1.75 standard deviations are merged',
-    'absence_time': 'existence is a probability with rates per second: see existence_probability',
-    'reweighting': 'the weight of a mode follows from all pairs of modes (docs/tracking.md)',
-    'jump_probability': 'a jump costs what its distance does in the time between two images',
-    'prediction_probability': 'predictions are proposals, and weigh as any other hypothesis',
-    'facing_trial': 'one filter follows both ways to face for as long as they are open',
-    'shape_images': 'every image tells of the shape by its share (docs/tracking.md)',
-    'shape_interval': 'every image tells of the shape by its share (docs/tracking.md)',
-    'lost_misfit': 'a track is lost when its cues say so together: hmt_ros/tracking/validity.py',
-    'lost_images': 'a track is lost when its cues say so together: hmt_ros/tracking/validity.py',
-    'trust': 'how far images are believed is a table: hmt_ros/inference/error_model.py',
-    'candidates': 'how much an image is searched follows from evaluation_budget',
-    'searched_chains': 'how much an image is searched follows from evaluation_budget',
-    'proposals': f'kinematic jumps; {_TRACKER}',
-    'samples': f'kinematic jumps draw none; {_TRACKER}',
-    'sample_scale': f'kinematic jumps draw none; {_TRACKER}',
-    'hypothesis_merge_distance': f'modes are merged below 20 mm; {_TRACKER}',
-    'likelihood.containment.weight': 'the outline of the silhouette says as much: '
-    'likelihood.coverage.weight',
-    'likelihood.intensity.weight': 'colours of the image before bring nothing (docs/tracking.md)',
-    'likelihood.motion.weight': 'predictions follow the optical flow: flow_weight',
-    'likelihood.prior_weight': f'the factor 0.5; {_LIKELIHOOD}',
-    'likelihood.pose_prior': f'the learned prior, where the body has one; {_LIKELIHOOD}',
-    'likelihood.self_intersection_sigma': f'the deviation 30 mm; {_LIKELIHOOD}',
-    'background.threshold': f'the squared distance 20; {_BACKGROUND}',
-    'background.shadow_threshold': f'the brightness 0.3; {_BACKGROUND}',
-    'overlay_quality': 'the JPEG quality is 90',
-    'status_interval': 'a line a second while messages arrive; none with --log-level warn',
-    'error_correlation': 'errors last for a time in s: hmt_ros/inference/error_model.py, and '
-    'error_time of the likelihoods that a smoother takes',
-}
-
 # Metadata of a field that is one parameter or holds several.
 _EFFECT, _LIMITS, _PREFIX = 'effect', 'limits', 'prefix'
 
@@ -312,8 +274,6 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
     known = {parameter.name: parameter for parameter in declared_parameters(settings)}
     for name in values:
         if name not in known:
-            if name in REMOVED:
-                raise ParameterError(f'parameter {name} was removed: {REMOVED[name]}')
             near = difflib.get_close_matches(name, known, n=1)
             hint = f'; is {near[0]} meant?' if near else ''
             raise ParameterError(f'there is no parameter {name}{hint}')

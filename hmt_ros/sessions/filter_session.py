@@ -195,7 +195,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
         """
         if len(message.components) == 0:
             # A predictor that leaves the image to the track has seen neither somebody nor nobody.
-            left = message.state == TrackState.TRACKING or getattr(message, 'reason', '')
+            left = message.state == TrackState.TRACKING or message.reason
             return None if left else Status.NOBODY
         try:
             content = pose_mixture_of(message)

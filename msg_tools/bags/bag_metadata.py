@@ -1,34 +1,51 @@
-"""`metadata.yaml`, which makes a folder a bag of rosbag2: reads and writes it."""
+"""`metadata.yaml`, which makes a folder a bag of rosbag2, names of topics, and `BagError`."""
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import yaml
-from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
 
-from msg_tools.bags.contents import BagError, reason
 from msg_tools.files.bounded_file import read_bytes
+from msg_tools.files.error_line import error_line, one_line
 
 FILE_NAME = 'metadata.yaml'
 # Suffixes of the other files of a bag.
-MCAP_SUFFIXES = ('.mcap', '.mcap.zstd')
-DATABASE_SUFFIXES = ('.db3', '.db3.zstd')
-SUFFIXES = (*MCAP_SUFFIXES, *DATABASE_SUFFIXES)
+SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 VERSION = 9
 MAX_BYTES = 2**24
 
 # No deadline, no lifespan: rmw writes this for an infinite duration.
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 
-_POLICIES: dict[str, type[Enum]] = {
-    'history': QosHistory,
-    'reliability': QosReliability,
-    'durability': QosDurability,
-    'liveliness': QosLiveliness,
-}
+
+class BagError(ValueError):
+    """A bag that can not be read or written, in one line: what was seen, wanted, and what to do."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
+
+
+def reason(error: BaseException) -> str:
+    """The text of a library's exception as one line of at most 160 characters."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    text = error_line(error)
+    return text if len(text) <= 160 else f'{text[:157]}...'
+
+
+def absolute_name(topic: str, namespace: str = '') -> str:
+    """Name of a topic as rosbag2 records and compares it: with its namespace and a leading slash.
+
+    Args:
+        topic: a relative name is in the namespace; an absolute one stays.
+        namespace: '/humans/bodies/p1' for example; '' for the root.
+    """
+    if topic.startswith('/'):
+        return topic
+    inside = namespace.strip('/')
+    return f'/{inside}/{topic}' if inside else f'/{topic}'
 
 
 def read_file_names(folder: Path) -> list[str]:
@@ -80,35 +97,6 @@ def quality_of_service(latched: bool) -> list[dict[str, Any]]:
             'avoid_ros_namespace_conventions': False,
         }
     ]
-
-
-def recorded_quality_of_service(text: str) -> list[dict[str, Any]]:
-    """Offered QoS as a bag of any version has it, with the names that the present version wants.
-
-    Args:
-        text: YAML, with numbers in bags of ROS 2 Iron and before.
-
-    Returns:
-        An empty list if the text can not be understood: players then offer the usual QoS.
-    """
-    try:
-        profiles = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError):
-        return []
-    if not isinstance(profiles, list) or not all(isinstance(x, dict) for x in profiles):
-        return []
-    found = []
-    for recorded in profiles:
-        profile = dict(quality_of_service(False)[0])
-        for name, usual in profile.items():
-            value = recorded.get(name, usual)
-            if name in _POLICIES and isinstance(value, int):
-                numbers = {policy.value: policy.name.lower() for policy in _POLICIES[name]}
-                value = numbers.get(value, 'unknown')
-            if isinstance(value, type(usual)):
-                profile[name] = value
-        found.append(profile)
-    return found
 
 
 def as_yaml(document: Any) -> str:

@@ -2,7 +2,8 @@
 
 Messages come in the order of their log times; messages of equal times come in the order of the
 files. Memory holds the chunks of the present time, never a whole file. Every fault of a bag is a
-`BagError` of one line.
+`BagError` of one line. A bag that a crash cut off is read up to its last complete message, and a
+line of the log says so.
 
     with BagReader('walk') as bag:
         topic = bag.find_topic(['sensor_msgs/msg/CompressedImage'])
@@ -12,109 +13,35 @@ files. Memory holds the chunks of the present time, never a whole file. Every fa
 
 from __future__ import annotations
 
+import heapq
+import logging
 import os
-import sqlite3
 import stat
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, closing
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
+import zstandard
 from rosbags.typesys.store import Typestore
 
-from msg_tools.bags.bag_metadata import read_file_names
-from msg_tools.bags.contents import BagError, Channel, Source, StoredMessage, merge, reason
-from msg_tools.bags.mcap_file import McapFile
-from msg_tools.bags.mcap_records import (
-    ZSTD_MAGIC,
-    DecompressionError,
-    decompress_file,
-    decompress_zstd,
-)
+from msg_tools.bags.bag_metadata import BagError, read_file_names, reason
+from msg_tools.bags.storage import Channel, McapFile, SqliteFile, StorageFile, StoredMessage
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.message_types import RosbagsMessages, typestore_of_definition
+from msg_tools.messages.message_types import typestore, typestore_of_definition
+
+_log = logging.getLogger(__name__)
 
 _SQLITE_MAGIC = b'SQLite format 3\x00'
+_MCAP_MAGIC = b'\x89MCAP0\r\n'
+_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
-
-_NEVER = 2**64  # later than any log time
 _OURS = 'hmt_msgs/'
-
-
-class SqliteFile:
-    """A .db3 file, the default storage before ROS 2 Iron.
-
-    The counterpart of `McapFile`, with the same attributes.
-    """
-
-    def __init__(self, path: Path, name: str) -> None:
-        self._path = path
-        self._name = name
-        self.damage: str | None = None
-        self.counts: dict[Channel, int] = {}
-        self._channels: dict[int, Channel] = {}
-        try:
-            with closing(self._connect()) as database:
-                counts = dict(
-                    database.execute('SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id')
-                )
-                definitions = self._definitions(database)
-                for key, topic, msgtype, encoding in database.execute(
-                    'SELECT id, name, type, serialization_format FROM topics ORDER BY id'
-                ):
-                    definition = definitions.get(msgtype, ('', b''))
-                    channel = Channel(str(topic), str(msgtype), str(encoding), *definition)
-                    self._channels[key] = channel
-                    self.counts[channel] = self.counts.get(channel, 0) + counts.get(key, 0)
-                self.start, self.end = database.execute(
-                    'SELECT MIN(timestamp), MAX(timestamp) FROM messages'
-                ).fetchone()
-        except sqlite3.Error as error:
-            raise BagError(f'{name} is not a bag of rosbag2: {reason(error)}') from error
-        if not all(isinstance(time, int | None) for time in (self.start, self.end)):
-            raise BagError(f'{name} is damaged: a time is not a whole number')
-
-    def _connect(self) -> sqlite3.Connection:
-        return sqlite3.connect(f'file:{quote(str(self._path.resolve()))}?mode=ro', uri=True)
-
-    @staticmethod
-    def _definitions(database: sqlite3.Connection) -> dict[str, tuple[str, bytes]]:
-        # Bags of ROS 2 Humble and before do not carry them.
-        table = "SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'"
-        if database.execute(table).fetchone() is None:
-            return {}
-        rows = database.execute(
-            'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
-        )
-        return {name: (str(encoding), str(text).encode()) for name, encoding, text in rows}
-
-    def messages(
-        self, wanted: Callable[[Channel], bool] = lambda channel: True
-    ) -> Iterator[tuple[int, StoredMessage]]:
-        """Log time in ns and message, by log time, then in the order in which they were written.
-
-        Raises:
-            BagError: where the file is damaged, after the messages before the damage.
-        """
-        keys = [key for key, channel in self._channels.items() if wanted(channel)]
-        query = (
-            'SELECT topic_id, timestamp, data FROM messages '
-            f'WHERE topic_id IN ({", ".join("?" * len(keys))}) ORDER BY timestamp, id'
-        )
-        try:
-            with closing(self._connect()) as database:
-                for key, time, data in database.execute(query, keys):
-                    if not isinstance(time, int) or not isinstance(data, bytes):
-                        raise BagError(
-                            f'{self._name} is damaged: a message at {time!r} has no data'
-                        )
-                    yield time, StoredMessage(self._channels[key], memoryview(data))
-        except sqlite3.Error as error:
-            raise BagError(f'{self._name} is damaged: {reason(error)}') from error
+_NEVER = 2**64  # later than any log time
 
 
 @dataclass(frozen=True)
@@ -148,15 +75,12 @@ class BagMessage:
     topic: str
     msgtype: str
     log_time_ns: int
-    data: memoryview = field(repr=False)
+    data: bytes = field(repr=False)
     _deserialise: Callable[[BagMessage], Any] = field(repr=False)
 
     @cached_property
     def message(self) -> Any:
         """The message, with the fields of its type; arrays are read-only.
-
-        One of hmt_msgs that was recorded with an older definition has today's fields; the new ones
-        are zero or empty.
 
         Raises:
             BagError: its bytes do not fit its type, or the type is not known.
@@ -166,7 +90,7 @@ class BagMessage:
     def with_message(self, message: Any) -> BagMessage:
         """Another message of `rosbags` in the place of this one; it has no bytes."""
         kind = message.__msgtype__
-        return BagMessage(self.topic, kind, self.log_time_ns, memoryview(b''), lambda _: message)
+        return BagMessage(self.topic, kind, self.log_time_ns, b'', lambda _: message)
 
 
 class BagReader(AbstractContextManager['BagReader']):
@@ -181,9 +105,7 @@ class BagReader(AbstractContextManager['BagReader']):
     Attributes:
         path: as given.
         topics: by name, in the order of the bag.
-        start_ns, end_ns: log times of the first and the last message; None when there is none.
-        damage: damage that is already known, None when there is none; it is raised by `messages`
-            once everything before it is out.
+        cut_off: the files of which the end is missing, as a recorder that is killed leaves them.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -205,9 +127,9 @@ class BagReader(AbstractContextManager['BagReader']):
                     known.encoding if known else channel.encoding,
                     count + (known.message_count if known else 0),
                 )
-        self.start_ns = min((f.start for f in self._files if f.start is not None), default=None)
-        self.end_ns = max((f.end for f in self._files if f.end is not None), default=None)
-        self.damage = next((f.damage for f in self._files if f.damage is not None), None)
+        self.cut_off = tuple(file.name for file in self._files if file.cut_off)
+        for name in self.cut_off:
+            _tell_cut_off(name)
 
     def close(self) -> None:
         """Removes the files that were decompressed into the folder for temporary files."""
@@ -217,11 +139,6 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def raise_damage(self) -> None:
-        """Raises BagError if damage is already known."""
-        if self.damage is not None:
-            raise BagError(f'{self.path} {self.damage}')
 
     def message_count(self, topics: Iterable[str] | None = None) -> int:
         """Number of messages of some topics, or of all.
@@ -251,7 +168,6 @@ class BagReader(AbstractContextManager['BagReader']):
             raise BagError(
                 f'{self.path} has several topics {name}: name one of {", ".join(inside)}'
             )
-        self.raise_damage()
         raise BagError(f'{self.path} has no topic {name}; it has {self._topic_names()}')
 
     def find_topic(self, msgtypes: Iterable[str], name: str | None = None) -> Topic:
@@ -280,13 +196,11 @@ class BagReader(AbstractContextManager['BagReader']):
                 names = ', '.join(topic.name for topic in used)
                 raise BagError(f'{self.path} has several topics of {short}: name one of {names}')
             if not found:
-                self.raise_damage()
                 raise BagError(
                     f'{self.path} has no topic of type {short}; it has {self._topic_names()}'
                 )
             topic = (used or found)[0]
         if not topic.message_count:
-            self.raise_damage()
             raise BagError(f'{self.path}: topic {topic.name} has no messages')
         return topic
 
@@ -301,7 +215,7 @@ class BagReader(AbstractContextManager['BagReader']):
                 damaged, after the messages before the damage.
         """
         if topics is None:
-            return self._merged(lambda channel: True)
+            return self._merged(self.topics)
         names = {self.topic(name).name for name in topics}
         for name in names:
             channels = {
@@ -314,28 +228,19 @@ class BagReader(AbstractContextManager['BagReader']):
                 kinds = ' and '.join(sorted(' as '.join(kind) for kind in channels))
                 raise BagError(f'{self.path}: topic {name} has messages of several kinds: {kinds}')
             self._check_encoding(name, self.topics[name].encoding)
-        return self._merged(lambda channel: channel.topic in names)
+        return self._merged(names)
 
-    def _merged(self, wanted: Callable[[Channel], bool]) -> Iterator[BagMessage]:
-        sources = [
-            # A file without messages comes last: all it can do is to report its damage.
-            Source(
-                _NEVER if file.start is None else file.start, order, partial(file.messages, wanted)
-            )
-            for order, file in enumerate(self._files)
-        ]
-        for time, stored in merge(sources):
-            yield self._bag_message(time, stored)
-
-    def _bag_message(self, time: int, stored: StoredMessage) -> BagMessage:
-        channel = stored.channel
-        return BagMessage(
-            channel.topic,
-            _full_name(channel.msgtype),
-            time,
-            stored.data,
-            partial(self._deserialise, channel),
-        )
+    def _merged(self, names: Collection[str]) -> Iterator[BagMessage]:
+        found = (_from_its_start(file, names) for file in self._files)
+        for stored in heapq.merge(*found, key=attrgetter('log_time')):
+            if stored.channel is not None:
+                yield BagMessage(
+                    stored.channel.topic,
+                    _full_name(stored.channel.msgtype),
+                    stored.log_time,
+                    stored.data,
+                    partial(self._deserialise, stored.channel),
+                )
 
     def _deserialise(self, channel: Channel, stored: BagMessage) -> Any:
         self._check_encoding(stored.topic, channel.encoding)
@@ -347,25 +252,19 @@ class BagReader(AbstractContextManager['BagReader']):
                 store = self._typestores[channel] = typestore_of_definition(
                     stored.msgtype,
                     channel.definition_encoding,
-                    channel.definition.decode('utf-8', 'replace'),
+                    channel.definition,
                 )
+            if store is not typestore() and stored.msgtype.startswith(_OURS):
+                raise ValueError('it was recorded with another definition of this type')
             # Bags with the compression mode "message". No CDR message starts like this.
-            if data[:4] == ZSTD_MAGIC:
-                data = memoryview(decompress_zstd(data))
-            message = deserialise(data, stored.msgtype, store)
-            return self._adopted(message) if stored.msgtype.startswith(_OURS) else message
+            if data[:4] == _ZSTD_MAGIC:
+                data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+            return deserialise(data, stored.msgtype, store)
         except Exception as error:
             # Bytes from outside meet generated code here, which does not say what it may raise.
             raise BagError(
                 f'{what} can not be read as {stored.msgtype or "unknown type"}: {reason(error)}'
             ) from error
-
-    def _adopted(self, message: Any) -> Any:
-        """A message of this project with all fields it has today; as it is if that can not be."""
-        try:
-            return RosbagsMessages().adopt(message)
-        except TypeError:
-            return message
 
     def _check_encoding(self, topic: str, encoding: str) -> None:
         if encoding != 'cdr':
@@ -396,38 +295,58 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
         return paths
 
-    def _open_file(self, path: Path) -> McapFile | SqliteFile:
+    def _open_file(self, path: Path) -> StorageFile:
         name = str(path)
         try:
-            with path.open('rb') as file:
-                magic = file.read(16)
-            if magic.startswith(ZSTD_MAGIC):
+            magic = _first_bytes(path)
+            if magic.startswith(_ZSTD_MAGIC):
                 path = self._decompressed(path)
-                with path.open('rb') as file:
-                    magic = file.read(16)
+                magic = _first_bytes(path)
         except OSError as error:
             raise BagError(f'{name} can not be read: {reason(error)}') from error
-        except DecompressionError as error:
-            raise BagError(f'{name} is damaged: {error}') from error
+        except zstandard.ZstdError as error:
+            raise BagError(f'{name} is damaged: {reason(error)}') from error
         if magic == _SQLITE_MAGIC:
             return SqliteFile(path, name)
+        if magic.startswith(_MCAP_MAGIC):
+            return McapFile(path, name)
         if magic.startswith(b'#ROSBAG V'):
             raise BagError(
                 f'{name} is a bag of ROS 1, wanted one of ROS 2: convert it with '
                 '`rosbags-convert --src FILE --dst FOLDER --dst-storage mcap`'
             )
-        return McapFile(path, name)
+        seen = f'starts with {magic!r}' if magic else 'is empty'
+        raise BagError(f'{name} is not a bag: it {seen}, wanted an MCAP or SQLite recording')
 
     def _decompressed(self, path: Path) -> Path:
         """The content of a zstd file, as a file that lives as long as the reader."""
         if self._scratch is None:
             self._scratch = tempfile.TemporaryDirectory(prefix='bag_reader.')
-        folder = Path(self._scratch.name)
-        target = folder / str(sum(1 for _ in folder.iterdir()))
+        target = Path(self._scratch.name) / path.stem
         with path.open('rb') as compressed, target.open('wb') as plain:
-            for piece in decompress_file(compressed):
-                plain.write(piece)
+            zstandard.ZstdDecompressor().copy_stream(compressed, plain)
         return target
+
+
+@cache
+def _tell_cut_off(name: str) -> None:
+    """A line in the log, once for each file: a command opens a bag several times."""
+    _log.warning(
+        '%s breaks off: it is read up to its last complete message; `mcap recover` makes a whole '
+        'file of it, and `ros2 bag reindex` the metadata of its folder',
+        name,
+    )
+
+
+def _first_bytes(path: Path) -> bytes:
+    with path.open('rb') as file:
+        return file.read(len(_SQLITE_MAGIC))
+
+
+def _from_its_start(file: StorageFile, topics: Collection[str]) -> Iterator[StoredMessage]:
+    """A mark without a channel, then the messages: no file is opened before its time has come."""
+    yield StoredMessage(_NEVER if file.start is None else file.start, None, b'')
+    yield from file.messages(topics)
 
 
 def _full_name(msgtype: str) -> str:

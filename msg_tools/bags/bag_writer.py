@@ -6,8 +6,8 @@ both the stamp that the caller gives.
 
 The bag is written into a hidden folder `.<name>.<random>.partial` next to its place and moved there
 when it is complete and on the disk; an error removes it. If the process is killed the hidden folder
-stays: each complete chunk is handed to the system at once, so that `bag_recovery` finds all but the
-last. Chunks, data and summary have checksums. The same calls write the same bytes.
+stays: each complete chunk is handed to the system at once, so that its file can be read but for the
+last one. Chunks, data and summary have checksums. The same calls write the same bytes.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
@@ -24,12 +24,20 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 
-from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES, VERSION, as_yaml, quality_of_service
-from msg_tools.bags.contents import BagError, Channel, absolute_name, reason
+from msg_tools.bags.bag_metadata import (
+    FILE_NAME,
+    SUFFIXES,
+    VERSION,
+    BagError,
+    absolute_name,
+    as_yaml,
+    quality_of_service,
+    reason,
+)
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.message_types import typestore
 
@@ -39,34 +47,36 @@ _PARTIAL = '.partial'
 
 
 @dataclass
-class _Written:
-    """A channel of the file."""
+class _Topic:
+    """A topic of the bag: the number of its channel, and what metadata.yaml says of it."""
 
-    channel: Channel
+    msgtype: str
+    channel: int
     offered_qos: list[dict[str, Any]]
     type_hash: str
     message_count: int = 0
 
 
-class BagFolder:
-    """A bag that is being written.
+class BagWriter(AbstractContextManager['BagWriter']):
+    """A bag that is open for writing; a context manager, which closes it, or drops it on an error.
 
     Args:
         path: folder to write, `<name>`; the file in it is `<name>.mcap`.
         overwrite: replace a bag that is there. Anything else that is there is never touched.
+        namespace: of the topics with relative names, '/humans/bodies/p1' for example.
 
     Raises:
         BagError: the folder exists, can not be created or written.
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], *, overwrite: bool = False, profile: str = 'ros2'
+        self, path: str | os.PathLike[str], *, overwrite: bool = False, namespace: str = ''
     ) -> None:
         self.path = Path(path).absolute()
-        self._overwrite = overwrite
+        self._overwrite, self._namespace = overwrite, namespace
         self._check_target()
-        self._channels: dict[int, _Written] = {}
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._topics: dict[str, _Topic] = {}
+        self._schemas: dict[str, int] = {}
         self._start: int | None = None
         self._end = 0
         self._folder: Path | None = self.path.with_name(
@@ -74,7 +84,7 @@ class BagFolder:
         )
         self._file: BinaryIO | None = None
         self._handed_over = 0
-        with self.dropping_on_error():
+        with self._dropping_on_error():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._folder.mkdir()
             self._file = (self._folder / self._file_name).open('xb')
@@ -85,62 +95,83 @@ class BagFolder:
                 enable_crcs=True,
                 enable_data_crcs=True,
             )
-            self._writer.start(profile=profile, library=LIBRARY)
+            self._writer.start(profile='ros2', library=LIBRARY)
 
-    def add_channel(
-        self, channel: Channel, offered_qos: list[dict[str, Any]], type_hash: str
-    ) -> int:
-        """Announces messages.
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+    def add_topic(self, name: str, msgtype: str, *, latched: bool = False) -> None:
+        """Announces a topic; one that is written without is not latched.
 
         Args:
-            offered_qos: quality of service that their publishers offered, as in metadata.yaml.
-            type_hash: RIHS01 hash of the type, or ''.
-
-        Returns:
-            Number of the channel, for `add_message`.
-        """
-        with self.dropping_on_error():
-            schema = 0
-            if channel.msgtype:
-                key = channel.msgtype, channel.definition_encoding, channel.definition
-                known = self._schemas.get(key)
-                schema = self._writer.register_schema(*key) if known is None else known
-                self._schemas[key] = schema
-            result = self._writer.register_channel(
-                channel.topic,
-                channel.encoding,
-                schema,
-                {'offered_qos_profiles': as_yaml(offered_qos), 'topic_type_hash': type_hash},
-            )
-        self._channels[result] = _Written(channel, offered_qos, type_hash)
-        return result
-
-    def add_message(
-        self, channel: int, log_time_ns: int, data: bytes, publish_time_ns: int, sequence: int = 0
-    ) -> None:
-        """Writes a message of a channel.
+            name: of the topic, absolute or relative to the namespace.
+            msgtype: for example 'hmt_msgs/msg/PoseMixture'.
+            latched: offered as transient local, so that late subscribers get the last message.
 
         Raises:
-            BagError: the disk is full.
+            BagError: an unknown type, or the topic is there already.
         """
-        with self.dropping_on_error():
-            self._writer.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
+        store, name = typestore(), absolute_name(name, self._namespace)
+        if msgtype not in store.fielddefs:
+            raise BagError(f'{self.path}: topic {name} can not have the unknown type {msgtype!r}')
+        if name in self._topics:
+            raise BagError(f'{self.path}: topic {name} is there already')
+        definition, _ = store.generate_msgdef(msgtype, ros_version=2)
+        offered, type_hash = quality_of_service(latched), store.hash_rihs01(msgtype)
+        metadata = {'offered_qos_profiles': as_yaml(offered), 'topic_type_hash': type_hash}
+        with self._dropping_on_error():
+            if msgtype not in self._schemas:
+                self._schemas[msgtype] = self._writer.register_schema(
+                    msgtype, 'ros2msg', definition.encode()
+                )
+            channel = self._writer.register_channel(name, 'cdr', self._schemas[msgtype], metadata)
+        self._topics[name] = _Topic(msgtype, channel, offered, type_hash)
+
+    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Writes a message of `typestore()`; announces its topic where that has not been done.
+
+        Raises:
+            BagError: the topic has another type, a field does not fit the type, the disk is full.
+        """
+        msgtype, topic = message.__msgtype__, absolute_name(topic, self._namespace)
+        if topic not in self._topics:
+            self.add_topic(topic, msgtype)
+        if self._topics[topic].msgtype != msgtype:
+            raise BagError(
+                f'{self.path}: topic {topic} has type {self._topics[topic].msgtype}, not {msgtype}'
+            )
+        try:
+            data = serialise(message)
+        except Exception as error:
+            # Generated code of the library, which does not say what it may raise for a wrong field.
+            raise BagError(
+                f'{self.path}: message of {topic} does not fit {msgtype}: {reason(error)}'
+            ) from error
+        self.write_serialised(topic, stamp_ns, data)
+
+    def write_serialised(self, topic: str, stamp_ns: int, data: bytes) -> None:
+        """Writes a message that is CDR bytes already, of a topic that has been announced.
+
+        Raises:
+            BagError: no such topic, a stamp before 1970, the disk is full.
+        """
+        topic = absolute_name(topic, self._namespace)
+        known = self._topics.get(topic)
+        if known is None:
+            raise BagError(f'{self.path}: topic {topic} has not been added')
+        if not 0 <= stamp_ns < 2**63:
+            raise BagError(
+                f'{self.path}: stamp {stamp_ns} ns of a message of {topic} is not a time'
+            )
+        with self._dropping_on_error():
+            self._writer.add_message(known.channel, stamp_ns, data, stamp_ns)
             self._hand_over()
-        self._channels[channel].message_count += 1
-        self._start = log_time_ns if self._start is None else min(self._start, log_time_ns)
-        self._end = max(self._end, log_time_ns)
-
-    def add_metadata(self, name: str, content: dict[str, str]) -> None:
-        """Writes a record of metadata."""
-        with self.dropping_on_error():
-            self._writer.add_metadata(name, content)
-
-    def add_attachment(
-        self, name: str, media_type: str, log_time_ns: int, create_time_ns: int, data: bytes
-    ) -> None:
-        """Writes an attachment."""
-        with self.dropping_on_error():
-            self._writer.add_attachment(create_time_ns, log_time_ns, name, media_type, data)
+        known.message_count += 1
+        self._start = stamp_ns if self._start is None else min(self._start, stamp_ns)
+        self._end = max(self._end, stamp_ns)
 
     def close(self) -> None:
         """Completes the bag and moves it to its place; does nothing when that has been done.
@@ -150,7 +181,7 @@ class BagFolder:
         """
         if self._folder is None or self._file is None:
             return
-        with self.dropping_on_error():
+        with self._dropping_on_error():
             information = self._information()
             self._writer.add_metadata('rosbag2', {'serialized_metadata': as_yaml(information)})
             self._writer.finish()  # type: ignore[no-untyped-call]
@@ -182,7 +213,7 @@ class BagFolder:
         return f'{self.path.name}.mcap'
 
     @contextmanager
-    def dropping_on_error(self) -> Iterator[None]:
+    def _dropping_on_error(self) -> Iterator[None]:
         """Removes the unfinished bag when an exception passes, and turns OSError into BagError."""
         if self._folder is None:
             raise BagError(f'{self.path} is closed')
@@ -242,7 +273,7 @@ class BagFolder:
         span = {
             'duration': {'nanoseconds': max(0, self._end - start)},
             'starting_time': {'nanoseconds_since_epoch': start},
-            'message_count': sum(written.message_count for written in self._channels.values()),
+            'message_count': sum(topic.message_count for topic in self._topics.values()),
         }
         return {
             'version': VERSION,
@@ -251,15 +282,15 @@ class BagFolder:
             'topics_with_message_count': [
                 {
                     'topic_metadata': {
-                        'name': written.channel.topic,
-                        'type': written.channel.msgtype,
-                        'serialization_format': written.channel.encoding,
-                        'offered_qos_profiles': written.offered_qos,
-                        'type_description_hash': written.type_hash,
+                        'name': name,
+                        'type': topic.msgtype,
+                        'serialization_format': 'cdr',
+                        'offered_qos_profiles': topic.offered_qos,
+                        'type_description_hash': topic.type_hash,
                     },
-                    'message_count': written.message_count,
+                    'message_count': topic.message_count,
                 }
-                for written in self._channels.values()
+                for name, topic in self._topics.items()
             ],
             'compression_format': '',
             'compression_mode': '',
@@ -285,96 +316,3 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-class _Topic(NamedTuple):
-    msgtype: str
-    channel: int
-
-
-class BagWriter(BagFolder, AbstractContextManager['BagWriter']):
-    """A bag that is open for writing; a context manager, which closes it, or drops it on an error.
-
-    Args:
-        path: folder to write, `<name>`; the file in it is `<name>.mcap`.
-        overwrite: replace a bag that is there. Anything else that is there is never touched.
-        namespace: of the topics with relative names, '/humans/bodies/p1' for example.
-
-    Raises:
-        BagError: the folder exists, can not be created or written.
-    """
-
-    def __init__(
-        self, path: str | os.PathLike[str], *, overwrite: bool = False, namespace: str = ''
-    ) -> None:
-        super().__init__(path, overwrite=overwrite)
-        self._namespace = namespace
-        self._topics: dict[str, _Topic] = {}
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.abort()
-
-    def add_topic(self, name: str, msgtype: str, *, latched: bool = False) -> None:
-        """Announces a topic; one that is written without is not latched.
-
-        Args:
-            name: of the topic, absolute or relative to the namespace.
-            msgtype: for example 'hmt_msgs/msg/PoseMixture'.
-            latched: offered as transient local, so that late subscribers get the last message.
-
-        Raises:
-            BagError: an unknown type, or the topic is there already.
-        """
-        store, name = typestore(), absolute_name(name, self._namespace)
-        if msgtype not in store.fielddefs:
-            raise BagError(f'{self.path}: topic {name} can not have the unknown type {msgtype!r}')
-        if name in self._topics:
-            raise BagError(f'{self.path}: topic {name} is there already')
-        definition, _ = store.generate_msgdef(msgtype, ros_version=2)
-        channel = self.add_channel(
-            Channel(name, msgtype, 'cdr', 'ros2msg', definition.encode()),
-            quality_of_service(latched),
-            store.hash_rihs01(msgtype),
-        )
-        self._topics[name] = _Topic(msgtype, channel)
-
-    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Writes a message of `typestore()`; announces its topic where that has not been done.
-
-        Raises:
-            BagError: the topic has another type, a field does not fit the type, the disk is full.
-        """
-        msgtype, topic = message.__msgtype__, absolute_name(topic, self._namespace)
-        if topic not in self._topics:
-            self.add_topic(topic, msgtype)
-        if self._topics[topic].msgtype != msgtype:
-            raise BagError(
-                f'{self.path}: topic {topic} has type {self._topics[topic].msgtype}, not {msgtype}'
-            )
-        try:
-            data = serialise(message)
-        except Exception as error:
-            # Generated code of the library, which does not say what it may raise for a wrong field.
-            raise BagError(
-                f'{self.path}: message of {topic} does not fit {msgtype}: {reason(error)}'
-            ) from error
-        self.write_serialised(topic, stamp_ns, data)
-
-    def write_serialised(self, topic: str, stamp_ns: int, data: bytes) -> None:
-        """Writes a message that is CDR bytes already, of a topic that has been announced.
-
-        Raises:
-            BagError: no such topic, a stamp before 1970, the disk is full.
-        """
-        topic = absolute_name(topic, self._namespace)
-        known = self._topics.get(topic)
-        if known is None:
-            raise BagError(f'{self.path}: topic {topic} has not been added')
-        if not 0 <= stamp_ns < 2**63:
-            raise BagError(
-                f'{self.path}: stamp {stamp_ns} ns of a message of {topic} is not a time'
-            )
-        self.add_message(known.channel, stamp_ns, data, stamp_ns)

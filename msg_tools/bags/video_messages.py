@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from msg_tools.bags.bag_metadata import BagError
 from msg_tools.bags.bag_reader import BagMessage, BagReader, Topic
-from msg_tools.bags.contents import BagError
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import MAX_PIXELS, image_message
 from msg_tools.messages.message_types import RosbagsMessages

@@ -14,18 +14,14 @@ from typing import Any
 
 from rosbags.typesys.store import Typestore
 
-from msg_tools.messages.message_types import RosbagsMessages, typestore
+from msg_tools.messages.message_types import typestore
 
 _HEADER_BYTES = 4
 
 
 def serialise(message: Any) -> bytes:
-    """Little-endian CDR bytes, with their encapsulation header, by the types of `typestore()`.
-
-    A message that was read by another definition of its type is adopted before.
-    """
-    known = RosbagsMessages().adopt(message)
-    return bytes(typestore().serialize_cdr(known, message.__msgtype__, little_endian=True))
+    """Little-endian CDR bytes, with their encapsulation header, by the types of `typestore()`."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__, little_endian=True))
 
 
 def deserialise(data: bytes | memoryview, msgtype: str, types: Typestore | None = None) -> Any:

@@ -126,7 +126,7 @@ def keep_out_of(message: Any) -> KeepOut:
         float(message.existence_probability),
         float(message.unseen),
         float(message.probability),
-        str(getattr(message, 'reason', '')),
+        str(message.reason),
     )
 
 

@@ -174,12 +174,10 @@ def array_of_all(
 ) -> Array | None:
     """A field (K, *shape) that all components have or none has; None: none.
 
-    An older definition may lack it.
-
     Raises:
         MessageError: some have it and others not, or another number of values.
     """
-    values = [getattr(component, name, ()) for component in components]
+    values = [getattr(component, name) for component in components]
     if not any(len(value) for value in values):
         return None
     for k, value in enumerate(values):
@@ -204,13 +202,11 @@ def lengths_of(message: Any, what: str) -> dict[str, float]:
 def named_numbers(message: Any, names: str, values: str, what: str) -> dict[str, float]:
     """The numbers in a field of a message, by the names in another; empty where it has none.
 
-    Bags older than the fields carry a definition without them: such a message has none, either.
-
     Raises:
         MessageError: a name that is there twice, another number of values than of names.
     """
-    keys = names_of(getattr(message, names, ()), f'{what}: {names}')
-    found = numbers(getattr(message, values, ()), (len(keys),), f'{what}: {values}')
+    keys = names_of(getattr(message, names), f'{what}: {names}')
+    found = numbers(getattr(message, values), (len(keys),), f'{what}: {values}')
     return dict(zip(keys, found.tolist(), strict=True))
 
 

@@ -175,30 +175,6 @@ class RosbagsMessages:
                 values[name] = np.ascontiguousarray(fields[name], dtype=dtype)
         return typestore().types[msgtype](**values)
 
-    def adopt(self, value: Any) -> Any:
-        """A message of an older definition of its type as one of `typestore()`.
-
-        Fields that it does not have are zero or empty.
-
-        Args:
-            value: the message, or the value of one of its fields.
-
-        Raises:
-            TypeError: a field that the type of `typestore()` does not have.
-        """
-        if isinstance(value, list):
-            return [self.adopt(item) for item in value]
-        msgtype = getattr(value, '__msgtype__', None)
-        if msgtype is None or isinstance(value, typestore().types[msgtype]):
-            return value
-        # Beside the fields it has constants, in capital letters, and the name of its type.
-        fields = {
-            name: self.adopt(x)
-            for name, x in vars(value).items()
-            if name.islower() and name[0] != '_'
-        }
-        return self.create(msgtype, **fields)
-
     def points(self, positions: NDArray[np.float64]) -> list[Any]:
         """See `MessageFactory.points`."""
         point = typestore().types[_POINT]

@@ -83,8 +83,8 @@ class PoseMixture:
         stamp_ns: of the image.
         frame_id: optical frame of the camera.
         segment_lengths: m, by name: the person's body is the model at these lengths. Empty:
-            unknown, as in messages of other publishers and in bags older than this field; the
-            body is then the one of the Body topic, or the model at its own lengths.
+            unknown, as in messages of other publishers; the body is then the one of the Body topic,
+            or the model at its own lengths.
         log_likelihoods: (K,) log p(image | mean) up to a constant; NaN: unknown. None: all unknown.
         degrees_of_freedom: (K,) of Student components; 0: Gaussian. None: all Gaussian.
         state: of the track, see `TrackState`.
@@ -93,19 +93,18 @@ class PoseMixture:
             on; 0: no identity. None: all without.
         joint_covariances: (K, J, 3, 3) m^2, of the joint positions; None: unknown.
         joint_covariances_relative: (K, J, 3, 3) m^2, of the joint positions relative to the first
-            joint, whose own are 0; None: unknown, as in bags older than this field.
+            joint, whose own are 0; None: unknown.
         joint_velocities: (K, J, 3) m/s, in the frame of the header; None: unknown.
         existence_probability: that a person is in view, given all images so far; NaN: unknown, as
-            in messages of other publishers and in bags older than this field.
+            in messages of other publishers.
         cue_probabilities: that each cue of the images shows the person, by the name of the cue; of
             the name 'track', that some component is about where the person is. Empty: unknown, as
-            in all but posteriors of the filter and in bags older than this field.
+            in all but posteriors of the filter.
         error_share: share of the evidence of one image that is independent, in (0, 1], beside a
-            likelihood; NaN: unknown, as in bags older than this field.
+            likelihood; NaN: unknown.
         error_time: time for which errors last, s; NaN: unknown.
         shape_covariance: (d, d) of the errors shared by poses of all images, as the lengths and
-            the flesh of the person are not known exactly, beside a likelihood; None: unknown, as in
-            bags older than this field.
+            the flesh of the person are not known exactly, beside a likelihood; None: unknown.
         reason: what is missing where the pose is not known; '' where nothing is.
 
     Raises:
@@ -421,28 +420,25 @@ def pose_mixture_of(
         ),
         cue_probabilities=named_numbers(message, 'cue_names', 'cue_probabilities', 'mixture'),
         shape_covariance=_shape_covariance(message, d),
-        reason=str(getattr(message, 'reason', '')),
+        reason=str(message.reason),
         **_errors(message),
     )
 
 
 def _existence(message: Any, state: TrackState) -> float:
-    """The probability of existence; NaN where a publisher or an older definition lacks it."""
-    value = float(getattr(message, 'existence_probability', math.nan))
-    # ROS sets a field to 0 that a publisher leaves alone.
+    """The probability of existence; NaN where a publisher leaves it alone, and so 0."""
+    value = float(message.existence_probability)
     return math.nan if state is TrackState.UNKNOWN and value == 0.0 else value
 
 
 def _errors(message: Any) -> dict[str, float]:
-    """The error model; NaN where a publisher or an older definition lacks it."""
-    share = float(getattr(message, 'error_share', math.nan))
-    if share == 0.0:
-        # ROS sets fields to 0 that a publisher leaves alone.
+    """The error model; none where a publisher leaves it alone, and so 0."""
+    if message.error_share == 0.0:
         return {}
-    return {'error_share': share, 'error_time': float(getattr(message, 'error_time', math.nan))}
+    return {'error_share': float(message.error_share), 'error_time': float(message.error_time)}
 
 
 def _shape_covariance(message: Any, d: int) -> Array | None:
-    """The field (d, d); None where a publisher or an older definition lacks it."""
-    values = getattr(message, 'shape_covariance', ())
+    """The field (d, d); None where it is empty."""
+    values = message.shape_covariance
     return numbers(values, (d, d), 'mixture: shape_covariance') if len(values) else None

@@ -52,7 +52,7 @@ class TrajectoryMixture:
         joint_names: (J,) order of the joints.
         joint_positions: (M, T, J, 3) m, at the means; None: not computed.
         identities: (M,) of the motions, which last within a track, from 1 on; 0: no identity. None:
-            all without, as in bags older than this field.
+            all without.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -182,5 +182,5 @@ def trajectory_mixture_of(
         joint_positions=array_of_all(
             components, 'joint_positions', (t, len(joints), 3), 'trajectories'
         ),
-        identities=np.array([getattr(component, 'id', 0) for component in components]),
+        identities=np.array([component.id for component in components]),
     )

@@ -40,8 +40,7 @@ def test_unknown_commands_are_one_line(arguments, message, capsys):
 @pytest.mark.parametrize(
     'command',
     [
-        'track-video', 'import-video', 'lift', 'subject', 'replay', 'recover', 'report', 'export',
-        'evaluate',
+        'track-video', 'import-video', 'lift', 'replay', 'report', 'export', 'evaluate',
     ],
 )  # fmt: skip
 def test_commands_explain_themselves(command, capsys):

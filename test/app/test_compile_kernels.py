@@ -9,7 +9,6 @@ import pytest
 from numba import njit
 
 from hmt_ros.app import main
-from hmt_ros.app.progress import ProgressLines
 from hmt_ros.compiled_code import CompiledFunctions, folder_in_use
 
 
@@ -29,19 +28,11 @@ def test_compiled_functions_are_counted():
     assert compiled.count == 2
 
 
-def test_progress_tells_that_kernels_are_compiled(monkeypatch):
-    monkeypatch.setattr('hmt_ros.app.progress.compiling', lambda: True)
-    line = ProgressLines('out', 'images', 60.0).line()
-    assert line.startswith('0 of 60 images')
-    assert line.endswith('compiling kernels, once')
-    monkeypatch.setattr('hmt_ros.app.progress.compiling', lambda: False)
-    assert 'compiling' not in ProgressLines('out', 'images', 60.0).line()
-
-
 def test_commands_without_kernels_do_not_load_numba_for_their_progress():
     code = (
-        'import sys; from hmt_ros.app.progress import ProgressLines\n'
-        "with ProgressLines('out', 'messages') as bar: bar.line()\n"
+        'import sys; from hmt_ros.app import progress\n'
+        'progress.INTERVAL = 1e-3\n'
+        "with progress.show_progress('out', 'messages') as bar: bar.update()\n"
         "sys.exit('numba' in sys.modules)"
     )
     assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0

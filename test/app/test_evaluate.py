@@ -135,7 +135,7 @@ def test_progress_leaves_stdout_to_the_numbers(capsys, bag, truth_file, monkeypa
     monkeypatch.setattr(progress, 'INTERVAL', 1e-4)
     code, out, errors = run(capsys, bag, '--truth', truth_file, '--json')
     assert (code, json.loads(out)) == (0, wanted)
-    assert errors[-1].startswith(f'evaluate: {FRAMES + 1} messages in ')
+    assert errors[-1].startswith(f'evaluate: 100% {FRAMES + 1}/{FRAMES + 1} [')
     assert run(capsys, bag, '--truth', truth_file, '--json', '--quiet') == (0, out, [])
 
 

@@ -50,7 +50,7 @@ def messages() -> RosbagsMessages:
 
 @pytest.fixture(scope='session')
 def read() -> Read:
-    """Reads all of a bag: (time, topic, bytes) of what came, and the error that ended it."""
+    """Reads all of a bag: (time, topic, bytes) of what came, and the error or cut that ended it."""
 
     def read_bag(path: Path) -> tuple[list[tuple[int, str, bytes]], str | None]:
         found = []
@@ -61,7 +61,7 @@ def read() -> Read:
                     assert stored.message is not None
         except BagError as error:
             return found, str(error)
-        return found, None
+        return found, 'breaks off' if bag.cut_off else None
 
     return read_bag
 

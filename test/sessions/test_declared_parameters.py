@@ -220,15 +220,12 @@ def test_defaults_lie_between_limits(settings):
     [
         ({'max_hypotheses': 0}, 'max_hypotheses must lie between 1 and 64, saw 0'),
         ({'evaluation_budget': 0}, 'evaluation_budget must lie between 1 and 100000, saw 0'),
-        ({'proposals': 'css'}, 'proposals was removed: kinematic jumps; programs set it'),
         ({'likelihood.edges.wieght': 2.0}, 'is likelihood.edges.weight meant'),
-        ({'absence_time': 0.5}, 'absence_time was removed: existence is a probability with rates'),
         ({'surprise': 2.0}, 'there is no parameter surprise'),
         ({'background.method': 'guess'}, "saw 'guess'"),
         ({'image_transport': 'theora'}, "image_transport must be one of .* saw 'theora'"),
         ({'body_model': ''}, 'body_model must be a name or a file'),
         ({'camera_height': -1.0}, 'camera_height must lie between 0 and 100'),
-        ({'jump_probability': 0.1}, 'jump_probability was removed: a jump costs'),
     ],
 )
 def test_wrong_parameters_of_the_node(values, message):

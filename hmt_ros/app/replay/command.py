@@ -93,7 +93,7 @@ def _parser() -> CommandParser:
         '--keep-going',
         action='store_true',
         help='skip unusable messages, with a warning for the first of each kind of fault, and read '
-        'a damaged bag as far as possible (default: stop there)',
+        'a damaged bag up to its damage (default: stop there)',
     )
     parser.add_argument(
         '--people',

@@ -19,7 +19,7 @@ from hmt_ros.sessions.image_inputs import (
 )
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools import BagError, BagMessage, BagReader, RosbagsMessages, Topic
-from msg_tools.bags.contents import absolute_name
+from msg_tools.bags.bag_metadata import absolute_name
 from msg_tools.bags.video_messages import VIDEO_TYPE, image_stamp, is_video, with_pictures
 from msg_tools.messages.camera_info import camera_from_info, camera_info_message
 from msg_tools.messages.headers import time_message, time_ns
@@ -275,7 +275,7 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
     beside = _named(bag, f'{namespace}/camera_info'.lstrip('/'), kinds)
     if beside is not None:
         return beside
-    if bag.damage is None and not _with_messages(bag, kinds):
+    if not _with_messages(bag, kinds):
         raise BagError(
             f'{bag.path} has images on {image.name}, but no camera_info: without the calibration '
             'of the camera images do not determine positions in space'

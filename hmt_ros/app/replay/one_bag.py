@@ -27,7 +27,7 @@ from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
-from msg_tools.bags.contents import absolute_name
+from msg_tools.bags.bag_metadata import absolute_name
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import ImageError, decode_image, image_message
 
@@ -71,8 +71,6 @@ def replay_bag(
     if target.exists() and target.resolve() in (source.resolve(), source.resolve().parent):
         raise ValueError(f'{target} is the bag that is read; give another name')
     with BagReader(source) as bag:
-        if not options.keep_going:
-            bag.raise_damage()
         recorded = options.recorded(bag)
         recorded.check_stamps(bag)
         recorded = fitted(bag, recorded, tell)

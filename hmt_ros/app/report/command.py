@@ -119,8 +119,6 @@ def write_report(options: ReportOptions) -> tuple[Content, str]:
         ValueError, OSError: bad input; one line that explains it.
     """
     _FOLDER.check_place(options.output, overwrite=options.overwrite)
-    with BagReader(options.bag) as bag:
-        bag.raise_damage()
     source = image_source(
         options.bag, options.images, options.image_topic, options.camera_info_topic
     )

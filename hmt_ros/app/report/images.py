@@ -82,7 +82,6 @@ def image_source(
     """
     path = out if images is None else images
     with BagReader(path) as bag:
-        bag.raise_damage()
         if images is None and image_topic is None:
             found = [
                 topic.name

@@ -275,7 +275,7 @@ def read_mixtures(
         names = chosen_topics(bag, topics)
         every = bag.messages(filter(None, [topic_beside(bag, KEEP_OUT, names[0])]))
         told = (x.message for x in every if x.message.state != KeepOutState.STALE)
-        answered = {time_ns(x.header.stamp): str(getattr(x, 'reason', '')) for x in told}
+        answered = {time_ns(x.header.stamp): str(x.reason) for x in told}
         bodies = RecordedBodies(body_model)
         for stored in bag.messages([*body_topics(bag), *names]):
             if stored.msgtype == BODY:

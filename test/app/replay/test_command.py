@@ -25,7 +25,7 @@ from hmt_ros.tracking import Status
 from hmt_ros.tracking.ground import Ground
 from hmt_ros.tracking.validity import Validity
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
-from msg_tools.bags.contents import absolute_name
+from msg_tools.bags.bag_metadata import absolute_name
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.camera_info import camera_from_info, camera_info_message
 from msg_tools.messages.headers import header_message, time_message, time_ns

@@ -42,7 +42,7 @@ def recorded(images):
     """(topic, log time, message) of the first images of a bag, with all that goes with them."""
     found = []
     with BagReader(REACH) as bag:
-        first = bag.start_ns
+        first = next(bag.messages(['image/compressed'])).log_time_ns
         for stored in bag.messages(['image/compressed', 'camera_info', 'ground_truth']):
             if stored.log_time_ns - first >= images * 10**9 // 15:
                 break

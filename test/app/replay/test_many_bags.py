@@ -101,10 +101,10 @@ def test_progress_of_all_and_of_each(archive, tracked, tmp_path, monkeypatch, ca
         f'{out}: 2 replayed, 0 done before, 0 failed',
     ]
     lines = streams.err.splitlines()
-    assert f'{out}: 0 of 2 bags, 00:00 so far' in lines
-    assert lines[-1].startswith(f'{out}: 2 bags in ')
+    assert any(line.startswith(f'{out}:   0% 0/2 [00:00<?, ') for line in lines)
+    assert lines[-1].startswith(f'{out}: 100% 2/2 [')
     for name in ('a', 'day/b'):
-        assert any(line.startswith(f'{out / name}: 2 images in ') for line in lines)
+        assert any(line.startswith(f'{out / name}: 100% 2/2 [') for line in lines)
 
 
 def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkeypatch, capsys):

@@ -8,7 +8,7 @@ from hmt_ros.app.replay.inputs import recorded_input, upright_frame
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.sessions.camera_frames import UP_SIGMA
 from msg_tools import BagReader, RosbagsMessages
-from msg_tools.bags.contents import absolute_name
+from msg_tools.bags.bag_metadata import absolute_name
 from msg_tools.messages.ground import ground_of
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.states import transforms_message

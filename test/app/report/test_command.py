@@ -456,12 +456,9 @@ def test_bags_that_can_not_be_shown(made, tmp_path, capsys):
     assert 'has no pose mixtures' in fails(tmp_path, capsys, made.images)
     line = fails(tmp_path, capsys, made.out, '--topic', 'body')
     assert 'has no mixtures' in line
-    content = (made.out / 'out.mcap').read_bytes()
-    cut = tmp_path / 'cut.mcap'
-    cut.write_bytes(content[: len(content) // 2])
-    assert str(cut) in fails(tmp_path, capsys, cut)
-    cut.write_bytes(b'')
-    assert str(cut) in fails(tmp_path, capsys, cut)
+    empty = tmp_path / 'empty.mcap'
+    empty.write_bytes(b'')
+    assert str(empty) in fails(tmp_path, capsys, empty)
     line = fails(tmp_path, capsys, made.out, '--images', made.out)
     assert 'no topic of type' in line
 
@@ -501,9 +498,6 @@ def test_images_that_do_not_fit(made, tmp_path, capsys):
     other = write_images(tmp_path / 'other', [stamp + 1 for stamp in STAMPS])
     line = fails(tmp_path, capsys, made.out, '--images', other)
     assert 'is this the bag that was tracked?' in line
-    cut = tmp_path / 'cut.mcap'
-    cut.write_bytes((made.images / 'in.mcap').read_bytes()[:-200])
-    assert str(cut) in fails(tmp_path, capsys, made.out, '--images', cut)
 
 
 @pytest.mark.usefixtures('no_pictures')

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from msg_tools import MessageError, RosbagsMessages, typestore
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.cdr import deserialise, serialise
 from msg_tools.messages.message_error import MessageFault
-from msg_tools.messages.message_types import typestore_of_definition
 from msg_tools.messages.pose_mixtures import (
     POSE_MIXTURE,
     MixtureKind,
@@ -86,56 +84,6 @@ def test_nobody(messages: RosbagsMessages) -> None:
     assert caught.value.fault is MessageFault.NO_COMPONENTS
 
 
-def test_messages_older_than_the_lengths(
-    pose_mixture: PoseMixture, messages: RosbagsMessages
-) -> None:
-    """A bag carries its own definition, which has no such fields."""
-    store = typestore()
-    definition, _ = store.generate_msgdef(POSE_MIXTURE, ros_version=2)
-    fields = ('string[] segment_names\n', 'float64[] segment_lengths\n', 'string reason\n')
-    assert all(field in definition for field in fields)
-    for field in fields:
-        definition = definition.replace(field, '', 1)
-    old = typestore_of_definition(POSE_MIXTURE, 'ros2msg', definition)
-    message = pose_mixture_message(messages, replace(pose_mixture, segment_lengths={}))
-    # The fields are the last of the message: two counts of zero, and an empty string.
-    data = serialise(message)
-    empty = bytes(8) + b'\x01\0\0\0\0'
-    assert data.endswith(empty)
-    old_data = data[: -len(empty)]
-    back = pose_mixture_of(deserialise(old_data, POSE_MIXTURE, old))
-    assert (back.segment_lengths, back.reason) == ({}, '')
-    np.testing.assert_array_equal(back.weights, [0.5, 0.3, 0.2])
-    # Written again it is of the present definition.
-    assert serialise(deserialise(old_data, POSE_MIXTURE, old)) == data
-
-
-def test_bags_from_before_error_model_and_relative_covariances(
-    pose_mixture: PoseMixture, messages: RosbagsMessages
-) -> None:
-    """Messages whose definition lacks the fields are read as if nothing was known of them."""
-    told = replace(pose_mixture, error_share=0.5, error_time=0.125)
-    message = pose_mixture_message(messages, told)
-    store = typestore()
-    definition, _ = store.generate_msgdef(POSE_MIXTURE, ros_version=2)
-    fields = (
-        'float64 error_share\n', 'float64 error_time\n', 'float64[] joint_covariances_relative\n',
-    )  # fmt: skip
-    assert all(definition.count(field) == 1 for field in fields)
-    for field in fields:
-        definition = definition.replace(field, '')
-    old = typestore_of_definition(POSE_MIXTURE, 'ros2msg', definition)
-    data = bytes(old.serialize_cdr(message, POSE_MIXTURE))
-    assert len(data) < len(serialise(message))
-    back = pose_mixture_of(deserialise(data, POSE_MIXTURE, old))
-    assert math.isnan(back.error_share)
-    assert math.isnan(back.error_time)
-    assert back.joint_covariances_relative is None
-    now = pose_mixture_of(message)
-    for name in ('weights', 'means', 'joint_covariances', 'joint_velocities', 'identities'):
-        np.testing.assert_array_equal(getattr(back, name), getattr(now, name))
-
-
 def test_error_model(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
     """Both are unknown where a publisher leaves them alone."""
     told = replace(pose_mixture, error_share=0.5, error_time=0.0)
@@ -201,7 +149,7 @@ def test_messages_measure_root_angles_against_the_camera() -> None:
 
 
 def test_probability_of_existence(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
-    """NaN where it is unknown: in older bags, and of publishers that leave the field alone."""
+    """NaN where it is unknown, as of publishers that leave the field alone."""
     content = replace(pose_mixture, state=TrackState.LOST, existence_probability=0.25)
     message = pose_mixture_message(messages, content)
     assert pose_mixture_of(message).existence_probability == 0.25
@@ -213,16 +161,13 @@ def test_probability_of_existence(pose_mixture: PoseMixture, messages: RosbagsMe
     assert math.isnan(pose_mixture_of(alone).existence_probability)
     nobody = replace(pose_mixture, state=TrackState.NOBODY, existence_probability=0.0)
     assert pose_mixture_of(pose_mixture_message(messages, nobody)).existence_probability == 0.0
-    # Bags carry their own definition: a message of an older one has no such field.
-    kept = {x: getattr(message, x) for x in vars(message) if x != 'existence_probability'}
-    assert math.isnan(pose_mixture_of(SimpleNamespace(**kept)).existence_probability)
     for wrong in (-0.1, 1.1, math.inf):
         with pytest.raises(MessageError, match=r'existence_probability must lie in \[0, 1\]'):
             replace(pose_mixture, existence_probability=wrong)
 
 
 def test_probabilities_of_cues(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
-    """By name, in their order; empty where they are unknown, as in older bags."""
+    """By name, in their order; empty where they are unknown."""
     told = {'silhouette': 0.25, 'keypoints/legs': 0.0, 'track': 1.0}
     message = pose_mixture_message(messages, replace(pose_mixture, cue_probabilities=told))
     back = pose_mixture_of(deserialise(serialise(message), POSE_MIXTURE))
@@ -233,18 +178,6 @@ def test_probabilities_of_cues(pose_mixture: PoseMixture, messages: RosbagsMessa
         error = r"cue_probabilities of 'track' must lie in \[0, 1\], saw"
         with pytest.raises(MessageError, match=error):
             replace(pose_mixture, cue_probabilities={'depth': 0.5, 'track': wrong})
-    # A bag carries its own definition: a message of an older one has no such fields.
-    store = typestore()
-    definition, _ = store.generate_msgdef(POSE_MIXTURE, ros_version=2)
-    for field in ('string[] cue_names\n', 'float64[] cue_probabilities\n'):
-        assert definition.count(field) == 1
-        definition = definition.replace(field, '')
-    old = typestore_of_definition(POSE_MIXTURE, 'ros2msg', definition)
-    data = bytes(old.serialize_cdr(message, POSE_MIXTURE))
-    assert len(data) < len(serialise(message))
-    older = pose_mixture_of(deserialise(data, POSE_MIXTURE, old))
-    assert older.cue_probabilities == {}
-    np.testing.assert_array_equal(older.means, back.means)
 
 
 def test_whose_poses_they_are() -> None:

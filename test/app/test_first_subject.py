@@ -1,7 +1,9 @@
+"""The start of a track from keypoints, as a subject file."""
+
 import numpy as np
 import pytest
 
-from hmt_ros.app import subject
+from hmt_ros.app.first_subject import WANTED, find_start, subject_text
 from hmt_ros.body import Camera
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -43,9 +45,11 @@ def write_bag(path, found):
     return path
 
 
-def run(bag, *options):
+def started(bag, body):
+    """The subject file of a bag as it is read."""
     file = bag.parent / 'subject.yaml'
-    return subject.main([str(bag), '-o', str(file), '--overwrite', *map(str, options)]), file
+    file.write_text(subject_text(find_start(bag, body), 1.8), 'utf-8')
+    return read_subject(file, body)
 
 
 NOBODY = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
@@ -55,9 +59,7 @@ HIDDEN = {'left_ankle': 0.2, 'right_ankle': 0.2, 'left_knee': 0.2}
 def test_first_image_that_shows_enough(tmp_path, human37):
     found = [NOBODY, person('coco17', HIDDEN), person('coco17', {'left_wrist': 0.4}, shift=3.0)]
     bag = write_bag(tmp_path / 'bag', [*found, person('coco17', {})])
-    code, file = run(bag, '--stature', '1.8')
-    assert code == 0
-    read = read_subject(file, human37)
+    read = started(bag, human37)
     assert read.stamp_ns == START_NS + 2 * STEP
     assert read.stature == 1.8
     names = schemes()['coco17'].names
@@ -68,25 +70,12 @@ def test_first_image_that_shows_enough(tmp_path, human37):
     assert list(read.keypoints.pixels[knee]) == [13.0 + i, 100.0 + 2 * i]
     # 3 % of the height of the person: from the left shoulder (5) to the right ankle (16).
     assert np.allclose(read.keypoints.covariances[0], 2.0**2 * np.eye(2))
-    code, file = run(bag, '--sigma', '7')
-    assert np.allclose(read_subject(file, human37).keypoints.covariances[0], 49 * np.eye(2))
 
 
 def test_image_that_shows_most(tmp_path, human37):
     few = HIDDEN | {'right_knee': 0.0}
     bag = write_bag(tmp_path / 'bag', [person('coco17', few), person('coco17', HIDDEN)] * 2)
-    _, file = run(bag)
-    assert read_subject(file, human37).stamp_ns == START_NS + STEP
-
-
-@pytest.mark.parametrize(
-    ('option', 'index'), [(['--stamp', START_NS + STEP], 1), (['--time', '0.16'], 2)]
-)
-def test_image_may_be_chosen(option, index, tmp_path, human37):
-    bag = write_bag(tmp_path / 'bag', [person('coco17', {})] * 3)
-    code, file = run(bag, *option)
-    assert code == 0
-    assert read_subject(file, human37).stamp_ns == START_NS + index * STEP
+    assert started(bag, human37).stamp_ns == START_NS + STEP
 
 
 @pytest.mark.parametrize(
@@ -100,9 +89,8 @@ def test_image_may_be_chosen(option, index, tmp_path, human37):
 )
 def test_names_of_detectors(scheme, extra, missing, tmp_path, human37):
     bag = write_bag(tmp_path / 'bag', [person(scheme, {})])
-    _, file = run(bag)
-    read = read_subject(file, human37).keypoints
-    assert {*subject.WANTED} | extra <= {*read.names}
+    read = started(bag, human37).keypoints
+    assert {*WANTED} | extra <= {*read.names}
     assert not missing & {*read.names}
     names = schemes()[scheme].names
     if scheme == 'mediapipe33':
@@ -115,31 +103,12 @@ def test_names_of_detectors(scheme, extra, missing, tmp_path, human37):
 
 
 @pytest.mark.parametrize(
-    ('found', 'options', 'message'),
+    ('found', 'message'),
     [
-        ([None], [], 'has no keypoints: import them with the video'),
-        ([NOBODY] * 2, [], '0 joints of human37 are seen with confidence in each image, wanted 4'),
-        ([NOBODY, 'all'], ['--time', '0'], f'are seen with confidence at {START_NS} ns'),
-        (['all'], ['--stamp', '5'], f'no keypoints at 5 ns, the nearest are at {START_NS} ns'),
-        (['all'], ['--stamp', '5', '--time', '1'], 'not allowed with argument'),
-        (['all'], ['--body', 'nobody'], "no body 'nobody'"),
+        ([None], 'has no keypoints: import them with the video'),
+        ([NOBODY] * 2, '0 joints of human37 are seen with confidence in each image, wanted 4'),
     ],
-)  # fmt: skip
-def test_bad_input_is_one_line(found, options, message, tmp_path, capsys):
-    everything = person('coco17', {})
-    bag = write_bag(tmp_path / 'bag', [everything if x == 'all' else x for x in found])
-    code, file = run(bag, *options)
-    assert code == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith('subject: ')
-    assert message in line
-    assert not file.exists()
-
-
-def test_nothing_is_replaced_unasked(tmp_path, capsys):
-    bag = write_bag(tmp_path / 'bag', [person('coco17', {})])
-    file = tmp_path / 'subject.yaml'
-    file.write_text('mine', 'utf-8')
-    assert subject.main([str(bag), '-o', str(file)]) == 1
-    assert 'exists; give another name, or --overwrite' in capsys.readouterr().err
-    assert file.read_text('utf-8') == 'mine'
+)
+def test_nothing_to_start_from(found, message, tmp_path, human37):
+    with pytest.raises(ValueError, match=message):
+        find_start(write_bag(tmp_path / 'bag', found), human37)

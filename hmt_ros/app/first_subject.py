@@ -1,0 +1,127 @@
+"""The start of a track from the keypoints of a detector in one image of a bag, as a subject file.
+
+The schemes of keypoints say at which joint a landmark lies (`hmt_ros.image.keypoint_schemes`).
+Eyes, ears and nose are left out: they do not lie at a joint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hmt_ros.app.replay.inputs import recorded_input
+from hmt_ros.body import Body
+from hmt_ros.image.keypoint_schemes import landmarks_of
+from hmt_ros.image.terms.keypoints import Keypoints
+from msg_tools import BagReader
+from msg_tools.messages.detections import NO_KEYPOINTS
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.keypoints import keypoints_of
+
+# Joints that an image to start from shows, and how many of them.
+WANTED = tuple(
+    f'{side}_{joint}'
+    for joint in ('hip', 'shoulder', 'knee', 'ankle', 'elbow', 'wrist')
+    for side in ('left', 'right')
+)
+ENOUGH = 10
+FEWEST = 4  # that a subject file may have
+CONFIDENT = 0.5
+# The landmark of a head that lies at its joint.
+_CENTRE_OF_HEAD = 'centre_of_head'
+# Standard deviation of a keypoint, in sizes of the person in the image, and at least, px.
+SIGMA, LEAST_SIGMA = 0.03, 2.0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Joints in an image.
+
+    Attributes:
+        stamp_ns: of the image.
+        joints: under the names of the body, those that were seen with confidence.
+    """
+
+    stamp_ns: int
+    joints: Keypoints
+
+    @property
+    def count(self) -> int:
+        """Number of the wanted joints among them."""
+        return len({*self.joints.names} & {*WANTED})
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether a track can start well from them."""
+        return self.count >= ENOUGH and {*WANTED[:4]} <= {*self.joints.names}
+
+
+def find_start(path: Path, body: Body) -> Seen:
+    """The joints in the image of a bag that a track starts from.
+
+    That is the first image that shows `ENOUGH` of the `WANTED` joints with confidence, all hips and
+    shoulders among them; else the image that shows most of them.
+
+    Raises:
+        ValueError: the bag has no keypoints, or too few in each image.
+    """
+    best: Seen | None = None
+    with BagReader(path) as bag:
+        topic = recorded_input(bag).of('keypoints')
+        if topic is None:
+            raise ValueError(f'{path} has no keypoints: import them with the video')
+        for stored in bag.messages([topic.name]):
+            stamp = time_ns(stored.message.header.stamp)
+            seen = Seen(stamp, joints_of(keypoints_of(stored.message, LEAST_SIGMA), body))
+            if best is None or seen.count > best.count:
+                best = seen
+                if seen.is_enough:
+                    break
+    count = 0 if best is None else len(best.joints.names)
+    if best is None or count < FEWEST:
+        raise ValueError(
+            f'{path}: {count} joints of {body.name} are seen with confidence in each image, wanted '
+            f'{FEWEST} at least'
+        )
+    return best
+
+
+def joints_of(keypoints: Keypoints, body: Body) -> Keypoints:
+    """The joints of a body at which confident landmarks lie, under the names of the body.
+
+    A landmark that has the name of the joint stands for it; if the detector has none of that name,
+    the mean of those at the joint does, as of the fingers for the hand.
+    """
+    names, known = keypoints.names, body.joint_names
+    sure = keypoints.seen & (keypoints.confidences >= CONFIDENT)
+    places: dict[str, list[int]] = {}
+    for i, mark in enumerate(landmarks_of(names, known)):
+        joint = names[i] if mark is None else mark.joint
+        stands_for_it = names[i] == joint or joint not in names
+        beside_it = mark is not None and joint == 'head' and mark.name != _CENTRE_OF_HEAD
+        if sure[i] and joint in known and stands_for_it and not beside_it:
+            places.setdefault(joint, []).append(i)
+    if not places:
+        return NO_KEYPOINTS
+    pixels = np.array([keypoints.pixels[i].mean(0) for i in places.values()])
+    covariances = np.array([keypoints.covariances[i].mean(0) for i in places.values()])
+    confidences = np.array([keypoints.confidences[i].mean() for i in places.values()])
+    return Keypoints(tuple(places), pixels, covariances, confidences)
+
+
+def subject_text(seen: Seen, stature: float) -> str:
+    """The subject file of a person of some stature, m."""
+    pixels = seen.joints.pixels
+    sigma = max(SIGMA * float(np.ptp(pixels, axis=0).max()), LEAST_SIGMA)
+    lines = [
+        '# joints in one image, as a detector found them',
+        f'stamp_ns: {seen.stamp_ns}',
+        f'sigma_px: {sigma:.1f}',
+        "keypoints:  # name: [u, v] in pixels; left and right are the person's own",
+    ]
+    for name, (u, v) in zip(seen.joints.names, pixels, strict=True):
+        lines.append(f'  {name}: [{u:.1f}, {v:.1f}]')
+    lines.append(f'stature_m: {stature:g}')
+    return '\n'.join(lines) + '\n'
