@@ -8,11 +8,11 @@ import pytest
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.ground_terms import GroundSettings
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.silhouettes import Silhouettes
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_frames, render_silhouettes
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Status, Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.silhouettes import Silhouettes
 from test.tracking.test_tracker import best_error, in_bytes
 
 FRAME = 100_000_000
