@@ -22,20 +22,18 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from hmt_ros.image.person_shape import fill_hull
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.error_model import seconds
+from hmt_ros.tracking.settings import (
+    ASSOCIATION_GATE,
+    EXPECTED_TIME,
+    LIMB_MARGIN,
+    VELOCITY_TIME,
+)
 
-# Cost below which a pair is possible from one image to the next, in sizes of the person; it doubles
-# within `GOES_ON`.
-GATE = 0.4
-# Time for which a person is taken to go on as before, and to keep the size though less is seen now,
-# s, and the time constant of the velocity.
-GOES_ON = 1.0
-MEMORY = 0.25
-# Margin around the area of a person, or around the hull of keypoints, that is masked for others, as
-# a fraction of the height: the radius of a limb.
-MARGIN = 0.05
+GATE = ASSOCIATION_GATE
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +98,14 @@ class ImageTrack:
         moved = np.median(self.sighting.shifts_to(sighting), axis=0)
         self._known_for += dt
         # At first the mean over all sightings, later that over the last moments.
-        gain = min(dt / min(self._known_for, MEMORY), 1.0)
+        gain = min(dt / min(self._known_for, VELOCITY_TIME), 1.0)
         self.velocity += gain * (moved / dt - self.velocity)
-        self.size = max(sighting.size, self.size * math.exp(-dt / GOES_ON))
+        self.size = max(sighting.size, self.size * math.exp(-dt / EXPECTED_TIME))
         self.sighting, self.stamp = sighting, stamp
 
     def shift(self, stamp: int) -> Array:
         """Way (2,) that the person is expected to have moved since then, px."""
-        dt = min(seconds(stamp - self.stamp), GOES_ON)
+        dt = min(seconds(stamp - self.stamp), EXPECTED_TIME)
         return np.asarray(dt * self.velocity)
 
     def cost(self, sighting: Sighting, stamp: int) -> float:
@@ -117,7 +115,7 @@ class ImageTrack:
 
     def gate(self, stamp: int) -> float:
         """Cost from which a sighting is of somebody else."""
-        return GATE * (1.0 + min(seconds(stamp - self.stamp) / GOES_ON, 1.0))
+        return ASSOCIATION_GATE * (1.0 + min(seconds(stamp - self.stamp) / EXPECTED_TIME, 1.0))
 
 
 def assigned(
@@ -158,17 +156,15 @@ def hull(sighting: Sighting, shape: tuple[int, ...]) -> Mask:
     if len(joints) < 3:
         (left, top), (right, bottom) = sighting.corners.tolist()
         joints = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
-    limit = 4.0 * max(shape)
-    points = np.clip(joints, -limit, limit).round().astype(np.int32)
     mask = np.zeros(shape[:2], dtype=np.uint8)
-    cv2.fillConvexPoly(mask, cv2.convexHull(points), 1)
+    fill_hull(mask, joints)
     return grown(mask.view(np.bool_))
 
 
 def grown(area: Mask) -> Mask:
     """An area (H, W) with a margin."""
     pixels = area.view(np.uint8)
-    size = max(round(MARGIN * cv2.boundingRect(pixels)[3]), 1)
+    size = max(round(LIMB_MARGIN * cv2.boundingRect(pixels)[3]), 1)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
     return np.asarray(cv2.dilate(pixels, kernel), dtype=np.uint8) > 0
 

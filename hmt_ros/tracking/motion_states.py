@@ -18,9 +18,7 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-
-# Variance of a pose that may be anywhere, as it jumped, rad^2 or m^2.
-ANYWHERE = 1e6
+from hmt_ros.tracking.settings import UNKNOWN_VARIANCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +86,7 @@ class PredictedStates:
         predicted = self.covariances[ancestors]
         known = predicted[:, :d, :d].copy()
         diagonal = np.arange(d)
-        known[:, diagonal, diagonal] += np.where(jumped, ANYWHERE, 0.0)
+        known[:, diagonal, diagonal] += np.where(jumped, UNKNOWN_VARIANCE, 0.0)
         cross = predicted[:, :d, d:]
         gain = np.linalg.solve(known, cross).swapaxes(1, 2)
         offset = poses - self.means[ancestors, :d]

@@ -12,13 +12,13 @@ from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import observe
+from hmt_ros.image.subject import Subject
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.tracking.initialisation import (
     poses_from_keypoints,
     poses_from_outline,
     start_from_keypoints,
 )
-from hmt_ros.tracking.subject import Subject
 
 
 @pytest.fixture(scope='module')

@@ -15,7 +15,7 @@ from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.shape import ShapeSpace
+from hmt_ros.body.shape import GROWTH_SIGMAS, MIN_LENGTH_SIGMA, ShapeSpace
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.image_term import TermSettings
@@ -23,15 +23,8 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.posterior import WIDEST, Posterior
-from hmt_ros.tracking.shape_estimation import (
-    LARGEST,
-    LARGEST_SHIFT,
-    LARGEST_STEP,
-    LEAST_LENGTH_SIGMA,
-    SPREAD,
-    Linearised,
-    ShapeEstimate,
-)
+from hmt_ros.tracking.settings import MAX_ANGLE_SHIFT, MAX_SHAPE_CHANGE, MAX_SHAPE_STEP
+from hmt_ros.tracking.shape_estimation import Linearised, ShapeEstimate
 
 VIEW = Viewpoint(distance=3.2)
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
@@ -199,20 +192,20 @@ def test_steps_and_shapes_have_limits(human37):
     estimate.measured = 1e3 * estimate.measured
     spread = np.sqrt(np.diagonal(estimate.covariance))
     update(estimate, np.zeros(human37.dimension))
-    assert np.abs(estimate.theta() / spread).max() == pytest.approx(LARGEST_STEP)
+    assert np.abs(estimate.theta() / spread).max() == pytest.approx(MAX_SHAPE_STEP)
     for _ in range(30):
         update(estimate, np.zeros(human37.dimension))
     furthest = np.abs(estimate.theta() / spread)
-    assert furthest.max() == pytest.approx(LARGEST)
+    assert furthest.max() == pytest.approx(MAX_SHAPE_CHANGE)
     assert all(min(part.radii) > 0 for part in estimate.body.flesh.parts)
 
 
 def test_what_people_differ_by_is_where_an_estimate_begins(human37):
     known = replace(human37, length_covariance=np.zeros_like(human37.length_covariance))
     deviations = ShapeEstimate(known).deviations
-    assert deviations['thigh'] == (0.0, pytest.approx(LEAST_LENGTH_SIGMA))
-    assert deviations['trunk_depth'] == (0.0, pytest.approx(SPREAD['depth']))
-    assert deviations['foot_end'] == (0.0, pytest.approx(SPREAD['end']))
+    assert deviations['thigh'] == (0.0, pytest.approx(MIN_LENGTH_SIGMA))
+    assert deviations['trunk_depth'] == (0.0, pytest.approx(GROWTH_SIGMAS['depth']))
+    assert deviations['foot_end'] == (0.0, pytest.approx(GROWTH_SIGMAS['end']))
 
 
 # What an image says of shape and pose.
@@ -354,7 +347,7 @@ def test_flesh_comes_nearer_to_the_true_one(human37, stout, poses):
     for name in ('trunk_depth', 'thigh_depth', 'shin_depth'):
         moved, sigma = known[name]
         assert 0.1 < moved < 0.35, name
-        assert sigma < 0.7 * SPREAD['depth']
+        assert sigma < 0.7 * GROWTH_SIGMAS['depth']
         assert abs(moved - 0.25) < 2 * sigma, name
     assert 0 < known['thigh_width'][0] < known['thigh_depth'][0]
     assert known['thigh_width'][1] > known['thigh_depth'][1]
@@ -427,13 +420,13 @@ def test_keypoints_tell_nothing_of_the_size(human37, poses):
     whole = covariance @ gradient
     turns = human37.skeleton.dof_is_rotation
     shift = estimate._limited(whole, covariance)
-    assert np.abs(whole[turns]).max() > LARGEST_SHIFT
-    assert np.abs(shift[turns]).max() == pytest.approx(LARGEST_SHIFT)
+    assert np.abs(whole[turns]).max() > MAX_ANGLE_SHIFT
+    assert np.abs(shift[turns]).max() == pytest.approx(MAX_ANGLE_SHIFT)
     lengths = human37.skeleton.lengths
     size = len(lengths)
     free, limited = (linear.by_shape - linear.mixed @ x for x in (whole, shift))
     scale = float(np.abs(linear.by_shape[:size] * lengths).sum())
     assert abs(free[:size] @ lengths) < 5e-4 * scale
     assert abs(limited[:size] @ lengths) < 5e-4 * scale
-    held = whole * (LARGEST_SHIFT / np.abs(whole).max())
+    held = whole * (MAX_ANGLE_SHIFT / np.abs(whole).max())
     assert abs((linear.by_shape - linear.mixed @ held)[:size] @ lengths) > 5e-3 * scale

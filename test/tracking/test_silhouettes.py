@@ -12,8 +12,8 @@ from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.ground_terms import GroundSettings
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.silhouettes import Silhouettes
 from hmt_ros.tracking import Status, Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.silhouettes import Silhouettes
 from test.tracking.test_tracker import best_error, in_bytes
 
 FRAME = 100_000_000

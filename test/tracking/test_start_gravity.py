@@ -11,11 +11,11 @@ from hmt_ros.body.camera import Viewpoint, shortest_turn
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_rotations
+from hmt_ros.image.subject import Subject
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.tracking import KnownGround, Tracker, TrackerSettings
 from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.initialisation import start_from_keypoints
-from hmt_ros.tracking.subject import Subject
 
 DOWN = Viewpoint(distance=3.0, height=2.4, pitch=np.radians(31.0))
 UP = DOWN.rotation @ np.array([0.0, 0.0, 1.0])

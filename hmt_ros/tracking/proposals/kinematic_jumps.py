@@ -31,20 +31,17 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Derivatives, Student
 from hmt_ros.inference.error_model import ERRORS
-from hmt_ros.tracking.evaluation_plan import EvaluationPlan
 from hmt_ros.tracking.hypotheses import LIKELY, Hypotheses
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.selection import choose_hypotheses
-
-# Modes have the same trunk when its joints are nowhere further apart, m.
-SAME_TRUNK = 0.06
-# Configurations of a limb are distinct when some joint is further apart, m.
-DISTINCT = 0.08
-# Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
-TAILS = 4.0
-# Factor on the standard deviations of the body's prior where samples are drawn from it.
-WIDE = 1.3
+from hmt_ros.tracking.settings import (
+    LIMB_TAILS,
+    PRIOR_STRETCH,
+    SAME_LIMB_DISTANCE,
+    SAME_TRUNK_DISTANCE,
+    EvaluationPlan,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +97,7 @@ class LimbSearch:
         )
         seen = self._own.seen(observation, explained=others.costs)
         seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
-        motion = Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS)
+        motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
         term = PoseEnergy(self._own, seen, motion, pose, own)
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: plan.refined]]
@@ -116,7 +113,7 @@ class LimbSearch:
         near = noise @ np.linalg.cholesky(block).T
         near[n // 3 :] *= search.stretch
         result = angles + near
-        wide = body.prior_mean[own] + WIDE * body.prior_sigma[own] * noise
+        wide = body.prior_mean[own] + PRIOR_STRETCH * body.prior_sigma[own] * noise
         result[2 * n // 3 :] = wide[2 * n // 3 :]
         result[0] = angles
         return np.clip(result, body.lower[own], body.upper[own])
@@ -153,7 +150,7 @@ class KinematicJumps:
                 if likely
                 else {},
                 price['limb_flip'],
-                apart=DISTINCT,
+                apart=SAME_LIMB_DISTANCE,
                 most=plan.alternatives,
             ).at_most(left)
             alone = products.alone
@@ -205,7 +202,7 @@ class KinematicJumps:
         groups = []
         while left:
             gaps = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1)
-            near = gaps < SAME_TRUNK
+            near = gaps < SAME_TRUNK_DISTANCE
             groups.append(np.array([i for i, ok in zip(left, near) if ok], dtype=np.intp))
             left = [i for i, ok in zip(left, near) if not ok]
         return groups

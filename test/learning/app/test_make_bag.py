@@ -10,8 +10,8 @@ from hmt_learning.app.make_bag import main
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.rasterisation import render_silhouettes
+from hmt_ros.image.subject import read_subject
 from hmt_ros.sessions.transform_buffer import TransformBuffer
-from hmt_ros.tracking.subject import read_subject
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.images import decode_depth, decode_image
