@@ -32,7 +32,7 @@ COMMANDS = {
     ),
     'install-detector': (
         'hmt_ros.app.install_detector',
-        'install MediaPipe Pose, a detector of keypoints',
+        'install a detector of keypoints, MediaPipe Pose',
     ),
     'train': ('hmt_ros.app.train', 'learn a predictor of poses from silhouettes'),
     'learn-prior': (
