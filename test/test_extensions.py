@@ -17,12 +17,11 @@ from hmt_ros.app.import_video import command as import_video
 from hmt_ros.detectors.detector import DetectorKind
 from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.image import background
-from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.background import BackgroundModel, BackgroundSettings
 from hmt_ros.image.pixel_backgrounds import FOREGROUND
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.keypoints_session import KeypointsSession
 from msg_tools import BagReader
@@ -89,8 +88,7 @@ class Bright:
 
 def test_a_background_is_a_file_and_a_line(monkeypatch):
     monkeypatch.setitem(background.BACKGROUNDS, 'bright', Bright)
-    parameters = with_values(FilterParameters(), {'background.method': 'bright'})
-    model = BackgroundModel(parameters.background)
+    model = BackgroundModel(BackgroundSettings(method='bright'))
     image = np.full((48, 64, 3), 90, np.uint8)
     model.learn(image)
     image[10:30, 20:40] = 250
@@ -125,13 +123,12 @@ TRY_TERM = """
 import numpy as np
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import observe
-from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.image.terms.image_term import TermSettings
 
 body, camera = load_body('human32'), Camera(100.0, 100.0, 31.5, 23.5, 64, 48)
-settings = with_values(FilterParameters(), {'likelihood.brightness.weight': 3.0}).tracker.likelihood
+settings = LikelihoodSettings.of_terms(brightness=TermSettings(3.0, 1.0, 1.0))
 poses = np.zeros((2, body.dimension))
 poses[:, 2] = 3.0
 observation = observe(np.full((48, 64, 3), 60, np.uint8))

@@ -60,7 +60,7 @@ class BackgroundSettings:
     """How the background is subtracted.
 
     Attributes:
-        method: Background model; 'mog2' and 'knn' are those of OpenCV.
+        method: Background model of OpenCV, 'mog2' or 'knn'.
         threshold: Squared distance from the background, in its variances, above which a pixel is
             foreground.
         shadow_threshold: Smallest brightness of a shadow, as a fraction of the background's; darker

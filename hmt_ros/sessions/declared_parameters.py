@@ -76,7 +76,7 @@ REMOVED = {
     'hypothesis_merge_distance': f'modes are merged below 20 mm; {_TRACKER}',
     'likelihood.containment.weight': 'the outline of the silhouette says as much: '
     'likelihood.coverage.weight',
-    'likelihood.intensity.weight': 'no term compares the image with the one before',
+    'likelihood.intensity.weight': 'colours of the image before bring nothing (docs/tracking.md)',
     'likelihood.motion.weight': 'predictions follow the optical flow: flow_weight',
     'likelihood.prior_weight': f'the factor 0.5; {_LIKELIHOOD}',
     'likelihood.pose_prior': f'the learned prior, where the body has one; {_LIKELIHOOD}',
