@@ -1,3 +1,4 @@
+import ast
 import os
 import shlex
 import subprocess
@@ -16,6 +17,21 @@ MESSAGES = 'hmt_msgs'
 def files(folder: str, pattern: str) -> list[str]:
     """Files of a folder as setuptools wants them: relative to this file, in a fixed order."""
     return sorted(str(path.relative_to(ROOT)) for path in (ROOT / folder).glob(pattern))
+
+
+def nodes() -> list[str]:
+    """Entry points of the nodes: every file NAME_node.py of hmt_ros/nodes that has a `main`."""
+    paths = (ROOT / PACKAGE / 'nodes').glob('*_node.py')
+    names = sorted(path.stem for path in paths if 'def main(' in path.read_text('utf-8'))
+    return [f'{name} = {PACKAGE}.nodes.{name}:main' for name in names]
+
+
+def commands() -> list[str]:
+    """Entry points of the commands: the table COMMANDS of hmt_ros/app, which is not imported."""
+    module = ast.parse((ROOT / PACKAGE / 'app' / '__init__.py').read_text('utf-8'))
+    assigned = [x for x in module.body if isinstance(x, ast.Assign)]
+    (table,) = (x.value for x in assigned if ast.unparse(x.targets[0]) == 'COMMANDS')
+    return [f'{name} = {found[0]}:main' for name, found in ast.literal_eval(table).items()]
 
 
 # Whether pip builds a wheel, which has the library and the offline commands; colcon builds none.
@@ -221,27 +237,8 @@ setup(
     cmdclass={'install': Install, 'develop': Develop},
     entry_points={
         # "ros2 run" finds each program by its name; pip would put all these names into PATH.
-        'console_scripts': ['hmt_ros = hmt_ros.app:main']
+        'console_scripts': [f'{PACKAGE} = {PACKAGE}.app:main']
         if WHEEL
-        else [
-            'filter_node = hmt_ros.nodes.filter_node:main',
-            'smoother_node = hmt_ros.nodes.smoother_node:main',
-            'bme_node = hmt_ros.nodes.bme_node:main',
-            'person_node = hmt_ros.nodes.person_node:main',
-            'camera_node = hmt_ros.nodes.camera_node:main',
-            'people_node = hmt_ros.nodes.people_node:main',
-            'track-video = hmt_ros.app.track_video:main',
-            'import-video = hmt_ros.app.import_video.command:main',
-            'lift = hmt_ros.app.lift:main',
-            'keypoints_node = hmt_ros.nodes.keypoints_node:main',
-            'hri_node = hmt_ros.nodes.hri_node:main',
-            'people_adapter_node = hmt_ros.nodes.people_adapter_node:main',
-            'replay = hmt_ros.app.replay.command:main',
-            'compile = hmt_ros.app.compile_kernels:main',
-            'install-detector = hmt_ros.app.install_detector:main',
-            'report = hmt_ros.app.report.command:main',
-            'export = hmt_ros.app.export:main',
-            'evaluate = hmt_ros.app.evaluate:main',
-        ],
+        else [*nodes(), *commands()],
     },
 )

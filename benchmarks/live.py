@@ -55,7 +55,7 @@ from hmt_ros.app.replay.live_node import LiveNode
 from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment
 from hmt_ros.app.truth import read_truth
 from hmt_ros.detectors.blazepose import BlazePose
-from hmt_ros.detectors.blazepose_models import DetectorError
+from hmt_ros.detectors.detector import DetectorError
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS
 from msg_tools import BagReader, BagWriter

@@ -23,13 +23,14 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from hmt_ros.detectors.blazepose_models import is_installed
+from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.sessions.focal_length import USUAL_SIGMA
 
 PACKAGE = 'hmt_ros'
 CAMERA = 'camera'
 WITH_DETECTOR = 'filter_node smoother_node keypoints_node'
 WITHOUT_DETECTOR = 'filter_node smoother_node bme_node'
+DETECTOR = DETECTORS[USUAL_DETECTOR]
 # Arguments of hmt.launch.py that tell where the person is in place of the detector.
 FINDERS = ('background_file', 'keypoints', 'detections_source', 'mask', 'depth', 'subject_file')
 INSTALL = '"ros2 run hmt_ros install-detector" (in a clone: make detector)'
@@ -50,8 +51,9 @@ ARGUMENTS = (
     (
         'detector',
         'auto',
-        "'true': keypoints of MediaPipe; 'false': none, silhouettes start the track, which needs "
-        "background_file or an empty scene at first; 'auto': where MediaPipe Pose is installed",
+        f"'true': keypoints of {DETECTOR.title}; 'false': none, silhouettes start the track, which "
+        "needs background_file or an empty scene at first; 'auto': where "
+        f'{DETECTOR.title} is installed',
     ),
 )
 
@@ -84,10 +86,10 @@ def what_is_missing(given: Mapping[str, str], handed: Mapping[str, str]) -> str:
     Args:
         given, handed: as for `actions_of`.
     """
-    if given['detector'] != 'false' and is_installed():
+    if given['detector'] != 'false' and DETECTOR.is_installed():
         return ''
     unwanted = given['detector'] == 'false'
-    text = 'no detector is wanted' if unwanted else 'MediaPipe Pose is not installed'
+    text = 'no detector is wanted' if unwanted else f'{DETECTOR.title} is not installed'
     if any(handed.get(name) for name in FINDERS):
         return '' if unwanted else f'{text}: keypoints help most, run {INSTALL}'
     return (
@@ -147,7 +149,7 @@ def actions_of(
 def _has_detector(wanted: str) -> bool:
     if wanted not in ('auto', 'true', 'false'):
         raise ValueError(f"detector: wanted 'auto', 'true' or 'false', saw {wanted!r}")
-    return wanted == 'true' or (wanted == 'auto' and is_installed())
+    return wanted == 'true' or (wanted == 'auto' and DETECTOR.is_installed())
 
 
 def _speed(text: str) -> float:

@@ -15,6 +15,7 @@ import tempfile
 import time
 import types
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from hmt_ros.detectors.detector import DetectorKind
+from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.sessions import bme_session, keypoints_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import values_of, with_values
@@ -94,6 +97,11 @@ def with_stand_ins(file: Path) -> dict[str, Any]:
             module.__dict__.update(content)
             patch.setitem(sys.modules, name, module)
         return runpy.run_path(str(file))
+
+
+def detector(installed: bool) -> DetectorKind:
+    """The usual detector, as if it were installed here, or not."""
+    return replace(DETECTORS[USUAL_DETECTOR], is_installed=lambda: installed)
 
 
 @pytest.fixture(scope='module')
@@ -397,7 +405,7 @@ def test_views_are_upright(actions):
 )
 def test_one_line_from_a_webcam_to_a_person(given, options, nodes, monkeypatch):
     camera_file = with_stand_ins(CAMERA_FILE)
-    monkeypatch.setitem(camera_file['actions_of'].__globals__, 'is_installed', lambda: False)
+    monkeypatch.setitem(camera_file['actions_of'].__globals__, 'DETECTOR', detector(False))
     *declared, function = camera_file['generate_launch_description']().arguments[0]
     context = {one.arguments[0]: one.options['default_value'] for one in declared}
     assert given.keys() <= context.keys()
@@ -434,7 +442,7 @@ def test_arguments_of_the_camera_that_can_not_be_used():
 @pytest.mark.parametrize('installed', [False, True])
 def test_a_detector_is_used_where_there_is_one(installed, monkeypatch):
     has_detector = with_stand_ins(CAMERA_FILE)['_has_detector']
-    monkeypatch.setitem(has_detector.__globals__, 'is_installed', lambda: installed)
+    monkeypatch.setitem(has_detector.__globals__, 'DETECTOR', detector(installed))
     assert has_detector('auto') is installed
     assert has_detector('true') is True
     assert has_detector('false') is False
@@ -457,7 +465,7 @@ def test_what_nobody_can_be_found_without_is_said_before_anything_starts(
 ):
     camera_file = with_stand_ins(CAMERA_FILE)
     patched = camera_file['actions_of'].__globals__
-    monkeypatch.setitem(patched, 'is_installed', lambda: installed)
+    monkeypatch.setitem(patched, 'DETECTOR', detector(installed))
     monkeypatch.setitem(patched, 'actions_of', lambda *_: pytest.fail('too early') if said else [])
     *declared, function = camera_file['generate_launch_description']().arguments[0]
     context = {one.arguments[0]: one.options['default_value'] for one in declared}

@@ -240,8 +240,14 @@ def test_package_data_covers_every_data_file(setup_arguments: dict[str, Any]) ->
                 assert any(fnmatch(name, pattern) for pattern in patterns), name
 
 
-def test_entry_points_exist(setup_arguments: dict[str, Any]) -> None:
-    for line in setup_arguments['entry_points']['console_scripts']:
+def test_entry_points_are_all_nodes_and_commands(setup_arguments: dict[str, Any]) -> None:
+    lines = setup_arguments['entry_points']['console_scripts']
+    points = dict(line.split(' = ') for line in lines)
+    nodes = {name for name in points if points[name].startswith('hmt_ros.nodes.')}
+    assert {'filter_node', 'smoother_node', 'person_node', 'camera_node'} <= nodes
+    commands = {name: f'{module}:main' for name, (module, _) in COMMANDS.items()}
+    assert {name: points[name] for name in points.keys() - nodes} == commands
+    for line in lines:
         module, _, function = line.split('=')[1].strip().partition(':')
         tree = ast.parse(MODULES[module].read_text('utf-8'))
         assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}

@@ -22,7 +22,7 @@ COMMANDS = {
     ),
     'install-detector': (
         'hmt_ros.app.install_detector',
-        'install MediaPipe Pose, a detector of keypoints',
+        'install a detector of keypoints, MediaPipe Pose',
     ),
     'report': (
         'hmt_ros.app.report.command',

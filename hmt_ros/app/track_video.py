@@ -16,7 +16,6 @@ from pathlib import Path
 from hmt_ros.app.command_line import CommandParser, gravity_of, number, run_command
 from hmt_ros.app.first_subject import find_start, subject_text
 from hmt_ros.app.import_video.command import (
-    MEDIAPIPE,
     ImportOptions,
     add_video_arguments,
     import_video,
@@ -28,7 +27,7 @@ from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.body import load_body
-from hmt_ros.detectors.blazepose_models import is_installed
+from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.sessions.focal_length import USUAL_FOV, USUAL_SIGMA
 
 VIDEO, SUBJECT, TRACKED, REPORT = 'video', 'subject.yaml', 'tracked', 'report'
@@ -107,8 +106,9 @@ def _track(arguments: argparse.Namespace) -> int:
         if not quiet:
             print(text, flush=True)
 
-    finds = arguments.keypoints is None and not arguments.no_detector and is_installed()
-    arguments.detector = arguments.detector or (MEDIAPIPE if finds else None)
+    if arguments.keypoints is None and arguments.detector is None and not arguments.no_detector:
+        usual = DETECTORS[USUAL_DETECTOR]
+        arguments.detector = USUAL_DETECTOR if usual.is_installed() else None
     with_keypoints = arguments.keypoints is not None or arguments.detector is not None
     if stature is not None and not with_keypoints:
         raise ValueError(

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.detectors import blazepose_models
+from hmt_ros.detectors.detector import DetectorKind
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
@@ -155,6 +156,11 @@ class BlazePose:
             positions,
             mask[..., 0],
         )
+
+
+MEDIAPIPE = DetectorKind(
+    'MediaPipe Pose', BlazePose, blazepose_models.is_installed, blazepose_models.install
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """The networks of MediaPipe Pose: files of the wheel of MediaPipe, under its Apache licence.
 
-`install-detector` takes them from the wheel; MediaPipe itself, which needs numpy below 2, is not
-installed. They lie in share/hmt_ros/blazepose of the Python environment or, where that can not be
+`install` takes them from the wheel; MediaPipe itself, which needs numpy below 2, is not installed.
+They lie in share/hmt_ros/blazepose of the Python environment or, where that can not be
 written, of the user.
 """
 
@@ -9,9 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import os
+import subprocess
 import sys
 import sysconfig
+import tempfile
+import zipfile
 from pathlib import Path
+
+from hmt_ros.detectors.detector import DetectorError
 
 # Package that runs the networks, and the module that it brings.
 RUNTIME, RUNTIME_MODULE = 'ai-edge-litert', 'ai_edge_litert'
@@ -25,9 +31,11 @@ CHECKSUMS = {
     LANDMARKS: 'e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f',
 }
 
-
-class DetectorError(ValueError):
-    """The detector is not installed; one line."""
+# The networks are the same in the wheels of all platforms: one that every release of pip accepts.
+_ANY_WHEEL = (
+    *('--no-deps', '--only-binary=:all:', '--platform=manylinux_2_28_x86_64'),
+    *('--python-version=3.12', '--implementation=cp', '--abi=cp312'),
+)
 
 
 def folders() -> tuple[Path, Path]:
@@ -82,3 +90,63 @@ def require_network(name: str) -> bytes:
         f'MediaPipe Pose is not installed, {reason}: run "ros2 run hmt_ros install-detector", or '
         '"make detector" in a clone'
     )
+
+
+def install() -> None:
+    """Installs LiteRT with pip, and takes the networks out of the wheel of MediaPipe.
+
+    Raises:
+        ValueError: pip fails, or the wheel has other networks; one line.
+    """
+    if not has_runtime():
+        _pip('install', RUNTIME)
+    if not has_networks():
+        with tempfile.TemporaryDirectory() as downloads:
+            _pip('download', *_ANY_WHEEL, f'--dest={downloads}', WHEEL)
+            (wheel,) = Path(downloads).glob('*.whl')
+            networks = networks_of(wheel)
+        _write(networks)
+
+
+def networks_of(wheel: Path) -> dict[str, bytes]:
+    """The networks in a wheel of MediaPipe, by name.
+
+    Raises:
+        ValueError: the wheel lacks one, or has another.
+    """
+    networks = {}
+    with zipfile.ZipFile(wheel) as archive:
+        members = {Path(member).name: member for member in archive.namelist()}
+        for name, checksum in CHECKSUMS.items():
+            data = archive.read(members[name]) if name in members else b''
+            seen = hashlib.sha256(data).hexdigest()
+            if seen != checksum:
+                saw = f'one with SHA-256 {seen}' if data else 'none'
+                raise ValueError(f'{wheel.name}: wanted {name} with SHA-256 {checksum}, saw {saw}')
+            networks[name] = data
+    return networks
+
+
+def _write(networks: dict[str, bytes]) -> None:
+    """Writes files for all users of this Python or, where that is not allowed, for this one."""
+    everybody, own = folders()
+    try:
+        everybody.mkdir(parents=True, exist_ok=True)
+        folder = everybody if os.access(everybody, os.W_OK) else own
+    except PermissionError:
+        folder = own
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in networks.items():
+        # A reader sees the whole file or none.
+        unfinished = folder / f'{name}.part'
+        unfinished.write_bytes(data)
+        unfinished.replace(folder / name)
+
+
+def _pip(*arguments: str) -> None:
+    command = [sys.executable, '-m', 'pip', '-q', '--disable-pip-version-check', *arguments]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
+    if done.returncode != 0:
+        lines = [line for line in done.stderr.splitlines() if line.strip()]
+        faults = [line for line in lines if line.lower().startswith('error')] or lines[-1:]
+        raise ValueError(f'"{" ".join(command)}" failed: {faults[-1] if faults else "no message"}')

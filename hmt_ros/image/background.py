@@ -1,9 +1,9 @@
 """The person's silhouette by background subtraction, shadows removed.
 
 The background is either a given image of the empty scene or learned from frames in which the person
-is absent or moves. OpenCV's mixture (MOG2) or nearest-neighbour (KNN) model does the per-pixel
-work, on images made smaller to about `LINES` lines: the cost does not depend on the camera,
-and the outline that comes back is smooth to a fraction of their pixels. A background that turns out
+is absent or moves. A model of the table `BACKGROUNDS` does the per-pixel work, on images made
+smaller to about `LINES` lines: the cost does not depend on the camera, and the outline that comes
+back is smooth to a fraction of their pixels. A background that turns out
 to be useless is rebuilt from the pixels of images where the person is not.
 
 `SceneWatch` tells whether the camera still sees the scene from where the background was taken:
@@ -17,6 +17,7 @@ where they are. It is elsewhere after a bump; after a larger one nothing fits.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,16 +25,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.image.pixel_backgrounds import (
+    FOREGROUND,
+    SHADOW,
+    Background,
+    mixture_background,
+    neighbour_background,
+)
 from hmt_ros.inference.arrays import Array, Image, Mask
 
 Box = tuple[int, int, int, int]
 
+# Makers of models of the empty scene, by the values of `BackgroundSettings.method`. A new model is
+# a file beside this one and a line here.
+BACKGROUNDS: dict[str, Callable[[float, float], Background]] = {
+    'mog2': mixture_background,
+    'knn': neighbour_background,
+}
+
 # Number of lines that images are made smaller to, about: by a whole factor.
 LINES = 240
 
-# Values of OpenCV's models for a pixel that differs from the background, and for one that is darker
-# in the same colour.
-FOREGROUND, SHADOW = 255, 127
 # Grey levels by which a pixel may differ from the colours of the background around it: compression
 # and aliasing move its edges.
 BESIDE = 8
@@ -41,8 +53,6 @@ BESIDE = 8
 # levels.
 AGREEING = 10
 AGREEMENT = 20.0
-# Learning rates at which nothing is learned; at 0 the KNN model would replace its samples at once.
-FROZEN = {'mog2': 0.0, 'knn': 1e-7}
 
 
 @dataclass(frozen=True)
@@ -68,8 +78,13 @@ class BackgroundSettings:
     largest_gap: float = 0.2
 
     def __post_init__(self) -> None:
-        if self.method not in ('mog2', 'knn'):
-            raise ValueError(f'background method must be mog2 or knn, saw {self.method!r}')
+        if self.method not in BACKGROUNDS:
+            known = ' or '.join(BACKGROUNDS)
+            raise ValueError(f'background method must be {known}, saw {self.method!r}')
+
+    def new_model(self) -> Background:
+        """A model of the chosen method that has seen no image."""
+        return BACKGROUNDS[self.method](self.threshold, self.shadow_threshold)
 
 
 class Silhouette(NamedTuple):
@@ -97,7 +112,7 @@ class BackgroundModel:
 
     def __init__(self, settings: BackgroundSettings | None = None) -> None:
         self.settings = settings or BackgroundSettings()
-        self._model = _new_model(self.settings)
+        self._model = self.settings.new_model()
         self.frames = 0
         self.changed = 0.0
         self._shape: tuple[int, ...] = ()
@@ -125,7 +140,7 @@ class BackgroundModel:
             self._shape = image.shape
         self._check(image)
         self.frames += 1
-        self._model.apply(self._smaller(image), learningRate=1.0 / self.frames)
+        self._model.learn(self._smaller(image), 1.0 / self.frames)
         self._nearby = self._last = None
 
     def forget(self) -> None:
@@ -158,7 +173,7 @@ class BackgroundModel:
     @property
     def empty(self) -> Image:
         """The empty scene (h, w, 3), as far as it is known, made smaller as all images are."""
-        return np.asarray(self._model.getBackgroundImage(), dtype=np.uint8)
+        return self._model.empty
 
     def foreground(self, image: Image) -> Mask:
         """Pixels (H, W) that differ from the background and are no shadow.
@@ -222,8 +237,7 @@ class BackgroundModel:
         if parts is None and self._last is not None and self._last[0] is image:
             return self._last[1]
         small = self._smaller(image)
-        rate = FROZEN[self.settings.method]
-        raw = np.asarray(self._model.apply(small, learningRate=rate), dtype=np.uint8)
+        raw = self._model.labels(small)
         raw[(raw == FOREGROUND) & self._is_beside(small)] = 0
         if parts is not None:
             raw[self._any_of(parts.unknown)] = 0
@@ -279,29 +293,15 @@ class BackgroundModel:
 
     def _learn_alone(self, background: Image) -> None:
         """Makes one image (H, W, 3) of the empty scene all that is known."""
-        self._model = _new_model(self.settings)
+        self._model = self.settings.new_model()
         self.frames = 0
-        for _ in range(1 if self.settings.method == 'mog2' else 20):
+        for _ in range(self._model.repeats):
             self.learn(background)
 
     def _check(self, image: Image) -> None:
         # OpenCV would silently begin a new model.
         if image.shape != self._shape:
             raise ValueError(f'the background has shape {self._shape}, saw an image {image.shape}')
-
-
-def _new_model(
-    settings: BackgroundSettings,
-) -> cv2.BackgroundSubtractorMOG2 | cv2.BackgroundSubtractorKNN:
-    s = settings
-    model: cv2.BackgroundSubtractorMOG2 | cv2.BackgroundSubtractorKNN
-    if s.method == 'mog2':
-        model = cv2.createBackgroundSubtractorMOG2(varThreshold=s.threshold)
-    else:
-        model = cv2.createBackgroundSubtractorKNN(dist2Threshold=20.0 * s.threshold)
-    model.setDetectShadows(True)
-    model.setShadowThreshold(s.shadow_threshold)
-    return model
 
 
 class _Parts:

@@ -189,31 +189,3 @@ def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Arr
 
 def _of_rows(value: Array, rows: Index, axes: int) -> Array:
     return value[rows] if value.ndim == axes else value
-
-
-@dataclass(frozen=True, eq=False)
-class Restricted:
-    """A term over some of the variables; the others stay where they are.
-
-    Attributes:
-        term: over all d variables.
-        point: (d,) values of all variables.
-        free: (f,) the variables that may move.
-    """
-
-    term: EnergyTerm
-    point: Array
-    free: Index
-
-    def energy(
-        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        """The energy at values x (n, f) of the free variables; see `EnergyTerm`."""
-        whole = np.repeat(self.point[None], len(x), axis=0)
-        whole[:, self.free] = x
-        value, gradient, hessian = self.term.energy(whole, rows, derivatives=derivatives)
-        if gradient is not None:
-            gradient = gradient[:, self.free]
-        if hessian is not None:
-            hessian = hessian[:, self.free[:, None], self.free]
-        return Energy(value, gradient, hessian)

@@ -1,4 +1,4 @@
-"""keypoints_node: images in, keypoints of MediaPipe out; a node around a `KeypointsSession`."""
+"""keypoints_node: images in, keypoints of a detector out; a node around a `KeypointsSession`."""
 
 from __future__ import annotations
 

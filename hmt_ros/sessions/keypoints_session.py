@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hmt_ros.detectors.blazepose import BlazePose
+from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.handled import Fault, Output
@@ -76,7 +76,8 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
         wanted: Callable[[str], bool] = everything,
     ) -> None:
         super().__init__(parameters, publish, wanted)
-        self._detector = BlazePose(with_mask=parameters.publish_mask)
+        kind = DETECTORS[parameters.detector]
+        self._detector = kind.make(with_mask=parameters.publish_mask)
         self._newest: int | None = None
         self._landmarks = 0
         self.state = self._present_state()

@@ -13,7 +13,8 @@ import pytest
 
 from hmt_ros.app import install_detector
 from hmt_ros.detectors import blazepose_models
-from hmt_ros.detectors.blazepose_models import DetectorError, require_network
+from hmt_ros.detectors.blazepose_models import require_network
+from hmt_ros.detectors.detector import DetectorError
 
 CONTENT = {name: name.encode() for name in blazepose_models.CHECKSUMS}
 
@@ -43,10 +44,8 @@ class Pip:
 def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
     """Folder of the environment, and of the user; neither exists."""
     found = tmp_path / 'environment' / 'share', tmp_path / 'user' / 'share'
-    for module in (install_detector, blazepose_models):
-        monkeypatch.setattr(module, 'folders', lambda: found)
+    monkeypatch.setattr(blazepose_models, 'folders', lambda: found)
     checksums = {name: hashlib.sha256(data).hexdigest() for name, data in CONTENT.items()}
-    monkeypatch.setattr(install_detector, 'CHECKSUMS', checksums)
     monkeypatch.setattr(blazepose_models, 'CHECKSUMS', checksums)
     return found
 
@@ -103,7 +102,7 @@ def test_the_users_folder_where_the_environments_can_not_be_written(
     pip: Pip, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     environment, user = folders
-    monkeypatch.setattr(install_detector.os, 'access', lambda path, _: path != environment)
+    monkeypatch.setattr(blazepose_models.os, 'access', lambda path, _: path != environment)
     assert install_detector.main([]) == 0
     assert len(list(user.iterdir())) == len(CONTENT)
     assert not list(environment.iterdir())

@@ -1,5 +1,6 @@
 """track-video: a video in, bags and a report out."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ from hmt_ros.app import main, track_video
 from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import load_body
+from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.tracking import read_subject
 from test.app.conftest import data_of
 from test.test_docs import ROOT, commands
@@ -20,7 +22,8 @@ from test.test_docs import ROOT, commands
 def installed(monkeypatch):
     """Whether the detector is installed; not so, wherever tests run, unless one says so."""
     answers = [False]
-    monkeypatch.setattr(track_video, 'is_installed', lambda: answers[-1])
+    usual = replace(DETECTORS[USUAL_DETECTOR], is_installed=lambda: answers[-1])
+    monkeypatch.setitem(DETECTORS, USUAL_DETECTOR, usual)
     return answers
 
 

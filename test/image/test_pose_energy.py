@@ -24,7 +24,8 @@ from hmt_ros.image.surface import lens_of
 from hmt_ros.image.surface_points import seen_points
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import minimise
-from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Restricted, Student, Sum
+from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, Sum
+from test.inference.restricted import Restricted
 
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
 SOLVER = {'step_scale': 0.3, 'damping': 1.0, 'tolerance': 0.02}

@@ -9,7 +9,6 @@ from hmt_ros.inference.energy import (
     Derivatives,
     EnergyFunction,
     Quadratic,
-    Restricted,
     Student,
     Sum,
 )
@@ -102,19 +101,3 @@ def test_a_sum_adds_what_its_terms_know():
     )
     assert values.gradient is None
     np.testing.assert_array_equal(values.value, total.value)
-
-
-@pytest.mark.parametrize('name', ['own precisions', 'own students', 'diagonal', 'sum'])
-def test_a_restriction_is_the_term_with_the_others_in_place(name):
-    point, free = np.array([0.3, -1.0, 2.0]), np.array([2, 0])
-    term = TERMS[name]
-    x = POINTS[:, :2]
-    whole = np.tile(point, (6, 1))
-    whole[:, free] = x
-    expected, found = term.energy(whole, ROWS), Restricted(term, point, free).energy(x, ROWS)
-    np.testing.assert_array_equal(found.value, expected.value)
-    np.testing.assert_array_equal(found.gradient, expected.gradient[:, free])
-    hessian = expected.hessian[:, free][:, :, free]
-    np.testing.assert_array_equal(found.hessian, hessian)
-    none = Restricted(term, point, free).energy(x, ROWS, derivatives=Derivatives.NONE)
-    assert none.gradient is None

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.sessions import keypoints_session
+from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from msg_tools import BagReader
-from test.sessions.test_keypoints_session import StubDetector
+from test.sessions.test_keypoints_session import STUB
 
 pytestmark = pytest.mark.ros
 
@@ -48,7 +48,7 @@ def stamp_of(message):
 
 
 def test_images_become_keypoints(world, somebody, monkeypatch):
-    monkeypatch.setattr(keypoints_session, 'BlazePose', StubDetector)
+    monkeypatch.setitem(DETECTORS, 'mediapipe', STUB)
     one = world(publish_mask=True).start()
     found = listening(one)
     for message in (somebody.image(0), somebody.empty(1)):
@@ -67,7 +67,7 @@ def test_images_become_keypoints(world, somebody, monkeypatch):
 
 
 def test_lifecycle(world, somebody, monkeypatch):
-    monkeypatch.setattr(keypoints_session, 'BlazePose', StubDetector)
+    monkeypatch.setitem(DETECTORS, 'mediapipe', STUB)
     one = world(autostart=False)
     one.node.start()
     assert one.change_state('configure')

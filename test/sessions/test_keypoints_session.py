@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from hmt_ros.detectors.detector import DetectorKind
+from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions import keypoints_session
 from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
@@ -34,9 +35,12 @@ class StubDetector:
         return Keypoints(NAMES, pixels, covariances, np.full(33, 0.5), np.full((33, 3), 0.25))
 
 
+STUB = DetectorKind('Stub', StubDetector, lambda: True, lambda: None)
+
+
 @pytest.fixture
 def session(outputs, monkeypatch):
-    monkeypatch.setattr(keypoints_session, 'BlazePose', StubDetector)
+    monkeypatch.setitem(DETECTORS, 'mediapipe', STUB)
 
     def make(wanted=lambda topic: True, **values):
         parameters = with_values(KeypointsParameters(), values)

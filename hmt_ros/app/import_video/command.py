@@ -34,7 +34,8 @@ from hmt_ros.app.import_video.keypoint_files.reading import (
 )
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.body import Camera
-from hmt_ros.detectors.blazepose import BlazePose
+from hmt_ros.detectors.detector import Detector
+from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
@@ -48,7 +49,6 @@ from msg_tools.messages.keypoints import keypoints_message, positions_message
 
 IMAGE, CAMERA_INFO, MASK = 'image/compressed', 'camera_info', 'mask'
 KEYPOINTS, KEYPOINTS_3D = 'keypoints', 'keypoints_3d'
-MEDIAPIPE = 'mediapipe'
 
 EPILOG = """\
 SOURCE is any video file that OpenCV reads, or a folder of images in the order of the numbers in
@@ -217,8 +217,8 @@ def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) 
     )
     found.add_argument(
         '--detector',
-        choices=[MEDIAPIPE],
-        help='find keypoints with MediaPipe Pose, where it is installed',
+        choices=tuple(DETECTORS),
+        help='find keypoints with a detector that is installed, such as MediaPipe Pose',
     )
     add_keypoint_arguments(person)
     person.add_argument(
@@ -295,7 +295,9 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
     if options.detector_masks and (options.detector is None or options.masks is not None):
         raise ValueError('--detector-masks goes with --detector, and not with --masks')
     if options.detector is not None and options.person != Choice():
-        raise ValueError('MediaPipe finds one person: --person goes with --keypoints')
+        raise ValueError(
+            f'{DETECTORS[options.detector].title} finds one person: --person goes with --keypoints'
+        )
     selection = Selection(options.start, options.end, options.every)
     source = open_source(options.source, options.fps, options.first_number)
     for note in source.notes:
@@ -352,7 +354,7 @@ def _seer(
     reading = ClipReading(options.person, options.scheme, options.keypoints_size, options.mirror)
     detector = None
     if options.detector is not None:
-        detector = BlazePose(with_mask=options.detector_masks)
+        detector = DETECTORS[options.detector].make(with_mask=options.detector_masks)
 
     def see(frame: Frame, stamp_ns: int) -> tuple[Keypoints | None, Mask | None]:
         nonlocal chosen
@@ -376,7 +378,7 @@ def _seer(
     return see
 
 
-def _detected(detector: BlazePose, frame: Frame, stamp_ns: int) -> Keypoints | None:
+def _detected(detector: Detector, frame: Frame, stamp_ns: int) -> Keypoints | None:
     """The keypoints of a frame, which the detector sees with square pixels."""
     if frame.aspect == 1.0:
         return detector.detect(frame.image, stamp_ns)

@@ -354,7 +354,7 @@ class KeypointTerm:
     def measured(self) -> MeasuredKeypoints:
         """The keypoints as inputs of the kernel, the same for all poses of the skeleton."""
         sigma = self.settings.sigma
-        return _measured(self.skeleton, self.camera, self.keypoints, sigma, self.magnification)
+        return _measured(self.skeleton, self.keypoints, sigma, self.magnification)
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,7 +376,7 @@ class MeasuredKeypoints:
 # lengths. Inputs that do not depend on the hypotheses, or on the lengths, are computed once.
 @lru_cache(maxsize=16)
 def _measured(
-    skeleton: Skeleton, camera: Camera, keypoints: Keypoints, sigma: float, magnification: float
+    skeleton: Skeleton, keypoints: Keypoints, sigma: float, magnification: float
 ) -> MeasuredKeypoints:
     counted, whiteners = _whitened(keypoints, sigma, magnification)
     names, known = counted.names, skeleton.joint_names

@@ -1,5 +1,6 @@
 import json
 import tracemalloc
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from hmt_ros.app.import_video import command
 from hmt_ros.app.replay.inputs import recorded_input
+from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
@@ -152,7 +154,7 @@ def test_detector(video, tmp_path, monkeypatch):
         made.append(FakePose(**options))
         return made[-1]
 
-    monkeypatch.setattr(command, 'BlazePose', pose)
+    monkeypatch.setitem(DETECTORS, 'mediapipe', replace(DETECTORS['mediapipe'], make=pose))
     options = ['--detector', 'mediapipe', '--detector-masks', '--every', 2]
     assert run(video, tmp_path / 'bag', *options) == 0
     found = content(tmp_path / 'bag')
@@ -172,7 +174,7 @@ def test_detector_sees_square_pixels(video, with_pixel_aspect, tmp_path, monkeyp
             sizes.append(image.shape[:2])
             return super().detect(image, stamp_ns)
 
-    monkeypatch.setattr(command, 'BlazePose', Pose)
+    monkeypatch.setitem(DETECTORS, 'mediapipe', replace(DETECTORS['mediapipe'], make=Pose))
     video.write_bytes(with_pixel_aspect(video.read_bytes(), 2, 1))
     options = ['--detector', 'mediapipe', '--detector-masks']
     assert run(video, tmp_path / 'bag', *options) == 0

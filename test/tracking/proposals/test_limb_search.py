@@ -8,10 +8,11 @@ from hmt_ros.body.pose_prior import pose_prior
 from hmt_ros.body.pose_terms import Posed
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation
-from hmt_ros.inference.energy import Restricted, Student, Sum
+from hmt_ros.inference.energy import Student, Sum
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.kinematic_jumps import LimbSearch
 from hmt_ros.tracking.settings import LIMB_TAILS, LimbSearchSettings, TrackerSettings
+from test.inference.restricted import Restricted
 
 CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
 

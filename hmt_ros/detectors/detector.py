@@ -1,0 +1,68 @@
+"""What a detector of keypoints is, and how one is made and installed.
+
+A new detector is a file beside this one with a `DetectorKind`, and a line in `registry.DETECTORS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Image, Mask
+
+
+class DetectorError(ValueError):
+    """The detector is not installed; one line says what to run."""
+
+
+class Detector(Protocol):
+    """Finds the keypoints of one person, from image to image.
+
+    A detector may follow the person through a sequence of images; that is all its state. It is
+    deterministic: the same images with the same stamps give the same output. It draws no random
+    numbers and reads no clock.
+
+    Attributes:
+        mask: (H, W) where the person was seen in the last image; None: no mask was asked for, or
+            the detector finds none.
+    """
+
+    mask: Mask | None
+
+    def detect(self, image: Image, stamp_ns: int) -> Keypoints | None:
+        """The keypoints of the person in an image.
+
+        An image that is not younger than the one before, or that has another size, begins a new
+        sequence.
+
+        Args:
+            image: (H, W, 3) BGR, with square pixels.
+            stamp_ns: of the image.
+
+        Returns:
+            Landmarks under the names of a scheme of `keypoint_schemes.yaml`, pixels with (0, 0) at
+            the centre of the first pixel, covariances, px^2, or NaN where unknown, and confidences
+            from 0 to 1; `positions`, m, along the axes of the camera, of a detector that lifts.
+            None: nobody was seen.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class DetectorKind:
+    """A detector that can be chosen by its name in `registry.DETECTORS`.
+
+    Attributes:
+        title: name of the detector, for users.
+        make: makes a detector that has seen no image, `make(with_mask=...)`: whether `mask` is
+            wanted as well. Raises DetectorError where the detector is not installed.
+        is_installed: whether the detector can run here.
+        install: installs what is missing; raises ValueError, in one line, where that fails.
+    """
+
+    title: str
+    make: Callable[..., Detector]
+    is_installed: Callable[[], bool]
+    install: Callable[[], None]

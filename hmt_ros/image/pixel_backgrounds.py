@@ -1,0 +1,98 @@
+"""Models of the empty scene, pixel by pixel: the contract, and the two models of OpenCV.
+
+A new model is a file beside this one with a class of the contract, and a line in the table
+`BACKGROUNDS` of `background`.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from hmt_ros.inference.arrays import Image
+
+# Labels of a pixel that differs from the background, and of one that is darker in the same colour;
+# any other is 0.
+FOREGROUND, SHADOW = 255, 127
+
+
+class Background(Protocol):
+    """A model of the empty scene that labels the pixels of an image.
+
+    `BACKGROUNDS` makes one that has seen no image, from `threshold` and `shadow_threshold` of
+    `BackgroundSettings`. The same images give the same labels.
+
+    Attributes:
+        repeats: how often one image has to be learned to be all that is known.
+        empty: (h, w, 3) the empty scene, as far as it is known.
+    """
+
+    repeats: int
+
+    @property
+    def empty(self) -> Image:
+        """See the attributes."""
+        ...
+
+    def learn(self, image: Image, share: float) -> None:
+        """Takes an image (h, w, 3) of the scene into the model.
+
+        Args:
+            share: weight of the image beside those before it, above 0; 1 for the first.
+        """
+        ...
+
+    def labels(self, image: Image) -> Image:
+        """`FOREGROUND`, `SHADOW` or 0 (h, w) of an image (h, w, 3); the model does not change."""
+        ...
+
+
+class OpenCvBackground:
+    """A background of OpenCV; see `Background`.
+
+    Args:
+        model: that has seen no image.
+        frozen: learning rate at which the model does not change.
+        repeats: see `Background`.
+        shadow_threshold: as in `BackgroundSettings`.
+    """
+
+    def __init__(
+        self,
+        model: cv2.BackgroundSubtractorMOG2 | cv2.BackgroundSubtractorKNN,
+        frozen: float,
+        repeats: int,
+        shadow_threshold: float,
+    ) -> None:
+        self.repeats = repeats
+        self._model, self._frozen = model, frozen
+        model.setDetectShadows(True)
+        model.setShadowThreshold(shadow_threshold)
+
+    @property
+    def empty(self) -> Image:
+        """See `Background`."""
+        return np.asarray(self._model.getBackgroundImage(), dtype=np.uint8)
+
+    def learn(self, image: Image, share: float) -> None:
+        """See `Background.learn`."""
+        self._model.apply(image, learningRate=share)
+
+    def labels(self, image: Image) -> Image:
+        """See `Background.labels`."""
+        return np.asarray(self._model.apply(image, learningRate=self._frozen), dtype=np.uint8)
+
+
+def mixture_background(threshold: float, shadow_threshold: float) -> Background:
+    """A mixture of Gaussians for each pixel: MOG2."""
+    model = cv2.createBackgroundSubtractorMOG2(varThreshold=threshold)
+    return OpenCvBackground(model, 0.0, 1, shadow_threshold)
+
+
+def neighbour_background(threshold: float, shadow_threshold: float) -> Background:
+    """The nearest of some samples of each pixel: KNN."""
+    model = cv2.createBackgroundSubtractorKNN(dist2Threshold=20.0 * threshold)
+    # At a learning rate of 0 it would replace its samples at once.
+    return OpenCvBackground(model, 1e-7, 20, shadow_threshold)

@@ -1,0 +1,172 @@
+"""A new detector, background, term or command is a new file and a line in a table."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros import app
+from hmt_ros.app.import_video import command as import_video
+from hmt_ros.detectors.detector import DetectorKind
+from hmt_ros.detectors.registry import DETECTORS
+from hmt_ros.image import background
+from hmt_ros.image.background import BackgroundModel, BackgroundSettings
+from hmt_ros.image.pixel_backgrounds import FOREGROUND
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions.camera_session import IMAGE
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.keypoints_session import KeypointsSession
+from msg_tools import BagReader
+from test.sessions.conftest import Somebody
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class Corner:
+    """A detector that sees a nose in the corner of every image."""
+
+    def __init__(self, *, with_mask):
+        self.mask = None
+
+    def detect(self, image, stamp_ns):
+        return Keypoints(('nose',), np.zeros((1, 2)), np.full((1, 2, 2), np.nan), np.ones(1))
+
+
+@pytest.fixture
+def corner(monkeypatch):
+    installed = []
+    kind = DetectorKind('Corner', Corner, lambda: True, lambda: installed.append('corner'))
+    monkeypatch.setitem(DETECTORS, 'corner', kind)
+    return installed
+
+
+def test_a_detector_is_a_file_and_a_line(corner, tmp_path, capsys):
+    # The node.
+    outputs = []
+    parameters = with_values(KeypointsParameters(), {'detector': 'corner'})
+    session = KeypointsSession(parameters, outputs.append)
+    assert session.take(IMAGE, Somebody().image(0)).faults == ()
+    assert [output.topic for output in outputs] == ['keypoints', 'keypoints_3d']
+    assert session.state.landmarks == 1
+    with pytest.raises(ValueError, match=r"detector must be one of .*, saw 'edge'"):
+        with_values(KeypointsParameters(), {'detector': 'edge'})
+    # The import of a video, here of two images.
+    for name in ('1.png', '2.png'):
+        import_video.cv2.imwrite(str(tmp_path / name), np.zeros((48, 64, 3), np.uint8))
+    given = [str(tmp_path), '-o', str(tmp_path / 'bag'), '--fov', '60', '--fps', '10']
+    assert import_video.main([*given, '--detector', 'corner', '--quiet']) == 0
+    with BagReader(tmp_path / 'bag') as bag:
+        names = [stored.message.names for stored in bag.messages(['keypoints'])]
+    assert names == [['nose'], ['nose']]
+    # Its installation.
+    assert app.main(['install-detector', 'corner']) == 0
+    assert (corner, capsys.readouterr().out) == (['corner'], 'Corner is installed\n')
+
+
+class Bright:
+    """A background of which whatever is brighter than 200 differs."""
+
+    repeats = 1
+
+    def __init__(self, threshold, shadow_threshold):
+        self.empty = np.zeros((0, 0, 3), np.uint8)
+
+    def learn(self, image, share):
+        self.empty = image.copy()
+
+    def labels(self, image):
+        return np.where(image.max(2) > 200, np.uint8(FOREGROUND), np.uint8(0))
+
+
+def test_a_background_is_a_file_and_a_line(monkeypatch):
+    monkeypatch.setitem(background.BACKGROUNDS, 'bright', Bright)
+    model = BackgroundModel(BackgroundSettings(method='bright'))
+    image = np.full((48, 64, 3), 90, np.uint8)
+    model.learn(image)
+    image[10:30, 20:40] = 250
+    found = model.silhouette(image)
+    assert found[10:30, 20:40].all()
+    assert found.sum() == 400
+    model.forget()
+    assert model.unknown.all()
+
+
+TERM = """
+from typing import NamedTuple
+from numba import njit
+from hmt_ros.image.terms.image_term import ImageTerm, TermSettings, Weighting
+
+class Inputs(NamedTuple):
+    term: Weighting
+    brightness: float
+
+@njit
+def kernel(view, inputs, wrenches, stiffnesses):
+    return inputs.term.weight * inputs.brightness
+
+BRIGHTNESS = ImageTerm(
+    'brightness', 'Brightness of the image', TermSettings(2.0, 1.0, 1.0),
+    lambda window: float(window.image.mean()),
+    lambda term, evidence, request: Inputs(term, float(evidence or 0.0)),
+    kernel,
+)
+"""
+TRY_TERM = """
+import numpy as np
+from hmt_ros.body import Camera, load_body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.observation import observe
+from hmt_ros.image.terms.image_term import TermSettings
+
+body, camera = load_body('human32'), Camera(100.0, 100.0, 31.5, 23.5, 64, 48)
+settings = LikelihoodSettings.of_terms(brightness=TermSettings(3.0, 1.0, 1.0))
+poses = np.zeros((2, body.dimension))
+poses[:, 2] = 3.0
+observation = observe(np.full((48, 64, 3), 60, np.uint8))
+likelihood = ImageLikelihood(body, camera, settings)
+print(likelihood.energies(forward(body.skeleton, poses), observation).terms['brightness'].tolist())
+"""
+
+
+def test_a_likelihood_term_is_a_file_and_a_line(tmp_path):
+    """In a copy of the package, interpreted: to compile the terms takes a minute."""
+    for name in ('hmt_ros', 'msg_tools'):
+        ignored = shutil.ignore_patterns('__pycache__')
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
+    terms = tmp_path / 'hmt_ros' / 'image' / 'terms'
+    (terms / 'brightness.py').write_text(TERM, 'utf-8')
+    registry = (terms / 'registry.py').read_text('utf-8')
+    registry = registry.replace('EDGES, DEPTH)', 'EDGES, DEPTH, BRIGHTNESS)')
+    first = 'from hmt_ros.image.terms.depth import DEPTH\n'
+    more = 'from hmt_ros.image.terms.brightness import BRIGHTNESS\n'
+    (terms / 'registry.py').write_text(registry.replace(first, more + first), 'utf-8')
+    done = subprocess.run(
+        [sys.executable, '-c', TRY_TERM],
+        cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': str(tmp_path), 'NUMBA_DISABLE_JIT': '1'},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stderr, done.stdout) == ('', '[180.0, 180.0]\n')
+
+
+def test_a_command_is_a_file_and_a_line(monkeypatch, capsys):
+    module = types.ModuleType('hmt_ros.app.greet')
+    module.main = lambda argv: print('hello', *argv) or 0
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(app.COMMANDS, 'greet', (module.__name__, 'say hello'))
+    assert app.main(['greet', 'you']) == 0
+    assert app.main(['--help']) == 0
+    found = capsys.readouterr().out
+    assert found.startswith('hello you\n')
+    assert '  greet' in found
