@@ -15,7 +15,6 @@ the lags up to a second. What was made of it stands in `hmt_ros/inference/error_
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,19 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from benchmarks.clips import read_clip, read_detections, table, with_file
-from benchmarks.command import benchmark_parser, show, told
-from benchmarks.keypoint_noise import CLIPS, QUICK
+from benchmarks.clips import read_detections, table, with_file
+from benchmarks.command import benchmark_parser, run_benchmark, told
 from benchmarks.machine import description
-from benchmarks.tracking_oracle import SHAPE_TERMS, STARTS, best_poses, with_true_lengths
-from hmt_ros.body import load_body
+from benchmarks.truth_fits import CLIPS, QUICK, QUICK_IMAGES, best_poses, fitted
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.inference.energy import Energy, add_energies
-from hmt_ros.tracking import read_subject
-from hmt_ros.tracking.initialisation import start_from_keypoints
 
 Array = NDArray[np.float64]
 
@@ -60,17 +55,15 @@ class Sums(NamedTuple):
     squares: Array
 
 
-def of_clip(folder: Path) -> tuple[dict[str, Sums], float]:
+def of_clip(folder: Path, limit: int | None = None) -> tuple[dict[str, Sums], float]:
     """The sums of each cue, and the time from image to image, s.
 
     Raises:
         ValueError: the clip can not be read.
     """
-    clip, model = read_clip(folder), load_body('human37')
-    begun = start_from_keypoints(model, clip.camera, read_subject(clip.subject, model))
-    body = with_true_lengths(begun.body, clip)
+    clip, body, starts = fitted(folder, limit)
     detections, stamps = read_detections(folder).keypoints, list(clip.stamps)
-    poses = best_poses(body, clip, stamps, begun.poses[:STARTS])
+    poses = best_poses(body, clip, stamps, starts)
     likelihood = ImageLikelihood(body, clip.camera)
     scene = None if clip.background is None else BackgroundModel.from_image(clip.background)
     rows = np.arange(1)
@@ -78,7 +71,7 @@ def of_clip(folder: Path) -> tuple[dict[str, Sums], float]:
     for stamp, image, pose in zip(stamps, clip.images, poses, strict=True):
         frames = forward(body.skeleton, pose[None])
         silhouette = None if scene is None else scene.silhouette(image)
-        seen = observe(image, silhouette, wanted=SHAPE_TERMS)
+        seen = observe(image, silhouette, wanted=('coverage', 'edges'))
         one = likelihood.energies(frames, seen)
         energies[IMAGE].append(Energy(one.value, one.gradient, one.hessian))
         energies[PRIOR].append(add_energies([x.energy(frames, rows) for x in likelihood.priors]))
@@ -131,7 +124,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
     Args:
         clips: folder of the clips; None: the development clips.
-        quick: two clips.
+        quick: a few images of two clips.
 
     Raises:
         FileNotFoundError: a clip is not there.
@@ -139,7 +132,8 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     """
     wanted = CLIPS[:QUICK] if quick else CLIPS
     folders = with_file(wanted, clips, 'keypoints_mediapipe.npz')
-    found = [of_clip(folder) for folder in told('error_model', folders)]
+    limit = QUICK_IMAGES if quick else None
+    found = [of_clip(folder, limit) for folder in told('error_model', folders)]
     dt = float(np.median([dt for _, dt in found]))
     cues = {}
     for name in CUES:
@@ -179,15 +173,12 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 def main(arguments: list[str]) -> int:
     """Runs the command; returns its exit code."""
-    parser = benchmark_parser('error_model', __doc__, quick='two clips')
+    parser = benchmark_parser('error_model', __doc__, quick='a few images of two clips')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     options = parser.parse_args(arguments)
-    try:
-        result = measure(options.clips, quick=options.quick)
-    except FileNotFoundError as error:
-        print(f'error_model: skipped, {error}', file=sys.stderr)
-        return 0
-    except ValueError as error:
-        print(f'error_model: {error}', file=sys.stderr)
-        return 1
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'error_model',
+        lambda: measure(options.clips, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )

@@ -1,4 +1,4 @@
-"""nodes: what ROS adds to an image, and whether nodes keep up with cameras, through DDS."""
+"""nodes: what ROS adds to an image, and whether the filter keeps up with a camera, through DDS."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 import hmt_ros
+from benchmarks.camera import with_stamp
 from benchmarks.clips import COMPRESSED, find_clips, index_back_and_forth, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
-from benchmarks.publisher import with_stamp
 from hmt_ros.app.replay.live_node import LiveNode
 from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment
 from hmt_ros.sessions import bme_session, track_messages
@@ -33,17 +33,15 @@ RATE = 30.0  # images a second
 SECONDS = 20.0
 WARM_UP = 10  # images before it counts: kernels are compiled
 PATIENCE = 2.0  # s after the last image
-KEPT = 0.99  # share of the images whose results came
 SIZE = (640, 480)
 MEDIAN_MS, LATE_MS = 5.0, 15.0  # wanted of what ROS adds, median and 99th percentile
 HELD = 0.8  # of the rate that the filter reaches
 # Images that may wait, where every image is to be used: no node is late, but images come in bursts.
 QUEUE = 5
-PEOPLE = (1, 2, 4)
 # Room in shared memory for raw images.
 PROFILE = Path(hmt_ros.__file__).parent / 'config' / 'fastdds.xml'
 
-STAGES = ('added, raw', 'added, compressed', 'filter_node', *map(str, PEOPLE))
+STAGES = ('added, raw', 'added, compressed', 'filter_node')
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +82,19 @@ class Feed:
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = benchmark_parser('nodes', __doc__, quick='two seconds each')
+    parser = benchmark_parser('nodes', __doc__, quick='a second of the first stage')
     add_choice(parser, STAGES)
-    parser.add_argument('--model', default='', help='of bme_node; usual: the one that ships')
     options = parser.parse_args(argv)
-    result = measure(2.0 if options.quick else SECONDS, options.model, tuple(options.only))
-    return show(result, as_text, as_json=options.json)
+    return show(measure(tuple(options.only), quick=options.quick), as_text, as_json=options.json)
 
 
-def measure(
-    seconds: float = SECONDS, model: str = '', only: tuple[str, ...] = STAGES
-) -> dict[str, Any]:
+def measure(only: tuple[str, ...] = STAGES, *, quick: bool = False) -> dict[str, Any]:
     """What comes of images at the rate of a camera."""
+    seconds = 1.0 if quick else SECONDS
     stages: dict[str, Callable[[], Any]] = {
         'added, raw': lambda: _added('raw', seconds),
         'added, compressed': lambda: _added('compressed', seconds),
         'filter_node': lambda: _held(_filter(), seconds),
-        **{str(count): lambda n=count: _of_people(_bme(model), n, seconds) for count in PEOPLE},
     }
 
     def tried(stage: Callable[[], Any]) -> Any:
@@ -111,11 +105,11 @@ def measure(
 
     chosen = {name: (lambda stage=stage: tried(stage)) for name, stage in stages.items()}
     with changed_environment({'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE)}):
-        return run_stages('nodes', chosen, only)
+        return run_stages('nodes', chosen, only[:1] if quick else only)
 
 
 def _added(transport: str, seconds: float) -> dict[str, Any]:
-    (found,) = followed(prompt_feed(transport), seconds, RATE)
+    found = followed(prompt_feed(transport), seconds, RATE)
     times = found['latency_ms']
     wanted = f'{MEDIAN_MS:g} ms median, {LATE_MS:g} ms at 99 %, none lost'
     return {
@@ -127,27 +121,11 @@ def _added(transport: str, seconds: float) -> dict[str, Any]:
     }
 
 
-def _of_people(feed: Feed, count: int, seconds: float) -> dict[str, Any]:
-    """Nodes for so many people in namespaces of their own; each has its own images."""
-    names = tuple(f'/humans/bodies/p{i}' for i in range(count)) if count > 1 else ('',)
-    people = followed(feed, seconds, RATE, names)
-    worst = max(people, key=lambda found: found['latency_ms']['99 %'] or np.inf)
-    results, images = (sum(found[what] for found in people) for what in ('results', 'images'))
-    return {
-        **worst,
-        'images': images,
-        'results': results,
-        'people': people,
-        'wanted': f'at least {100 * KEPT:g} % of the images',
-        'met': all(found['results'] >= KEPT * found['images'] for found in people),
-    }
-
-
 def _held(feed: Feed, seconds: float) -> dict[str, Any]:
     """The filter at a rate that it can hold: it must use every image."""
-    (reached,) = followed(feed, seconds, None)
+    reached = followed(feed, seconds, None)
     rate = HELD * reached['answered_hz']
-    (found,) = followed(feed, seconds, rate)
+    found = followed(feed, seconds, rate)
     return {
         **found,
         'reached_hz': reached['answered_hz'],
@@ -156,60 +134,46 @@ def _held(feed: Feed, seconds: float) -> dict[str, Any]:
     }
 
 
-def followed(
-    feed: Feed, seconds: float, rate: float | None, namespaces: Sequence[str] = ('',)
-) -> list[dict[str, Any]]:
-    """Publishes images to nodes, forwards and backwards, and listens to results.
+def followed(feed: Feed, seconds: float, rate: float | None) -> dict[str, Any]:
+    """Publishes images to a node, forwards and backwards, and listens to results; what came.
 
     Args:
         feed: the node, and what it gets.
         seconds: that are measured.
         rate: images a second; None: one when the one before is answered.
-        namespaces: of the nodes, one each.
-
-    Returns:
-        Of each node what came.
     """
     with ExitStack() as opened:
         player = Player(opened)
-        nodes = [_Heard(feed, player, opened, namespace) for namespace in namespaces]
-        for one in nodes:
-            one.connect()
+        one = _Heard(feed, player, opened)
+        one.connect()
         data = [serialise(image) for image in feed.images]
         # What is compiled in the first images is not to be waited for by the others.
         for number in range(WARM_UP):
-            for one in nodes:
-                one.show(number, data)
-            for one in nodes:
-                one.wait(player)
-        warm = len(nodes[0].sent)
+            one.show(number, data)
+            one.wait(player)
         first, number = time.perf_counter(), 0
         while time.perf_counter() < first + seconds:
-            for i, one in enumerate(nodes):
-                if rate is not None:
-                    # Cameras are not synchronised.
-                    due = first + (number + i / len(nodes)) / rate
-                    while (left := due - time.perf_counter()) > 0:
-                        player.executor.spin_once(timeout_sec=left)
-                one.show(warm + number, data)
-                if rate is None:
-                    one.wait(player)
+            if rate is not None:
+                while (left := first + number / rate - time.perf_counter()) > 0:
+                    player.executor.spin_once(timeout_sec=left)
+            one.show(WARM_UP + number, data)
+            if rate is None:
+                one.wait(player)
             number += 1
         spent = time.perf_counter() - first
         late = spent - number / rate if rate is not None else 0.0
         end = time.perf_counter() + PATIENCE
-        while time.perf_counter() < end and not all(one.complete() for one in nodes):
+        while time.perf_counter() < end and not one.complete():
             player.executor.spin_once(timeout_sec=0.05)
-        for one in nodes:
-            one.node.stop_well()
-    return [one.told(warm, rate, number / spent, late) for one in nodes]
+        one.node.stop_well()
+    return one.told(WARM_UP, rate, number / spent, late)
 
 
 class _Heard:
     """A node, what it was shown, and when results came."""
 
-    def __init__(self, feed: Feed, player: Player, opened: ExitStack, namespace: str) -> None:
-        self.feed, self.namespace = feed, namespace
+    def __init__(self, feed: Feed, player: Player, opened: ExitStack) -> None:
+        self.feed = feed
         self.sent: dict[int, float] = {}
         self.arrived: dict[int, float] = {}
         topics = {feed.result: feed.topics[feed.result]}
@@ -220,7 +184,6 @@ class _Heard:
             feed.parameters,
             inputs=feed.inputs(),
             topics={},
-            namespace=namespace,
             module=feed.module,
             write=_ignored,
         )
@@ -232,8 +195,7 @@ class _Heard:
             seconds, nanoseconds = np.frombuffer(data, '<i4', 2, 4).tolist()
             self.arrived[seconds * 10**9 + nanoseconds] = now
 
-        topic = f'{namespace}/{feed.result}'
-        player.node.create_subscription(kind, topic, heard, player.reliable, raw=True)
+        player.node.create_subscription(kind, feed.result, heard, player.reliable, raw=True)
 
     def connect(self) -> None:
         """Returns when it listens, and is listened to."""
@@ -266,7 +228,6 @@ class _Heard:
             [self.arrived[x] - self.sent[x] for x in counted if x in self.arrived]
         )
         return {
-            'namespace': self.namespace,
             'rate_hz': rate if rate is not None else reached,
             'answered_hz': reached * len(delays) / max(len(counted), 1),
             'images': len(counted),
@@ -302,25 +263,6 @@ def prompt_feed(transport: str) -> Feed:
         bme_session.TOPICS,
         bme_session.PREDICTION,
         replace(info, width=SIZE[0], height=SIZE[1]),
-        images,
-        10**18,
-        round(1e9 / RATE),
-    )
-
-
-def _bme(model: str) -> Feed:
-    folder, info, images = _recorded()
-    return Feed(
-        'bme_node',
-        '',
-        BmeParameters(
-            image_transport='compressed',
-            background_file=str(folder / 'background.png'),
-            model_file=model,
-        ),
-        bme_session.TOPICS,
-        bme_session.PREDICTION,
-        info,
         images,
         10**18,
         round(1e9 / RATE),
@@ -376,9 +318,6 @@ _ROWS = {
     'added, raw': 'ROS alone, 640x480 bgr8',
     'added, compressed': 'ROS alone, 640x480 JPEG',
     'filter_node': 'filter_node',
-    '1': 'bme_node of 1 person',
-    '2': 'bme_nodes of 2 people',
-    '4': 'bme_nodes of 4 people',
 }
 
 

@@ -11,12 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.clips import Clip, at_rate, read_clip, read_detections, table
+from benchmarks.clips import Clip, at_rate, read_clip, table
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
-from benchmarks.runs import IMAGES, INPUTS, KEYPOINTS, keypoints_only, new_tracker
+from benchmarks.runs import IMAGES, INPUTS, begun
 from hmt_ros.app.progress import with_progress
-from hmt_ros.body import load_body
-from hmt_ros.tracking import TrackerSettings
 
 OPENCV = 'MOG2 + Canny + distance transform'
 # Images a second besides all of them, and images that start a track.
@@ -35,14 +33,14 @@ def speed(clip: Clip) -> dict[str, Any]:
 
     assert clip.background is not None
     forget_peak()
-    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    tracker = begun(clip, IMAGES)[0]
     subtractor = cv2.createBackgroundSubtractorMOG2()
     for _ in range(10):
         subtractor.apply(clip.background)
     # Compile, or load what was compiled, before anything is timed.
     for stamp, image in islice(zip(clip.stamps, clip.images, strict=True), 3):
         tracker.step(image, stamp)
-    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    tracker = begun(clip, IMAGES)[0]
     clock = StageClock()
     steps, reference = [], []
     with clock.running():
@@ -90,20 +88,16 @@ def costs(folder: Path, limit: int | None = None) -> list[dict[str, Any]]:
     Raises:
         ValueError: the clip can not be read.
     """
-    whole, body = read_clip(folder, limit), load_body('human37')
-    detected = (folder / 'keypoints_mediapipe.npz').is_file()
-    known = read_detections(folder).keypoints if detected else {}
+    whole, detected = read_clip(folder, limit), (folder / 'keypoints_mediapipe.npz').is_file()
     rows = []
     for inputs in INPUTS if detected else (IMAGES,):
         for rate in (0.0, LOW_RATE):
-            clip, settings = at_rate(whole, rate), TrackerSettings()
-            settings = keypoints_only(settings) if inputs == KEYPOINTS else settings
-            subtractor = cv2.createBackgroundSubtractorMOG2()
-            tracker = new_tracker(clip, body, settings, 0)
+            clip, subtractor = at_rate(whole, rate), cv2.createBackgroundSubtractorMOG2()
+            tracker, known = begun(clip, inputs)
             spent, floor, evaluations = [], [], []
             for stamp, image in zip(clip.stamps, clip.images, strict=True):
                 start = time.process_time()
-                tracker.step(image, stamp, None if inputs == IMAGES else known.get(stamp))
+                tracker.step(image, stamp, known.get(stamp))
                 middle = time.process_time()
                 opencv_work(subtractor, image)
                 floor.append(time.process_time() - middle)
@@ -155,7 +149,7 @@ def opencv_work(subtractor: Any, image: Any) -> Any:
 def memory(clip: Clip, frames: int) -> dict[str, Any]:
     """Resident memory while a clip is played back and forth."""
     forget_peak()
-    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    tracker = begun(clip, IMAGES)[0]
     every = max(frames // 50, 1)
     seen: list[tuple[int, float]] = []
     images = clip.back_and_forth(frames)

@@ -15,7 +15,6 @@ import cv2
 import pytest
 import yaml
 
-from benchmarks import BENCHMARKS
 from hmt_ros.app import COMMANDS
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import Scores
@@ -138,7 +137,7 @@ def test_commands_are_understood(page):
         if words[:3] == ['python', '-m', 'hmt_ros']:
             parse(words[3:])
         elif words[:3] == ['python', '-m', 'benchmarks']:
-            assert words[3] in BENCHMARKS
+            assert (RESULTS / f'{words[3]}.md').is_file(), words
         elif words[0] == 'python':
             assert words[1].startswith('examples/'), words
             assert (ROOT / words[1]).is_file(), words
@@ -225,14 +224,6 @@ def test_page_of_a_node_tells_of_every_parameter(node):
         assert f'The other {len(shared)} are as for [filter_node]' in after
     else:
         assert set(codes(after)) == shared
-
-
-def test_every_benchmark_has_its_results():
-    pages = {page.stem: page.read_text('utf-8') for page in RESULTS.glob('*.md')}
-    assert set(pages) == {*BENCHMARKS}
-    for name, text in pages.items():
-        assert text.startswith(f'# {name}: {BENCHMARKS[name]}\n'), name
-        assert text.count('\n|') > 2, f'run: python docs/generate.py {name}'
 
 
 def rows(page: str, heading: str) -> list[list[str]]:

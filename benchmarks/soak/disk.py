@@ -5,15 +5,14 @@ from __future__ import annotations
 import contextlib
 import io
 import resource
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from benchmarks.clips import ROOT
-from benchmarks.soak.faults import place
-from benchmarks.soak.outcome import Amount, Outcome
+from benchmarks.soak.outcome import Amount, Outcome, place
 from benchmarks.soak.scenes import CLIP
-from hmt_ros.app import make_bag
 from hmt_ros.app.replay import command as replay
 from hmt_ros.experts import load_predictor
 from hmt_ros.experts.model_file import read_arrays, write_arrays
@@ -33,10 +32,8 @@ def disk(amount: Amount) -> Iterator[Outcome]:
     """
     with TemporaryDirectory(prefix='hmt_ros.') as folder:
         root = Path(folder)
-        replayed = amount.part(0.1)
-        yield _limited('replay', replayed, root / 'a', _replays, _is_whole_bag)
-        yield _limited('make-bag', amount.part(0.3), root / 'b', _makes, _is_whole_bag)
-        yield _limited('a model file', amount.part(0.6), root / 'c', _writes_model, _is_whole_model)
+        yield _limited('replay', amount.part(0.1), root / 'a', _replays, _is_whole_bag)
+        yield _limited('a model file', amount.part(0.9), root / 'b', _writes_model, _is_whole_model)
 
 
 def _limited(
@@ -83,8 +80,10 @@ def _limited(
                 outcome.lost += 1
                 outcome.fault(f'not whole: {place(fault)}')
         for path in folder.iterdir():
-            if path != whole:
-                _remove(path)
+            if path.is_dir() and path != whole:
+                shutil.rmtree(path)
+            elif path != whole.with_suffix('.npz') and path != whole:
+                path.unlink()
     return outcome
 
 
@@ -113,13 +112,6 @@ def _replays(target: Path) -> str:
     )  # fmt: skip
 
 
-def _makes(target: Path) -> str:
-    return _command(
-        make_bag.main, 'reach', '-o', str(target), '--duration', '0.2', '--size', '64x48',
-        '--quiet',
-    )  # fmt: skip
-
-
 def _writes_model(target: Path) -> str:
     try:
         write_arrays(target.with_suffix('.npz'), read_arrays(MODEL))
@@ -143,12 +135,3 @@ def _is_whole_model(path: Path) -> None:
 def _largest_file(path: Path) -> int:
     files = path.rglob('*') if path.is_dir() else path.parent.glob(f'{path.name}*')
     return max(file.stat().st_size for file in files if file.is_file())
-
-
-def _remove(path: Path) -> None:
-    if not path.is_dir():
-        path.unlink()
-        return
-    for inner in path.iterdir():
-        _remove(inner)
-    path.rmdir()

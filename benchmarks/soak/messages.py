@@ -12,8 +12,7 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.mutations import damaged, messages_of
-from benchmarks.soak.faults import place, warnings_as_errors
-from benchmarks.soak.outcome import Amount, Outcome
+from benchmarks.soak.outcome import Amount, Outcome, place, warnings_as_errors
 from benchmarks.soak.scenes import Scene, scenes, stamped
 from hmt_ros.body import load_body
 from hmt_ros.sessions.filter_session import FilterSession

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.flesh import Flesh
@@ -13,6 +12,7 @@ from hmt_ros.motion.limb_motions import arm_posture
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render, render_frames, render_silhouettes
 from hmt_ros.rendering.scene import Scene
+from test.oracles.numpy_contour import occluding_contour
 
 VIEW = Viewpoint(distance=3.2)
 BARE = Scene(viewpoint=VIEW, noise=0.0, shadow=0.0, clutter=2)

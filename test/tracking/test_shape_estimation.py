@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import numpy_likelihood as oracle
-from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Camera
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
@@ -32,6 +30,8 @@ from hmt_ros.tracking.shape_estimation import (
     Linearised,
     ShapeEstimate,
 )
+from test.oracles import numpy_likelihood as oracle
+from test.oracles.numpy_contour import occluding_contour
 
 VIEW = Viewpoint(distance=3.2)
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
