@@ -9,10 +9,9 @@ from types import ModuleType
 # Benchmark, which is the module of that name: what it measures.
 BENCHMARKS = {
     'absence': 'whether a visible person is taken for nobody, an empty scene for somebody',
-    'bags': 'what replay adds to the estimate, and memory with a large bag',
+    'bags': 'what replay adds to the time of the estimate',
     'blind': 'what is said of a person whom nothing explains, and of one whom something does',
     'contour_noise': 'how far contours of people lie from those of the model',
-    'error_model': 'how far the errors of each cue are independent, in an image and in time',
     'experts': 'what the predictor that ships says of silhouettes, and its speed',
     'forecast': 'where a person is said to be soon, against holding the last pose',
     'gate': 'whether a step of the tracker costs more than a table that is checked in says',
@@ -24,7 +23,7 @@ BENCHMARKS = {
     'lifting': 'poses from keypoints alone, on clips with truth',
     'live': 'the nodes at the images of a camera that does not wait for them',
     'motion_prior': 'how well the motion prior predicts motions of other people',
-    'nodes': 'what ROS adds to an image, and the rate that the filter holds',
+    'nodes': 'what ROS adds to an image',
     'people': 'two people cross: are they told apart afterwards?',
     'real_clips': 'real people, beside the own 3D of the detector',
     'real_video': 'real videos without truth: keypoints held out, feet, lengths',

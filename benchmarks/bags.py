@@ -1,4 +1,4 @@
-"""bags: what replay adds to the estimate, and memory with a large bag."""
+"""bags: what replay adds to the time of the estimate."""
 
 from __future__ import annotations
 
@@ -7,111 +7,40 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.clips import COMPRESSED, ROOT, find_clips, table
-from benchmarks.command import add_choice, benchmark_parser, run_stages, show
-from benchmarks.machine import forget_peak, peak_memory, resident_memory
+from benchmarks.command import benchmark_parser, run_benchmark
+from benchmarks.machine import description
 from benchmarks.stages import StageClock, Stages
 from hmt_ros.app.replay import command as replay
 from hmt_ros.experts.pose_predictor import PosePredictor
-from hmt_ros.image.background import BackgroundModel
-from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing import SlidingWindow, TrajectoryMixture
+from hmt_ros.smoothing import SlidingWindow
 from hmt_ros.tracking import Tracker
-from msg_tools import BagReader, BagWriter, RosbagsMessages
-from msg_tools.messages.headers import header_message
+from msg_tools import BagReader
 
-STAGES = ('memory', 'replay')
 MOST_ADDED = 0.1  # of the time of the estimate
-MOST_GROWTH = 32e6  # bytes of memory, from a twentieth of a bag to its end
-LARGE = 2_000_000_000  # bytes
-QUICK_LARGE = 20_000_000
-PICTURE_BYTES = 100_000
 # What estimates: all else that replay does is added by it.
 ESTIMATE = 'estimate'
 ESTIMATORS: Stages = (
     (Tracker, 'step', ESTIMATE),
     (SlidingWindow, 'step', ESTIMATE),
     (SlidingWindow, 'finish', ESTIMATE),
-    (TrajectoryMixture, 'marginal', ESTIMATE),
-    (GaussianMixture, 'reduce', ESTIMATE),
-    (BackgroundModel, 'learn', ESTIMATE),
-    (BackgroundModel, 'silhouette', ESTIMATE),
     (PosePredictor, 'observe', ESTIMATE),
 )
 
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = benchmark_parser('bags', __doc__, quick='a small bag, and a replay of one kind')
-    add_choice(parser, STAGES)
+    parser = benchmark_parser('bags', __doc__, quick='the smallest bag, and the filter alone')
     options = parser.parse_args(argv)
-    result = measure(quick=options.quick, only=options.only)
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'bags', lambda: measure(quick=options.quick), as_text, as_json=options.json
+    )
 
 
-def measure(*, quick: bool = False, only: tuple[str, ...] = STAGES) -> dict[str, Any]:
-    """All stages, on bags in a temporary folder."""
+def measure(*, quick: bool = False) -> dict[str, Any]:
+    """What replay adds, on bags in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix='benchmark_bags.') as name:
-        folder = Path(name)
-        stages = {
-            'memory': lambda: memory(folder, QUICK_LARGE if quick else LARGE),
-            'replay': lambda: replayed(folder, quick=quick),
-        }
-        return run_stages('bags', stages, only)
-
-
-# Memory
-
-
-def pictures(path: Path, size: float) -> Path:
-    """A bag with so many bytes of what can not be compressed, as pictures are."""
-    messages = RosbagsMessages()
-    rng = np.random.default_rng(0)
-    with BagWriter(path) as bag:
-        for i in range(max(10, round(size / PICTURE_BYTES))):
-            stamp = 10**18 + i * 33_333_333
-            picture = messages.create(
-                'sensor_msgs/msg/CompressedImage',
-                header=header_message(messages, stamp, 'camera'),
-                format='jpeg',
-                data=rng.integers(0, 256, PICTURE_BYTES, dtype=np.uint8),
-            )
-            bag.write('image/compressed', stamp, picture)
-    return path
-
-
-def memory(folder: Path, size: int) -> dict[str, Any]:
-    """Resident memory while a large bag is written, and while it is read."""
-    forget_peak()
-    path = pictures(folder / 'large', size)
-    writing = peak_memory()
-    stored = sum(file.stat().st_size for file in path.iterdir())
-    track: list[list[float]] = []
-    forget_peak()
-    start = time.perf_counter()
-    with BagReader(path) as bag:
-        count = bag.message_count()
-        marks = {round(share * (count - 1)) for share in np.linspace(0.05, 1.0, 20)}
-        for i, stored_message in enumerate(bag.messages()):
-            assert len(stored_message.message.data) == PICTURE_BYTES
-            if i in marks:
-                track.append([i / (count - 1), resident_memory() / 1e6])
-    growth = 1e6 * (max(used for _, used in track) - track[0][1])
-    return {
-        'gb': stored / 1e9,
-        'seconds': time.perf_counter() - start,
-        'writing_mb': writing / 1e6,
-        'reading_mb': peak_memory() / 1e6,
-        'resident_mb': track,
-        'growth_mb': growth / 1e6,
-        'wanted': f'at most {MOST_GROWTH / 1e6:g} MB more from a twentieth of it to the end',
-        'met': growth <= MOST_GROWTH,
-    }
-
-
-# Replay
+        return {'machine': description(), 'replay': replayed(Path(name), quick=quick)}
 
 
 def replayed(folder: Path, *, quick: bool = False) -> list[dict[str, Any]]:
@@ -159,43 +88,19 @@ def _run(source: Path, target: Path, options: list[str]) -> None:
         raise ValueError(f'replay of {source} ended with {code}')
 
 
-# What is printed
-
-
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables for people."""
-    tables = {'memory': _memory_rows, 'replay': _replay_rows}
-    return '\n\n'.join(
-        table(rows(result[stage]), markdown=markdown)
-        for stage, rows in tables.items()
-        if stage in result
-    )
-
-
-def _memory_rows(case: dict[str, Any]) -> list[list[str]]:
-    return [
-        [
-            'resident memory', 'size', 'growth on the way', 'most, reading', 'most, writing',
-            f'at most {MOST_GROWTH / 1e6:g} MB more',
-        ],
-        [
-            'one large bag', f'{case["gb"]:.2f} GB', f'{case["growth_mb"]:.1f} MB',
-            f'{case["reading_mb"]:.0f} MB', f'{case["writing_mb"]:.0f} MB', _verdict(case),
-        ],
-    ]  # fmt: skip
-
-
-def _replay_rows(cases: list[dict[str, Any]]) -> list[list[str]]:
+    """A table for people."""
     most = f'at most {100 * MOST_ADDED:g} %'
-    return [['replay, per image', 'images', 'estimate', 'added', 'share', most]] + [
+    rows = [['replay, per image', 'images', 'estimate', 'added', 'share', most]]
+    rows += [
         [
-            f'{case["clip"]}, {case["what"]}', str(case['images']),
-            f'{case["estimate_ms"]:.0f} ms', f'{case["added_ms"]:.1f} ms',
-            f'{100 * case["share"]:.1f} %', _verdict(case),
+            f'{case["clip"]}, {case["what"]}',
+            str(case['images']),
+            f'{case["estimate_ms"]:.0f} ms',
+            f'{case["added_ms"]:.1f} ms',
+            f'{100 * case["share"]:.1f} %',
+            'met' if case['met'] else 'missed',
         ]
-        for case in cases
-    ]  # fmt: skip
-
-
-def _verdict(case: dict[str, Any]) -> str:
-    return 'met' if case['met'] else 'missed'
+        for case in result['replay']
+    ]
+    return table(rows, markdown=markdown)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -73,12 +73,6 @@ class Clip:
     def subject(self) -> Path:
         """The subject file."""
         return self.folder / 'subject.yaml'
-
-    def back_and_forth(self, frames: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """So many images with increasing stamps: to the end, back to the start, and again."""
-        step = self.stamps[1] - self.stamps[0]
-        for i in range(frames):
-            yield self.stamps[0] + i * step, self.images[index_back_and_forth(i, len(self.images))]
 
 
 def at_rate(clip: Clip, rate: float) -> Clip:

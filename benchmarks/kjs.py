@@ -87,7 +87,7 @@ class Samples:
         costs: (N,) of those, above the start.
         optimised: what came of them.
         minima: indices of the distinct minima, best first.
-        drawing, optimising: CPU time, s.
+        seconds: CPU time of drawing and optimising, s.
     """
 
     sampler: str
@@ -96,8 +96,7 @@ class Samples:
     costs: Array
     optimised: Minimum
     minima: NDArray[np.intp]
-    drawing: float
-    optimising: float
+    seconds: float
 
 
 def main(argv: list[str]) -> int:
@@ -191,15 +190,11 @@ def sampled(
     for _ in range(runs):
         start = time.process_time()
         raw = draw()
-        drawn = time.process_time()
         optimised = optimise(setting.body, setting.energy, raw)
-        times.append((drawn - start, time.process_time() - drawn))
-    drawing, optimising = min(times, key=sum)
+        times.append(time.process_time() - start)
     costs = setting.energy.energy(raw, derivatives=False).value - setting.start.value[0]
-    return Samples(
-        sampler, scale, raw, costs, optimised, minima_of(setting.body, optimised), drawing,
-        optimising,
-    )  # fmt: skip
+    minima = minima_of(setting.body, optimised)
+    return Samples(sampler, scale, raw, costs, optimised, minima, min(times))
 
 
 def minima_of(body: Body, optimised: Minimum) -> NDArray[np.intp]:
@@ -211,28 +206,23 @@ def minima_of(body: Body, optimised: Minimum) -> NDArray[np.intp]:
 
 def row(setting: Setting, found: Samples) -> dict[str, Any]:
     """What the table says about samples; medians of raw and of optimised ones."""
-    joints = setting.body.joint_positions(found.optimised.x[np.argsort(found.optimised.value)])
     optimised = found.optimised.value - setting.start.value[0]
     converged = found.optimised.status == Status.CONVERGED
     distances = [distances_from(setting, x) for x in (found.raw, found.optimised.x[converged])]
-    seconds = found.drawing + found.optimising
     return {
         'sampler': found.sampler,
         'scale': found.scale,
         'samples': len(found.raw),
         'minima': len(found.minima),
-        'distinct_with_unconverged': len(distinct_poses(joints, APART).kept),
         'alike': int((optimised[found.minima] < ALIKE).sum()),
         'unconverged': int((~converged).sum()),
         'distance': [float(np.median(d)) for d, _ in distances],
         'deviations': [float(np.median(m)) for _, m in distances],
         'cost': [float(np.median(found.costs)), float(np.median(optimised[converged]))],
-        'evaluations': int(found.optimised.iterations.sum()),
-        'drawing_cpu_s': found.drawing,
-        'cpu_s': seconds,
+        'cpu_s': found.seconds,
         'minima_per_sample': len(found.minima) / len(found.raw),
         'alike_per_sample': (optimised[found.minima] < ALIKE).sum() / len(found.raw),
-        'minima_per_cpu_s': len(found.minima) / seconds,
+        'minima_per_cpu_s': len(found.minima) / found.seconds,
     }
 
 

@@ -42,11 +42,10 @@ from benchmarks.tracking_means import (
     grouped,
     key_of,
     means_of,
-    medians_of,
     paired,
 )
 from benchmarks.tracking_scores import detector_scores, scores_of
-from benchmarks.tracking_speed import PRICED, costs, memory, speed
+from benchmarks.tracking_speed import PRICED, costs, speed
 from benchmarks.tracking_tables import COMPARED, HEAVIEST, as_text
 
 PARTS = ('accuracy', 'speed')
@@ -102,10 +101,6 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         '--processes', type=int, default=0, metavar='N', help='of one thread each (one a core)'
     )
-    parser.add_argument(
-        '--frames', type=int, default=0, metavar='N',
-        help='follow memory over so many images of a clip that is played back and forth',
-    )  # fmt: skip
     options = parser.parse_args(argv)
     usual = () if options.against or options.baseline else PARTS
     try:
@@ -117,7 +112,6 @@ def main(argv: list[str]) -> int:
             options.parts or usual,
             parsed_changes(options.against),
             options.processes,
-            options.frames,
             quick=options.quick,
             start=options.start,
             rates=options.rates,
@@ -138,7 +132,6 @@ def measure(
     parts: Sequence[str] = PARTS,
     against: tuple[tuple[str, Any], ...] = (),
     processes: int = 0,
-    frames: int = 0,
     *,
     quick: bool = False,
     start: str = SUBJECT,
@@ -156,7 +149,6 @@ def measure(
         parts: some of `PARTS`.
         against: changed settings that the tracker is compared with; empty: no comparison.
         processes: number of processes; 0: one a core.
-        frames: over so many images memory is followed.
         quick: 20 images a clip, one seed.
         start: what tracks start from, one of `runs.STARTS`; with images alone always the subject.
         rates: images a second at most; `USUAL_RATE` or more: all images.
@@ -217,8 +209,6 @@ def measure(
         result['speed'] = speed(read_clip(timed, QUICK if quick else 60))
         priced = [folder for folder in still if folder.name in PRICED] or [timed]
         result['costs'] = [row for folder in priced for row in costs(folder, limit)]
-    if timed is not None and frames > 0:
-        result['memory'] = memory(read_clip(timed), frames)
     return result
 
 
@@ -288,6 +278,5 @@ def _compared(
     return {
         'groups': grouped(entries),
         'means': means_of(averaged),
-        'medians': medians_of(averaged),
         'paired': paired(entries, HEAVIEST.key),
     }

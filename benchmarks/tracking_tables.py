@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from benchmarks.clips import table
 from benchmarks.runs import GIVEN
 from benchmarks.tracking_means import DETECTOR
-from benchmarks.tracking_speed import OPENCV, costs_as_text, memory_as_text, speed_as_text
+from benchmarks.tracking_speed import OPENCV, costs_as_text, speed_as_text
 
 
 class Column(NamedTuple):
@@ -68,12 +68,6 @@ MISTAKES = (
     WRONG_WAY, Column('images', 'wrong_way_images', '.1f'), WRONG_SIGN, NOBODY,
     EVALUATIONS, Column('99 %', 'evaluations_99'), Column('ms', 'ms'), CPU,
 )  # fmt: skip
-# Where the model has joints of the trunk.
-OFFSETS = tuple(
-    Column(f'{joint}, {way}', f'{joint}_{way}_mm', '+.0f')
-    for joint in ('neck', 'shoulders', 'hips')
-    for way in ('ahead', 'up')
-)
 # Of two kinds of settings.
 COMPARED = tuple(
     column._replace(form=column.form.replace('.0f', '.1f'))
@@ -100,12 +94,6 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         parts.append(_table(group, CALIBRATION, markdown, worst_joint=True))
         parts.append(f'{group["group"]}: large mistakes, and what an image costs.')
         parts.append(_table(group, MISTAKES, markdown))
-        if group['means']:
-            parts.append(
-                f'{group["group"]}: how far joints lie ahead and above the true ones, mm, seen '
-                'from the pelvis in the frame of the trunk.'
-            )
-            parts.append(_table({**group, 'clips': []}, OFFSETS, markdown))
     if 'against' in result:
         found = result['against']
         what = f'{", ".join(found["changes"])} minus the usual settings'
@@ -121,8 +109,6 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         parts.append(speed_as_text(result['speed'], cores, markdown=markdown))
         parts.append(f'Processor time of a step in floors, that of {OPENCV} of the same images:')
         parts.append(costs_as_text(result['costs'], markdown=markdown))
-    if 'memory' in result:
-        parts.append(memory_as_text(result['memory']))
     return '\n\n'.join(parts)
 
 
@@ -134,7 +120,7 @@ def _table(
     sign: str = '',
     worst_joint: bool = False,
 ) -> str:
-    """Clips and inputs, then means with their intervals and medians of each input."""
+    """Clips and inputs, then means of each input with their intervals."""
     extra = [WORST_JOINT] if worst_joint else []
     entries = [*group['clips'], *group['means']]
     rated = ['rate'] if any(entry['rate'] > 0 for entry in entries) else []
@@ -149,15 +135,13 @@ def _table(
         cells = [column.cell(entry.get(column.key), _sign(column, sign)) for column in columns]
         cells += [_worst_joint(entry)] if worst_joint else []
         rows.append([*head(entry['clip'], entry), *cells])
-    for means, medians in zip(group['means'], group['medians'], strict=True):
+    for means in group['means']:
         known = [(column, means.get(column.key, [None] * 3)) for column in columns]
         cells = [column.cell(values[0], _sign(column, sign)) for column, values in known]
         cells += [_worst_joint(means)] if worst_joint else []
         rows.append([*head('mean', means), *cells])
         ends = [_ends(column, values, sign) for column, values in known]
         rows.append([*head('95 %', means), *ends, *['' for _ in extra]])
-        cells = [column.cell(medians.get(column.key), _sign(column, sign)) for column in columns]
-        rows.append([*head('median', medians), *cells, *['' for _ in extra]])
     return table(rows, left=2 + len(rated) + len(upright), markdown=markdown)
 
 

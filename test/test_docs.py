@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import pytest
 import yaml
 
@@ -207,25 +206,6 @@ def test_generated_parts_are_up_to_date():
         generate['with_part'](page, 'weather', '')
 
 
-@pytest.mark.parametrize('node', NODES)
-def test_page_of_a_node_tells_of_every_parameter(node):
-    """In its table, or by reference to that of filter_node, where default and meaning are equal."""
-    described = {codes(row[0])[0]: row[1:] for row in rows(page_of(node), '## Parameters')}
-    known = [] if node == 'filter_node' else declared_parameters(FilterParameters())
-    declared = {p.name: p for p in declared_parameters(NODES[node][0])}
-    shared = {name for name, p in declared.items() if p in known}
-    assert set(described) == set(declared) - shared
-    for name, (default, _) in described.items():
-        value = declared[name].default
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        assert codes(default) == ([text] if value not in ('', ()) else []), name
-    after = page_of(node).partition('New values take effect at once')[2].partition('<!-- end')[0]
-    if node == 'people_node':
-        assert f'The other {len(shared)} are as for [filter_node]' in after
-    else:
-        assert set(codes(after)) == shared
-
-
 def rows(page: str, heading: str) -> list[list[str]]:
     """Cells of the tables under a heading, without their heads."""
     text = page.partition(f'{heading}\n')[2]
@@ -318,14 +298,6 @@ def test_rosdoc2_finds_the_pages():
     folder = (ROOT / name).parent / builder['sphinx']['sphinx_sourcedir']
     assert (folder / 'conf.py').is_file()
     assert (folder / 'index.md').is_file()
-
-
-def test_the_picture_of_the_readme():
-    path = ROOT / 'docs' / 'overview.png'
-    assert path.stat().st_size < 300_000
-    height, width = cv2.imread(str(path)).shape[:2]
-    assert width >= 800
-    assert height >= 400
 
 
 @pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)

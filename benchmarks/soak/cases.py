@@ -11,7 +11,6 @@ from tqdm import tqdm
 
 from benchmarks.clips import table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
-from benchmarks.soak.disk import disk
 from benchmarks.soak.files import files
 from benchmarks.soak.messages import messages
 from benchmarks.soak.nodes import nodes
@@ -23,8 +22,7 @@ MINUTES = 10.0
 CASES: dict[str, tuple[Callable[[Amount], Iterator[Outcome]], int, int, float]] = {
     'messages': (messages, 100_000, 60, 0.45),
     'nodes': (nodes, 200, 2, 0.35),
-    'files': (files, 3000, 30, 0.10),
-    'disk': (disk, 40, 10, 0.10),
+    'files': (files, 3000, 30, 0.20),
 }
 
 
