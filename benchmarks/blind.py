@@ -20,7 +20,6 @@ detector   with the keypoints of MediaPipe
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +35,7 @@ from benchmarks.clips import (
     read_messages,
     table,
 )
-from benchmarks.command import add_choice, benchmark_parser, show
+from benchmarks.command import add_choice, benchmark_parser, run_benchmark
 from benchmarks.machine import description
 from benchmarks.runs import in_processes
 from hmt_ros.app.replay.options import NodeParameters
@@ -205,7 +204,7 @@ def measure(
         if not (case == VISIT and not (folder / 'background.png').is_file())
         and not (case == DETECTOR and not _has_keypoints(folder))
     ]  # fmt: skip
-    found = in_processes(answers_of, work, 0, 'blind')
+    found = in_processes(answers_of, work, 1 if quick else 0, 'blind')
     rows = []
     for case in cases:
         for rate in rates:
@@ -260,11 +259,11 @@ def main(argv: list[str]) -> int:
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     parser.add_argument('--rates', type=float, nargs='+', default=RATES, help='images a second')
     options = parser.parse_args(argv)
-    try:
-        found = measure(
+    return run_benchmark(
+        'blind',
+        lambda: measure(
             options.clips, tuple(options.only), tuple(options.rates), quick=options.quick
-        )
-    except ValueError as error:
-        print(f'blind: {error}', file=sys.stderr)
-        return 1
-    return show(found, as_text, as_json=options.json)
+        ),
+        as_text,
+        as_json=options.json,
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -50,7 +50,6 @@ class Clip:
         background: the empty scene; None: the camera moves.
         views: stamp -> true rotation (3, 3) and position (3,) of a camera that moves, in the world,
             m; they stand for odometry. Empty: it stands still, or the clip does not tell.
-        size: against that of the images in the bag.
         ups: stamp -> (3,) true unit vector against gravity, camera frame; empty: the clip does not
             tell it.
     """
@@ -62,7 +61,6 @@ class Clip:
     truth: Truth
     pixels: dict[int, NDArray[np.float64]]
     background: NDArray[np.uint8] | None
-    size: float = 1.0
     views: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
     ups: dict[int, NDArray[np.float64]] = field(default_factory=dict)
 
@@ -75,42 +73,6 @@ class Clip:
     def subject(self) -> Path:
         """The subject file."""
         return self.folder / 'subject.yaml'
-
-    def back_and_forth(self, frames: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """So many images with increasing stamps: to the end, back to the start, and again."""
-        step = self.stamps[1] - self.stamps[0]
-        for i in range(frames):
-            yield self.stamps[0] + i * step, self.images[index_back_and_forth(i, len(self.images))]
-
-
-def resized(clip: Clip, size: float) -> Clip:
-    """A clip with images of another size: as a camera with so many times the pixels had seen it.
-
-    Args:
-        clip: with its images as they are in its bag.
-        size: factor on width and height.
-    """
-    c = clip.camera
-    width, height = round(size * c.width), round(size * c.height)
-    across, down = width / c.width, height / c.height
-    centre = at_size(np.array([c.cx, c.cy]), (across, down))
-    camera = replace(
-        c, fx=across * c.fx, fy=down * c.fy, cx=float(centre[0]), cy=float(centre[1]),
-        width=width, height=height,
-    )  # fmt: skip
-
-    def scaled(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        result = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        return np.asarray(result, dtype=np.uint8)
-
-    return replace(
-        clip,
-        camera=camera,
-        images=[scaled(image) for image in clip.images],
-        pixels={stamp: at_size(x, (across, down)) for stamp, x in clip.pixels.items()},
-        background=None if clip.background is None else scaled(clip.background),
-        size=size,
-    )
 
 
 def at_rate(clip: Clip, rate: float) -> Clip:
@@ -144,14 +106,6 @@ def rows_at_rate(stamps: Sequence[int], rate: float) -> list[int]:
         if stamps[i] - stamps[rows[-1]] >= least:
             rows.append(i)
     return rows
-
-
-def at_size(pixels: NDArray[np.float64], factors: tuple[float, float]) -> NDArray[np.float64]:
-    """Pixels (..., 2) in an image whose width and height were multiplied by factors.
-
-    The centre of the first pixel is at (0, 0), its corner at (-1/2, -1/2).
-    """
-    return np.asarray((pixels + 0.5) * np.array(factors) - 0.5, dtype=np.float64)
 
 
 def index_back_and_forth(number: int, count: int) -> int:
@@ -301,8 +255,6 @@ LANDMARK_NAMES = (*_FACE, *(f'{side}_{x}' for x in _OF_SIDES for side in ('left'
 # Landmarks of the detector that have other names than our joints.
 LANDMARKS = {'left_foot_index': 'left_toe', 'right_foot_index': 'right_toe'}
 SCHEME = 'mediapipe33'
-# Standard deviation of a keypoint of the oracles, px.
-KEYPOINT_SIGMA = 5.0
 
 
 def read_detections(folder: Path, *, lifted: bool = True) -> Detections:

@@ -51,6 +51,36 @@ def show(result: dict[str, Any], text: Callable[[dict[str, Any]], str], *, as_js
     return 0
 
 
+def run_benchmark(
+    name: str,
+    measure: Callable[[], dict[str, Any]],
+    text: Callable[[dict[str, Any]], str],
+    *,
+    as_json: bool,
+) -> int:
+    """Measures and prints; the exit code.
+
+    Args:
+        name: of the benchmark.
+        measure: what is measured.
+        text: tells people of it.
+        as_json: whether a program is told.
+
+    Returns:
+        0, also where the data that the benchmark needs is not there, which a line on stderr says;
+        1: a line on stderr says what is wrong.
+    """
+    try:
+        result = measure()
+    except FileNotFoundError as error:
+        print(f'{name}: skipped, {error}', file=sys.stderr)
+        return 0
+    except ValueError as error:
+        print(f'{name}: {error}', file=sys.stderr)
+        return 1
+    return show(result, text, as_json=as_json)
+
+
 def run_stages(
     benchmark: str, stages: Mapping[str, Callable[[], Any]], only: Sequence[str]
 ) -> dict[str, Any]:

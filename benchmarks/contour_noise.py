@@ -4,12 +4,11 @@ The poses of the body, with the true lengths, that come nearest to the true join
 of another body; its flesh fitted once to the true silhouettes of all clips, a Gaussian prior on its
 growth; then the signed distances, positive inside out, of contour points that no other part covers
 to the outline of the subtracted silhouettes. Robust deviations by part, at the sides and in front
-and behind, and correlations along the contour. `-o` writes `hmt_ros/image/contour_noise.yaml`.
+and behind, and correlations along the contour: the content of `hmt_ros/image/contour_noise.yaml`.
 """
 
 from __future__ import annotations
 
-import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,27 +19,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clips import read_clip, table, with_file
-from benchmarks.command import benchmark_parser, show, told
+from benchmarks.clips import with_file
+from benchmarks.command import benchmark_parser, run_benchmark, told
 from benchmarks.machine import description
-from benchmarks.numpy_contour import occluding_contour
-from benchmarks.numpy_likelihood import project_surface
-from benchmarks.tracking_oracle import (
-    STARTS,
-    SUBTRACTED,
-    TRUE,
-    best_poses,
-    silhouettes_of,
-    with_true_lengths,
-)
-from hmt_ros.body import Body, Camera, load_body
+from benchmarks.truth_fits import QUICK, SUBTRACTED, TRUE, best_poses, fitted, silhouettes_of
+from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import GROWTH_SIGMAS, ShapeSpace
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.surface import (
+    empty_contour,
+    flesh_table_of,
+    lens_of,
+    mark_visibility,
+    trace_contour,
+)
 from hmt_ros.image.terms.image_term import TermSettings
-from hmt_ros.tracking import read_subject
-from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 
 Array = NDArray[np.float64]
@@ -49,7 +44,7 @@ Mask = NDArray[np.bool_]
 
 CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'exercise')
 EVERY = 12  # images
-QUICK = 2  # clips
+QUICK_EVERY, QUICK_STEPS = 60, 1
 # Of the true silhouettes, to which the flesh is fitted.
 TERM = TermSettings(30.0, 3.0, 8.0)
 SETTINGS = LikelihoodSettings.of_terms(coverage=TERM)
@@ -117,19 +112,17 @@ def posed(folder: Path, every: int = EVERY) -> Posed:
     Raises:
         ValueError: it can not be read, or lacks the true silhouettes or the empty scene.
     """
-    clip, model = read_clip(folder), load_body('human37')
+    clip, body, starts = fitted(folder)
     silhouettes = silhouettes_of(clip, every)
     if {SUBTRACTED, TRUE} - set(silhouettes):
         raise ValueError(f'{folder}: wanted true silhouettes and the empty scene')
-    begun = start_from_keypoints(model, clip.camera, read_subject(clip.subject, model))
-    body = with_true_lengths(begun.body, clip)
     pairs = zip(clip.images[::every], silhouettes[TRUE], strict=True)
     observations = [observe(*pair, wanted=('coverage',)) for pair in pairs]
-    poses = best_poses(body, clip, clip.stamps[::every], begun.poses[:STARTS])
+    poses = best_poses(body, clip, clip.stamps[::every], starts)
     return Posed(body, clip.camera, poses, observations, silhouettes[SUBTRACTED])
 
 
-def fitted_growth(clips: Sequence[Posed]) -> Array:
+def fitted_growth(clips: Sequence[Posed], most_steps: int = MOST_STEPS) -> Array:
     """How the groups of parts grow (G, 5) to fit the true silhouettes; poses are held.
 
     Levenberg-Marquardt, with a Gaussian prior of the deviations `GROWTH_SIGMAS`. The gradient is
@@ -140,7 +133,7 @@ def fitted_growth(clips: Sequence[Posed]) -> Array:
     spread = np.tile(np.array([*GROWTH_SIGMAS.values()]), groups)
     growth, damping = np.zeros(len(spread)), 0.1
     least, (gradient, curvature) = energy_of(clips, growth), derivatives_of(clips, growth)
-    for _ in range(MOST_STEPS):
+    for _ in range(most_steps):
         damped = curvature + damping * np.diag(np.diagonal(curvature))
         step = -np.linalg.solve(damped, gradient)
         furthest = float(np.abs(step / spread).max())
@@ -194,22 +187,35 @@ def grown(body: Body, growth: Array) -> Body:
 
 def contour_distances(body: Body, camera: Camera, poses: Array, masks: Sequence[Mask]) -> Distances:
     """Of the contour points that no part covers to the outlines of silhouettes, pose by pose."""
-    frames = forward(body.skeleton, poses)
-    surface, contour = project_surface(body, camera, frames), occluding_contour(body.flesh, frames)
-    columns, rows = np.round(surface.pixels).astype(np.intp)  # (P, N)
+    columns, origins = forward(body.skeleton, poses).by_pose()
+    count, every = len(body.flesh.ring_parts), np.ones(len(body.shapes), dtype=np.bool_)
+    # Deviations of 0 at the sides and 1 ahead make the noise of a point its share of ahead.
+    flesh = flesh_table_of(body)._replace(ring_noise=np.tile([0.0, 1.0], (count, 1)))
     height, width = masks[0].shape
-    inner = (columns >= MARGIN) & (columns < width - MARGIN)
-    inner &= (rows >= MARGIN) & (rows < height - MARGIN)
-    found, count = [], len(body.flesh.ring_parts)
+    found = []
     for n, mask in enumerate(masks):
-        use = np.flatnonzero(surface.valid[:, n] & ~surface.covered[:, n] & inner[:, n])
-        pixels = np.ascontiguousarray(mask).view(np.uint8)
-        away = signed_distance(pixels)
-        depths = surface.points[use, 2, n]
-        magnification = np.array([camera.magnification(float(z)) for z in depths])
-        values = away[rows[use, n], columns[use, n]] / magnification
-        ahead = np.abs(contour.turns[use, 1, n]) > AHEAD
+        contour = empty_contour(count)
+        trace_contour(flesh, every, lens_of(camera), columns[n], origins[n], contour)
+        mark_visibility(
+            flesh,
+            every,
+            columns[n],
+            origins[n],
+            contour.parts,
+            contour.points,
+            contour.valid,
+            contour.covered,
+            contour.hidden,
+        )
+        use = np.flatnonzero(contour.valid & ~contour.covered)
+        at, row = np.round(contour.pixels[use]).astype(np.intp).T
+        inner = (at >= MARGIN) & (at < width - MARGIN) & (row >= MARGIN) & (row < height - MARGIN)
+        use, at, row = use[inner], at[inner], row[inner]
+        away = signed_distance(np.ascontiguousarray(mask).view(np.uint8))
+        magnification = np.array([camera.magnification(z) for z in contour.points[use, 2].tolist()])
+        ahead = contour.noise[use] > AHEAD
         rings = np.where(use < count, use, use + count)
+        values = away[row, at] / magnification
         found.append((values, contour.parts[use], ahead, rings, np.full(len(use), n)))
     return Distances(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
@@ -258,7 +264,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
     Args:
         clips: folder of the clips; None: the development clips.
-        quick: two clips.
+        quick: a few images of two clips, and one step of the fit.
 
     Raises:
         FileNotFoundError: a clip is not there.
@@ -266,8 +272,9 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     """
     wanted = CLIPS[:QUICK] if quick else CLIPS
     folders = with_file(wanted, clips, 'truth.npz')
-    known = [posed(folder) for folder in told('contour_noise', folders)]
-    growth = fitted_growth(known)
+    every, steps = (QUICK_EVERY, QUICK_STEPS) if quick else (EVERY, MOST_STEPS)
+    known = [posed(folder, every) for folder in told('contour_noise', folders)]
+    growth = fitted_growth(known, steps)
     found = joined(
         [contour_distances(grown(x.body, growth), x.camera, x.poses, x.masks) for x in known]
     )
@@ -326,25 +333,9 @@ def as_yaml(result: dict[str, Any]) -> str:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
-    rows = [['part', 'points', 'sides, mm', 'median', 'points', 'front and behind, mm', 'median']]
-    for name, row in result['groups'].items():
-        cells = [name]
-        for side in ('side', 'ahead'):
-            own = row[side]
-            numbers = (own['deviation'], own['median'])
-            cells += [str(own['points'])]
-            cells += ['-' if x is None else f'{1e3 * x:.1f}' for x in numbers]
-        rows.append(cells)
-    near = ', '.join(f'{x:.2f}' for x in result['correlations'])
-    return '\n\n'.join(
-        [
-            f'Contours of {", ".join(result["clips"])} against the model at the true poses.',
-            table(rows, markdown=markdown),
-            f'Correlation 1, 2 and 3 rings apart: {near}; {result["points"]:.0f} points an image '
-            f'are worth {result["independent_points"]:.0f}.',
-        ]
-    )
+    """The file, as it is to be put in the place of `hmt_ros/image/contour_noise.yaml`."""
+    text = as_yaml(result)
+    return f'```yaml\n{text}```' if markdown else text
 
 
 def signed_distance(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -357,18 +348,14 @@ def signed_distance(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark; without the clips it tells so and does nothing."""
-    parser = benchmark_parser('contour_noise', __doc__, quick=f'{QUICK} clips')
+    parser = benchmark_parser(
+        'contour_noise', __doc__, quick='a few images of two clips, and one step of the fit'
+    )
     parser.add_argument('--clips', type=Path, metavar='DIR', help='folder of the clips')
-    parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='write a YAML file')
     options = parser.parse_args(argv)
-    try:
-        result = measure(options.clips, quick=options.quick)
-    except FileNotFoundError as error:
-        print(f'contour_noise: skipped, {error}', file=sys.stderr)
-        return 0
-    except ValueError as error:
-        print(f'contour_noise: {error}', file=sys.stderr)
-        return 1
-    if options.output is not None:
-        options.output.write_text(as_yaml(result), 'utf-8')
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'contour_noise',
+        lambda: measure(options.clips, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )

@@ -1,253 +1,209 @@
-"""experts: conditional densities on a toy, on motions and on clips; speed of both uses."""
+"""experts: what the predictor that ships says of the images of clips with truth, and its speed.
+
+Masks are the true ones, and those of background subtraction with the empty scene. Nobody of the
+clips was learned from.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from benchmarks import experts_clips, experts_figures, experts_motion, experts_start, experts_toy
-from benchmarks.clips import ROOT, table
-from benchmarks.command import add_choice, benchmark_parser, run_stages, show
-from benchmarks.experts_motion import BEST_OF, COLUMNS, Learned, SeenMotion
-from benchmarks.machine import best_time
-from hmt_learning.training.predictor_learning import kinds
-from hmt_learning.training.training_set import procedural_sequence
-from hmt_ros.body import Camera, load_body
-from hmt_ros.body.rasterisation import render_silhouettes
+from benchmarks.clips import Clip, find_clips, read_clip, table
+from benchmarks.command import benchmark_parser, run_benchmark
+from benchmarks.machine import best_time, description
+from benchmarks.runs import in_processes
+from benchmarks.tracking_means import GROUPS, group_of
+from hmt_ros.evaluation.pose_scores import joint_mixtures, origin_joints, score
+from hmt_ros.evaluation.track_scores import Truth
+from hmt_ros.experts.descriptor.contour import NoSilhouetteError
+from hmt_ros.experts.pose_predictor import ALONE, BY_DYNAMICS, PosePredictor, load_predictor
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.inference import GaussianMixture
+from msg_tools.files.array_file import read_archive
 
-STAGES = ('toy', 'oracle', 'learning', 'motion', 'clips', 'start', 'speed', 'figures')
-SAMPLES = 6000
-FIGURES = ROOT / 'build' / 'benchmarks' / 'experts'
-PROPAGATED = tuple(COLUMNS)
-MILLISECONDS = {'descriptor': 5.0, 'prediction': 1.0}
+Mask = NDArray[np.uint8]
+
+BEST_OF = 5
+QUICK = 8  # images
+STEP = 2  # interval of the images that are predicted without propagation
+TRUE, SUBTRACTED = 'true', 'subtracted'
+COLUMNS = (
+    'best_mm', 'heaviest_mm', 'depth_error', 'coverage_90', 'joint_coverage_90',
+    'propagated_best_mm', 'propagated_heaviest_mm',
+)  # fmt: skip
 
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = benchmark_parser('experts', __doc__, quick='fewer seeds, samples and frames')
-    add_choice(parser, STAGES)
-    parser.add_argument(
-        '--propagate', nargs='*', choices=COLUMNS, default=PROPAGATED, metavar='MODEL',
-        help=f'models that also learn dynamics (minutes for experts): {", ".join(COLUMNS)}',
-    )  # fmt: skip
-    parser.add_argument(
-        '--figures', type=Path, default=FIGURES, metavar='DIR',
-        help='folder of the figures of the paper (build/benchmarks/experts)',
-    )  # fmt: skip
+    parser = benchmark_parser('experts', __doc__, quick=f'{QUICK} images of two clips')
+    parser.add_argument('--clips', type=Path, help='folder of the clips')
     options = parser.parse_args(argv)
-    result = measure(
-        quick=options.quick, only=options.only, propagated=options.propagate,
-        figures=options.figures,
-    )  # fmt: skip
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'experts',
+        lambda: measure(options.clips, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )
 
 
-def measure(
-    *,
-    quick: bool = False,
-    only: Sequence[str] = STAGES,
-    propagated: Sequence[str] = PROPAGATED,
-    figures: Path = FIGURES,
-) -> dict[str, Any]:
-    """Runs the stages asked for."""
-    stages: dict[str, Callable[[], Any]] = {
-        'toy': lambda: experts_toy.toy_scores(*((2, (3,), 150, 500) if quick else ())),
-        'oracle': experts_toy.gaussian_mixture_oracle,
-        'learning': lambda: {
-            'time': experts_toy.learning(*((300, 2, 8, 0.0) if quick else ())),
-            'peer': experts_toy.regression_peer(*((200, 4) if quick else ())),
-        },
-        'motion': lambda: motion(quick, propagated),
-        'clips': lambda: experts_clips.clips(quick=quick),
-        'start': lambda: experts_start.starts(quick=quick),
-        'speed': lambda: speed(0.0 if quick else 1.0, 96 if quick else 3000),
-        'figures': lambda: experts_figures.draw(figures, quick=quick),
+def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
+    """Scores by clip, their means over groups of clips, and times of a prediction, ms.
+
+    Raises:
+        ValueError: there are no clips, or one can not be read.
+    """
+    folders, _ = find_clips(clips, moving=True)
+    work = [(folder, QUICK if quick else None) for folder in (folders[:2] if quick else folders)]
+    found = in_processes(of_clip, work, 1 if quick else 0, 'experts')
+    by_clip = {folder.name: one for (folder, _), one in zip(work, found, strict=True) if one}
+    means: dict[str, Any] = {}
+    for group in GROUPS:
+        for kind in (TRUE, SUBTRACTED):
+            rows = [x[kind] for name, x in by_clip.items() if group_of(name) == group and kind in x]
+            if rows:
+                means.setdefault(group, {})[kind] = {
+                    key: float(np.mean([row[key] for row in rows])) for key in rows[0]
+                }
+    masked = next((x for x in folders if (x / 'background.png').is_file()), None)
+    return {
+        'machine': description(),
+        'clips': by_clip,
+        'means': means,
+        'ms': None if masked is None else speed(masked, 0.1 if quick else 1.0),
     }
-    return run_stages('experts', stages, only)
 
 
-def motion(quick: bool = False, propagated: Sequence[str] = PROPAGATED) -> dict[str, Any] | str:
-    """Scores on recorded motions of other people, or the reason why there are none."""
-    try:
-        train, test = (experts_motion.recorded(part) for part in ('train', 'dev'))
-    except ValueError as error:
-        return f'skipped: {error}'
-    learned = experts_motion.learn_from(train, 600 if quick else SAMPLES)
-    motions = experts_motion.seen_motions(learned, test, 4 if quick else experts_motion.FRAMES)
-    return experts_motion.compared(learned, motions, propagated=propagated)
+def speed(folder: Path, seconds: float) -> dict[str, float]:
+    """Times on the first image of a clip, ms: of the descriptor, and of the whole prediction."""
+    clip, predictor = read_clip(folder, 1), load_predictor()
+    assert clip.background is not None
+    silhouette = BackgroundModel.from_image(clip.background).silhouette(clip.images[0])
+    mask = silhouette.view(np.uint8)
+    return {
+        'descriptor': 1e3
+        * best_time(lambda: predictor.describe(mask, clip.camera), seconds=seconds),
+        'whole': 1e3 * best_time(lambda: predictor.predict(mask, clip.camera), seconds=seconds),
+    }
 
 
-def made_up(samples: int, frames: int = 6) -> tuple[Learned, list[SeenMotion]]:
-    """Procedural motions for learning, and others for tests."""
-    body = load_body('human37')
-    train = [procedural_sequence(name, body, 4.0, seed) for name in ('walk', 'dance')
-             for seed in (0, 1)]  # fmt: skip
-    learned = experts_motion.learn_from(train, samples)
-    test = [procedural_sequence(name, body, 2.0, 5) for name in ('walk', 'dance')]
-    return learned, experts_motion.seen_motions(learned, test, frames)
+def of_clip(work: tuple[Path, int | None]) -> dict[str, dict[str, float]]:
+    """Scores of a clip by kind of mask; empty: nothing shows silhouettes."""
+    clip, predictor = read_clip(*work), load_predictor()
+    masks: dict[str, list[Mask]] = {}
+    if clip.background is not None:
+        background = BackgroundModel.from_image(clip.background)
+        masks[SUBTRACTED] = [background.silhouette(x).view(np.uint8) for x in clip.images]
+    true = true_masks(clip)
+    if true is not None:
+        masks[TRUE] = true
+    return {kind: of_masks(predictor, clip, which) for kind, which in masks.items()}
 
 
-def speed(seconds: float, samples: int) -> dict[str, Any]:
-    """Time per image of 640 x 480 for the descriptor, each model, and the whole prediction, ms."""
-    learned, _ = made_up(samples)
-    body = learned.body
-    sequence = procedural_sequence('walk', body, 1.0, 9)
-    poses = sequence.poses[:1].copy()
-    poses[:, 2] += 3.5 - poses[:, 2]
-    camera = Camera(580.0, 580.0, 319.5, 239.5, 640, 480)
-    mask = render_silhouettes(body, poses, camera)[0].view(np.uint8)
-    result: dict[str, Any] = {'samples': samples, 'pixels': int(mask.sum()), 'prediction_ms': {}}
-    for name in (x for x in COLUMNS if x in kinds()):
-        predictor, _ = experts_motion.predictor_of(learned, name, dynamics=False)
-        row = predictor.describe(mask, camera)[None]
-        model = predictor.model
-        result['prediction_ms'][name] = 1e3 * best_time(
-            lambda m=model, x=row: m.predict_arrays(x), seconds=seconds
-        )
-        if name == 'local':
-            result['descriptor_ms'] = 1e3 * best_time(
-                lambda p=predictor: p.describe(mask, camera), seconds=seconds
-            )
-            result['whole_ms'] = 1e3 * best_time(
-                lambda p=predictor: p.predict(mask, camera), seconds=seconds
-            )
-    slowest = max(result['prediction_ms'].values())
-    result['wanted'] = [
-        {
-            'what': what, 'value': value, 'wanted': f'at most {MILLISECONDS[what]:g} ms',
-            'met': value <= MILLISECONDS[what],
-        }
-        for what, value in (('descriptor', result['descriptor_ms']), ('prediction', slowest))
-    ]  # fmt: skip
+def true_masks(clip: Clip) -> list[Mask] | None:
+    """The true silhouettes of a clip; None if its truth has none."""
+    content = read_archive(clip.folder / 'truth.npz')
+    if 'masks' not in content:
+        return None
+    width = clip.images[0].shape[1]
+    packed = dict(zip(content['stamps'].tolist(), content['masks'], strict=True))
+    return [np.unpackbits(packed[stamp], axis=1)[:, :width] for stamp in clip.stamps]
+
+
+def of_masks(predictor: PosePredictor, clip: Clip, masks: Sequence[Mask]) -> dict[str, float]:
+    """Errors of single predictions and of propagated ones, mm, and coverage."""
+    rows = np.arange(0, len(masks), STEP)
+    alone = predictions(predictor, clip, masks, rows)
+    after = predictions(predictor, clip, masks, np.arange(len(masks)), BY_DYNAMICS)
+    found = _scores(predictor, clip, alone, 200)
+    followed = _scores(predictor, clip, after, 2)
+    depth = true_depths(clip.truth, [clip.stamps[i] for i in alone])
+    off = [abs(x.means[0, 2] - z) / z for x, z in zip(alone.values(), depth, strict=True)]
+    return {
+        'best_mm': found['best_mm'],
+        'heaviest_mm': found['heaviest_mm'],
+        'depth_error': float(np.mean(off)),
+        'coverage_90': found['coverage_90'],
+        'joint_coverage_90': found['joint_coverage_90'],
+        'propagated_best_mm': followed['best_mm'],
+        'propagated_heaviest_mm': followed['heaviest_mm'],
+    }
+
+
+def _scores(
+    predictor: PosePredictor, clip: Clip, found: dict[int, GaussianMixture], samples: int
+) -> dict[str, float]:
+    names = clip.truth.joint_names
+    scored, origin = clip.truth.evaluated_joints(), origin_joints(names)
+    every = np.array([clip.truth.joints[clip.stamps[i]] for i in found])
+    true = every[:, [names.index(x) for x in scored]]
+    true = true - every[:, [names.index(x) for x in origin]].mean(1, keepdims=True)
+    mixtures = joint_mixtures(predictor.body, [*found.values()], scored, origin=origin)
+    return score(mixtures, true, scored, samples=samples).summary()
+
+
+def predictions(
+    predictor: PosePredictor, clip: Clip, masks: Sequence[Mask], rows: NDArray[np.intp],
+    propagation: str = ALONE,
+) -> dict[int, GaussianMixture]:  # fmt: skip
+    """Mixtures over poses by the row of the image, of those that show somebody and have truth."""
+    result: dict[int, GaussianMixture] = {}
+    before: GaussianMixture | None = None
+    last = 0
+    for i in rows.tolist():
+        interval = 1e-9 * (clip.stamps[i] - last)
+        try:
+            seen = predictor.observe(
+                masks[i], clip.camera, before, interval, propagation=propagation,
+                max_components=BEST_OF,
+            )  # fmt: skip
+        except NoSilhouetteError:
+            continue
+        before, last = seen.mixture, clip.stamps[i]
+        if clip.stamps[i] in clip.truth.joints:
+            result[i] = seen.mixture
     return result
 
 
+def true_depths(truth: Truth, stamps: Sequence[int]) -> NDArray[np.float64]:
+    """Depth of the hips or the pelvis (T,), m."""
+    rows = [truth.joint_names.index(x) for x in origin_joints(truth.joint_names)]
+    return np.array([truth.joints[stamp][rows, 2].mean() for stamp in stamps])
+
+
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables for people."""
-    parts = []
-    rows = _summary_rows(result)
-    if len(rows) > 1:
-        parts.append(table(rows, markdown=markdown))
-    for name in ('motion', 'clips', 'start', 'figures'):
-        found = result.get(name)
-        if isinstance(found, str):
-            parts.append(f'{name}: {found}')
-    if isinstance(result.get('figures'), list) and not markdown:
-        parts.append(f'figures: {", ".join(result["figures"])}')
-    if isinstance(result.get('motion'), dict):
-        parts += _motion_tables(result['motion'], markdown)
-    if isinstance(result.get('clips'), dict):
-        found = result['clips']
-        parts.append(table(experts_clips.as_rows(found), left=2, markdown=markdown))
-        if found['wanted']:
-            parts.append(table(_verdict_rows(found['wanted']), markdown=markdown))
-    if isinstance(result.get('start'), dict):
-        found = result['start']
-        parts.append(table(experts_start.as_rows(found), left=2, markdown=markdown))
-        parts.append(table(_verdict_rows(found['wanted']), markdown=markdown))
-    return '\n\n'.join(parts)
+    """A table for people."""
+    head = [
+        'clip',
+        'masks',
+        f'best of {BEST_OF}, mm',
+        'heaviest, mm',
+        'depth',
+        '90 %',
+        'joint 90 %',
+        'by rule (9): best',
+        'heaviest',
+    ]
+    rows = [head]
+    for name, entry in [*result['clips'].items(), *result['means'].items()]:
+        for kind, s in entry.items():
+            cells = [_cell(x, s[x]) for x in COLUMNS]
+            rows.append([name, kind, *cells])
+    text = table(rows, left=2, markdown=markdown)
+    spent = result['ms']
+    if spent is None:
+        return text
+    return (
+        f'{text}\n\nA silhouette is described in {spent["descriptor"]:.1f} ms; from mask to '
+        f'mixture over poses it takes {spent["whole"]:.1f} ms.'
+    )
 
 
-def _summary_rows(result: dict[str, Any]) -> list[list[str]]:
-    rows = [['measure', 'value', 'wanted']]
-    if 'toy' in result:
-        toy = result['toy']
-        rows.append(['toy: mean log p of the truth', f'{toy["ceiling"]:.3f}', ''])
-        rows.append(['toy: one regression', f'{toy["regression"]["mean"]:.3f}', ''])
-        for name in experts_toy.MODELS:
-            for count, entry in toy[name].items():
-                value = f'{entry["mean"]:.3f} (worst seed {entry["worst"]:.3f})'
-                wanted = '' if entry['wanted'] is None else f'at least {entry["wanted"]:.2f}'
-                rows.append([f'toy: {count} {name} experts', value, wanted])
-    if 'oracle' in result:
-        oracle = result['oracle']
-        what = 'linear joint experts from a mixture of Gaussians'
-        if isinstance(oracle, str):
-            rows.append([what, oracle, ''])
-        else:
-            rows.append([what, f'{oracle["largest_difference"]:.1e}', f'{oracle["wanted"]:.0e}'])
-    if 'learning' in result:
-        spent, peer = result['learning']['time'], result['learning']['peer']
-        for name in experts_toy.MODELS:
-            what = f'{name}: learning {spent["samples"]} samples, {spent["experts"]} experts'
-            wanted = f'{spent[name]["learning_wanted_s"]:.0f} s'
-            rows.append([what, f'{spent[name]["learning_s"]:.1f} s', wanted])
-        if isinstance(peer['peer'], str):
-            rows.append(['one regression against sklearn-rvm', peer['peer'], ''])
-        else:
-            value = f'{peer["times_faster"]:.0f} times faster an output'
-            wanted = f'{peer["wanted"]:.0f}'
-            rows.append(['one regression against sklearn-rvm', value, wanted])
-    if 'speed' in result:
-        found = result['speed']
-        wanted = f'{MILLISECONDS["descriptor"]:g} ms'
-        rows.append(['descriptor, 640x480', f'{found["descriptor_ms"]:.2f} ms', wanted])
-        for name, value in found['prediction_ms'].items():
-            wanted = f'{MILLISECONDS["prediction"]:g} ms'
-            rows.append([f'prediction: {COLUMNS[name]}', f'{value:.2f} ms', wanted])
-        rows.append(['mask to mixture over poses', f'{found["whole_ms"]:.2f} ms', ''])
-    return rows
-
-
-def _motion_tables(found: dict[str, Any], markdown: bool) -> list[str]:
-    """Errors by activity, calibration by model, and verdicts."""
-    names = [name for name in COLUMNS if name in found]
-    activities = [*found['ambiguous_share'], 'all']
-    parts = []
-    for unit, what in (('degrees', 'Joint angles, degrees'), ('mm', 'Joints, mm')):
-        head = f'{what}: mean (maximum), best of {BEST_OF}'
-        rows = [[head, 'ambiguous', *(COLUMNS[name] for name in names)]]
-        for activity in activities:
-            share = found['ambiguous_share'].get(activity)
-            row = [activity, '' if share is None else f'{100 * share:.0f} %']
-            for name in names:
-                s = found[name]['alone'][activity]
-                digits = 1 if unit == 'degrees' else 0
-                row.append(
-                    f'{s[unit]:.{digits}f} ({s[f"max_{unit}"]:.0f}), {s[f"best_{unit}"]:.{digits}f}'
-                )
-            rows.append(row)
-        parts.append(table(rows, markdown=markdown))
-    rows = [
-        [
-            'model', 'given', 'degrees', 'mm', 'best, mm', 'log p a frame', '50 %', '90 %',
-            'joint 50 %', 'joint 90 %',
-        ]
-    ]  # fmt: skip
-    for name in names:
-        for how, given in (
-            ('alone', 'r'),
-            ('not_propagated', 'r, one view'),
-            ('propagated', 'x before, r, one view: rule (1)'),
-            ('by_dynamics', 'x before, r, one view: rule (9)'),
-        ):
-            if how not in found[name]:
-                continue
-            s = found[name][how]['all']
-            shares = ('coverage_50', 'coverage_90', 'joint_coverage_50', 'joint_coverage_90')
-            rows.append(
-                [
-                    COLUMNS[name], given, f'{s["degrees"]:.1f}', f'{s["mm"]:.0f}',
-                    f'{s["best_mm"]:.0f}', f'{s["log_density"]:.1f}',
-                    *(f'{100 * s[share]:.0f} %' for share in shares),
-                ]
-            )  # fmt: skip
-    parts.append(table(rows, left=2, markdown=markdown))
-    if found['wanted']:
-        wanted = [
-            {**one, 'what': f'{COLUMNS[one["model"]]}: {one["what"]}'} for one in found['wanted']
-        ]
-        parts.append(table(_verdict_rows(wanted), markdown=markdown))
-    return parts
-
-
-def _verdict_rows(wanted: Sequence[dict[str, Any]]) -> list[list[str]]:
-    rows = [['what', 'found', 'wanted', '']]
-    for one in wanted:
-        missed = ', '.join(one.get('missed', ()))
-        verdict = 'met' if one['met'] else f'missed{": " + missed if missed else ""}'
-        rows.append([one['what'], f'{one["value"]:.2f}', one['wanted'], verdict])
-    return rows
+def _cell(name: str, value: float) -> str:
+    if 'coverage' in name:
+        return f'{100 * value:.0f} %'
+    return f'{100 * value:.1f} %' if name == 'depth_error' else f'{value:.0f}'

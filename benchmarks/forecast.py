@@ -8,22 +8,20 @@ forecast from it can do without.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.clips import find_clips, read_clip, read_detections, table
-from benchmarks.command import benchmark_parser, show
+from benchmarks.clips import find_clips, read_clip, table
+from benchmarks.command import benchmark_parser, run_benchmark
 from benchmarks.machine import description
-from benchmarks.runs import BOTH, IMAGES, in_processes, new_tracker
+from benchmarks.runs import BOTH, GIVEN, IMAGES, begun, in_processes, stepped
 from benchmarks.tracking_means import GROUPS, group_of
-from hmt_ros.body import Body, load_body
+from hmt_ros.body import Body
 from hmt_ros.evaluation.track_scores import Estimate, TrackScorer
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking import TrackerSettings
 from msg_tools.messages.headers import SECOND_NS
 
 AHEAD = (0.1, 0.2, 0.5)  # s
@@ -45,14 +43,10 @@ class Work(NamedTuple):
 def of_clip(work: Work) -> dict[str, dict[str, float]]:
     """Error of the heaviest mode, mm, and coverage of 90 % regions, by time ahead and way."""
     clip = read_clip(work.folder, work.limit)
-    found = {} if work.inputs == IMAGES else read_detections(clip.folder).keypoints
-    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    tracker, keypoints = begun(clip, work.inputs)
     scorers = {f'{way} {ahead:g}': TrackScorer(way, clip.truth) for way in WAYS for ahead in AHEAD}
     stamps = np.array(sorted(clip.truth.joints))
-    for stamp, image in zip(clip.stamps, clip.images, strict=True):
-        if stamp in clip.ups:
-            tracker.set_gravity(clip.ups[stamp])
-        posterior, _ = tracker.step(image, stamp, found.get(stamp))
+    for stamp, posterior, *_ in stepped(clip, tracker, keypoints, gravity=GIVEN):
         if posterior is None:
             continue
         for ahead in AHEAD:
@@ -100,7 +94,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     if quick:
         folders, inputs, limit = folders[:1], (IMAGES,), QUICK + 6
     work = [Work(x, given, limit) for given in inputs for x in folders]
-    found = in_processes(of_clip, work, 0, 'forecast')
+    found = in_processes(of_clip, work, 1 if quick else 0, 'forecast')
     means = []
     for group in GROUPS:
         for given in inputs:
@@ -146,9 +140,9 @@ def main(argv: list[str]) -> int:
     parser = benchmark_parser('forecast', __doc__, quick=f'{QUICK} images of one clip')
     parser.add_argument('--clips', type=Path, help='folder of clips')
     options = parser.parse_args(argv)
-    try:
-        result = measure(options.clips, quick=options.quick)
-    except ValueError as error:
-        print(f'forecast: {error}', file=sys.stderr)
-        return 1
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'forecast',
+        lambda: measure(options.clips, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )

@@ -12,7 +12,6 @@ What was made of it stands in `joint_errors` of `hmt_ros/body/models/human37.yam
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,12 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clips import read_clip, read_detections, table, with_file
-from benchmarks.command import benchmark_parser, show, told
-from benchmarks.keypoint_noise import CLIPS, QUICK
+from benchmarks.clips import read_clip, table, with_file
+from benchmarks.command import benchmark_parser, run_benchmark, told
 from benchmarks.machine import description
-from benchmarks.runs import IMAGES, INPUTS, KEYPOINTS, keypoints_only, new_tracker
-from hmt_ros.body import load_body
+from benchmarks.runs import INPUTS, begun, stepped
+from benchmarks.truth_fits import CLIPS, QUICK, QUICK_IMAGES
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN
 from hmt_ros.inference.calibration import (
     levels_of,
@@ -33,7 +31,6 @@ from hmt_ros.inference.calibration import (
     stratified_samples,
 )
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking import TrackerSettings
 
 Array = NDArray[np.float64]
 
@@ -64,26 +61,18 @@ class Said(NamedTuple):
     covariances: Array
 
 
-def said_of(folder: Path, inputs: str) -> list[Said]:
+def said_of(folder: Path, inputs: str, limit: int | None = None) -> list[Said]:
     """What the tracker says of the joints of a clip, with some of `runs.INPUTS`.
 
     Raises:
         ValueError: the clip can not be read.
     """
-    clip, body = read_clip(folder), load_body('human37')
-    keypoints = {} if inputs == IMAGES else read_detections(folder).keypoints
-    settings = TrackerSettings()
-    tracker = new_tracker(
-        clip, body, keypoints_only(settings) if inputs == KEYPOINTS else settings, 0
-    )
+    clip = read_clip(folder, limit)
+    tracker, keypoints = begun(clip, inputs)
     names = [name for name in EVALUATED_JOINTS if name in clip.truth.joint_names]
-    which = body.skeleton.joint_index([ORIGIN, *names])
+    which = tracker.body.skeleton.joint_index([ORIGIN, *names])
     result = []
-    for i, (stamp, image) in enumerate(zip(clip.stamps, clip.images, strict=True)):
-        if stamp in clip.views:
-            rotation, position = clip.views[stamp]
-            tracker.set_camera(position, rotation)
-        posterior, _ = tracker.step(image, stamp, keypoints.get(stamp))
+    for i, (stamp, posterior, *_) in enumerate(stepped(clip, tracker, keypoints)):
         if posterior is None or i % EVERY or stamp not in clip.truth.joints:
             continue
         rows = [clip.truth.joint_names.index(name) for name in (ORIGIN, *names)]
@@ -194,22 +183,19 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     said = [
         one
         for job in told('joint_errors', jobs, lambda job: f'{job[0].name}, {job[1]}')
-        for one in said_of(*job)
+        for one in said_of(*job, QUICK_IMAGES if quick else None)
     ]
     return {'machine': description(), 'clips': [x.name for x in folders], 'shares': learned(said)}
 
 
 def main(arguments: list[str]) -> int:
     """Runs the command; returns its exit code."""
-    parser = benchmark_parser('joint_errors', __doc__, quick=f'only {QUICK} clips')
+    parser = benchmark_parser('joint_errors', __doc__, quick='a few images of two clips')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     options = parser.parse_args(arguments)
-    try:
-        result = measure(options.clips, quick=options.quick)
-    except FileNotFoundError as error:
-        print(f'joint_errors: skipped, {error}', file=sys.stderr)
-        return 0
-    except ValueError as error:
-        print(f'joint_errors: {error}', file=sys.stderr)
-        return 1
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'joint_errors',
+        lambda: measure(options.clips, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )

@@ -9,7 +9,6 @@ images, too.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.clips import at_rate, find_clips, read_clip, table
-from benchmarks.command import benchmark_parser, show
+from benchmarks.command import benchmark_parser, run_benchmark
 from benchmarks.machine import description
-from benchmarks.runs import BOTH, GIVEN, IMAGES, in_processes, true_joints
-from benchmarks.smoothing_clips import tracked
+from benchmarks.runs import BOTH, GIVEN, IMAGES, in_processes, tracked, true_joints
 from benchmarks.tracking_means import GROUPS, group_of
 from hmt_ros.body.keep_out import MARGIN, Capsules, keep_out_capsules
 from msg_tools.messages.headers import SECOND_NS
@@ -37,7 +35,7 @@ QUICK = 12  # images
 
 
 class Work(NamedTuple):
-    """A clip, and how it is seen; see `smoothing_clips.Work`."""
+    """A clip, and how it is seen; see `smoothing.Work`."""
 
     folder: Path
     inputs: str
@@ -90,7 +88,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     if quick:
         folders, inputs, rates, limit = folders[:1], (IMAGES,), RATES[:1], QUICK
     work = [Work(x, given, rate, limit) for rate in rates for given in inputs for x in folders]
-    found = in_processes(of_clip, work, 0, 'keep_out')
+    found = in_processes(of_clip, work, 1 if quick else 0, 'keep_out')
     means = []
     for group in GROUPS:
         for rate in rates:
@@ -140,9 +138,9 @@ def main(argv: list[str]) -> int:
     parser = benchmark_parser('keep_out', __doc__, quick=f'{QUICK} images of one clip')
     parser.add_argument('--clips', type=Path, help='folder of clips')
     options = parser.parse_args(argv)
-    try:
-        result = measure(options.clips, quick=options.quick)
-    except ValueError as error:
-        print(f'keep_out: {error}', file=sys.stderr)
-        return 1
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'keep_out',
+        lambda: measure(options.clips, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )

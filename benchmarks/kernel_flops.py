@@ -11,7 +11,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -94,10 +94,10 @@ def energies(poses: int) -> tuple[dict[str, PoseEnergy], Array]:
     }, x  # fmt: skip
 
 
-def counts() -> dict[str, dict[str, float]]:
+def counts(names: Sequence[str]) -> dict[str, dict[str, float]]:
     """By energy of `energies` the operations of one pose, and the bytes of what it reads."""
     environment = {**os.environ, 'NUMBA_DISABLE_JIT': '1'}
-    command = [sys.executable, '-m', 'benchmarks.kernel_flops']
+    command = [sys.executable, '-m', 'benchmarks.kernel_flops', *names]
     found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if found.returncode:
         raise RuntimeError(f'the operations can not be counted: {found.stderr.strip()[-400:]}')
@@ -179,7 +179,7 @@ def _bytes(value: Any) -> int:
     return sum(map(_bytes, value)) if isinstance(value, tuple) else 0
 
 
-def _count() -> dict[str, dict[str, float]]:
+def _count(names: Sequence[str]) -> dict[str, dict[str, float]]:
     """See `counts`; in a process without the compiler."""
     some, poses = energies(1)
     compiled_module: Any = pose_energy
@@ -202,7 +202,8 @@ def _count() -> dict[str, dict[str, float]]:
 
     compiled_module.solve = solve
     result: dict[str, dict[str, float]] = {}
-    for name, energy in some.items():
+    for name in names:
+        energy = some[name]
         result[name] = {}
         for kind, derivatives in KINDS.items():
             Counting.done = 0
@@ -213,4 +214,4 @@ def _count() -> dict[str, dict[str, float]]:
 
 
 if __name__ == '__main__':
-    print(json.dumps(_count()))
+    print(json.dumps(_count(sys.argv[1:])))

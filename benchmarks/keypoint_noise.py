@@ -10,7 +10,6 @@ right. What was made of it stands in `hmt_ros/image/keypoint_schemes.yaml`.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,23 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from benchmarks.clips import SCHEME, Clip, read_clip, read_detections, table, with_file
-from benchmarks.command import benchmark_parser, show, told
+from benchmarks.clips import SCHEME, Clip, read_detections, table, with_file
+from benchmarks.command import benchmark_parser, run_benchmark, told
 from benchmarks.machine import description
-from benchmarks.tracking_oracle import STARTS, best_poses, with_true_lengths
-from hmt_ros.body import Body, load_body
+from benchmarks.truth_fits import CLIPS, QUICK, QUICK_IMAGES, best_poses, fitted
+from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.experts.lifter import lifted_positions
 from hmt_ros.image.keypoint_schemes import MIRROR, schemes
 from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.image.terms.keypoints import EXCHANGED, Keypoints, KeypointTerm
-from hmt_ros.tracking import read_subject
-from hmt_ros.tracking.initialisation import start_from_keypoints
 
 Array = NDArray[np.float64]
 
-CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'follow')
-QUICK = 2
 # Scale of the robust kernel of offsets, m, and number of its iterations.
 KERNEL, ITERATIONS = 0.06, 30
 # Bins of the confidence, and of the number of images from one deviation to another.
@@ -80,18 +75,16 @@ class Clips:
     depths: list[tuple[str, Array]]
 
 
-def measured(folder: Path) -> Clips:
+def measured(folder: Path, limit: int | None = None) -> Clips:
     """What the detector says of one clip, beside the truth.
 
     Raises:
         ValueError: it can not be read, or has no keypoints.
     """
-    clip, model = read_clip(folder), load_body('human37')
-    begun = start_from_keypoints(model, clip.camera, read_subject(clip.subject, model))
-    body = with_true_lengths(begun.body, clip)
+    clip, body, starts = fitted(folder, limit)
     detections = read_detections(folder).keypoints
     stamps = [s for s in clip.stamps if s in detections and detections[s].seen.any()]
-    poses = best_poses(body, clip, stamps, begun.poses[:STARTS])
+    poses = best_poses(body, clip, stamps, starts)
     found = [detections[stamp] for stamp in stamps]
     exchanges = np.array(
         [_exchange(body, clip, x, pose) for x, pose in zip(found, poses, strict=True)]
@@ -307,7 +300,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
     Args:
         clips: folder of the clips; None: the development clips.
-        quick: two clips.
+        quick: a few images of two clips.
 
     Raises:
         FileNotFoundError: a clip is not there.
@@ -315,7 +308,8 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     """
     wanted = CLIPS[:QUICK] if quick else CLIPS
     folders = with_file(wanted, clips, 'keypoints_mediapipe.npz')
-    found = [measured(folder) for folder in told('keypoint_noise', folders)]
+    limit = QUICK_IMAGES if quick else None
+    found = [measured(folder, limit) for folder in told('keypoint_noise', folders)]
     return {'machine': description(), 'clips': list(wanted), **summary(found)}
 
 
@@ -353,15 +347,12 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 def main(arguments: list[str]) -> int:
     """Runs the command; returns its exit code."""
-    parser = benchmark_parser('keypoint_noise', __doc__, quick='two clips')
+    parser = benchmark_parser('keypoint_noise', __doc__, quick='a few images of two clips')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     options = parser.parse_args(arguments)
-    try:
-        result = measure(options.clips, quick=options.quick)
-    except FileNotFoundError as error:
-        print(f'keypoint_noise: skipped, {error}', file=sys.stderr)
-        return 0
-    except ValueError as error:
-        print(f'keypoint_noise: {error}', file=sys.stderr)
-        return 1
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'keypoint_noise',
+        lambda: measure(options.clips, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )

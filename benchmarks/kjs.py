@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import description, dgemm_rate
-from benchmarks.whole_body_flips import full_body_flips
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
@@ -36,8 +35,7 @@ SIGMA = 1.0  # px, of an image joint
 PRIOR_WEIGHT = 0.01
 OUT_OF_PLANE = np.radians(10.0)
 DRAWN = 20_000  # poses from which the one of the table is chosen
-SAMPLES, QUICK_SAMPLES = 2000, 100  # of each random row
-FRONTAL = 20  # poses that are taken as they are drawn
+SAMPLES, QUICK_SAMPLES = 2000, 20  # of each random row
 APART = 0.01  # m: minima of which no joint differs by as much are one
 ALIKE = 10.0  # nats above the start, within which a minimum explains the image as well
 ITERATIONS = 200
@@ -45,12 +43,10 @@ RUNS = 3  # of each row, for the CPU time
 COUNTS = ('samples', 'unconverged', 'minima', 'alike')
 RATIOS = ('minima_per_sample', 'alike_per_sample', 'minima_per_cpu_s')
 SCALES = (1.0, 4.0, 8.0, 16.0, 0.0)  # 0: Cauchy tails
-MOST_LEAVES = 4000
-PARTITIONS: dict[str, tuple[str, ...] | None] = {
+PARTITIONS = {
     'both arms, left calf': ('left_arm', 'right_arm', 'left_leg'),
     'both calves, right arm': ('left_leg', 'right_leg', 'right_arm'),
     'four limbs and neck': ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck'),
-    'full body': None,  # torso, limbs and neck
 }
 LINKS = (
     ('shoulder', 'elbow'), ('elbow', 'wrist'), ('wrist', 'hand'),
@@ -91,7 +87,7 @@ class Samples:
         costs: (N,) of those, above the start.
         optimised: what came of them.
         minima: indices of the distinct minima, best first.
-        drawing, optimising: CPU time, s.
+        seconds: CPU time of drawing and optimising, s.
     """
 
     sampler: str
@@ -100,30 +96,28 @@ class Samples:
     costs: Array
     optimised: Minimum
     minima: NDArray[np.intp]
-    drawing: float
-    optimising: float
+    seconds: float
 
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = benchmark_parser('kjs', __doc__, quick='few samples, and one pose as drawn')
+    parser = benchmark_parser('kjs', __doc__, quick='few samples, each drawn once')
     parser.add_argument('--samples', type=int, default=SAMPLES, help='random samples a row')
-    parser.add_argument('--frontal', type=int, default=FRONTAL, help='poses taken as drawn')
     parser.add_argument('--seed', type=int, default=0, help='of the random samples')
     options = parser.parse_args(argv)
-    amount = (QUICK_SAMPLES, 1) if options.quick else (options.samples, options.frontal)
-    result = measure(*amount, options.seed)
+    amount = (QUICK_SAMPLES, 1) if options.quick else (options.samples, RUNS)
+    result = measure(amount[0], options.seed, amount[1])
     return show(result, as_text, as_json=options.json)
 
 
-def measure(count: int = SAMPLES, frontal: int = FRONTAL, seed: int = 0) -> dict[str, Any]:
-    """All rows of the table at one pose, and kinematic jumps at others."""
+def measure(count: int = SAMPLES, seed: int = 0, runs: int = RUNS) -> dict[str, Any]:
+    """All rows of the table, of each the fastest of some runs."""
     body = load_body('human34')
     setting = setting_of(body, chosen_pose(body))
     # Compiled code is read before anything is timed.
-    for found in all_samples(setting, 4, seed):
+    for found in all_samples(setting, 4, seed, 1):
         row(setting, found)
-    rows = [row(setting, found) for found in all_samples(setting, count, seed)]
+    rows = [row(setting, found) for found in all_samples(setting, count, seed, runs)]
     return {
         'machine': description(),
         'dgemm_gflops': dgemm_rate() / 1e9,
@@ -132,7 +126,6 @@ def measure(count: int = SAMPLES, frontal: int = FRONTAL, seed: int = 0) -> dict
         },
         'rows': rows,
         'ratios': ratios(rows),
-        'frontal': frontal_rows(body, frontal),
     }
 
 
@@ -156,68 +149,52 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         [name, *(f'{r[x]:.1f}' for x in RATIOS), f'{r["cost"]:.2g}']
         for name, r in result['ratios'].items()
     ]
-    others = [['frontal poses as drawn', 'poses', 'leaves', 'minima', 'share', 'least', 'most']]
-    others += [
-        [r['sampler'], str(r['poses']), str(r['leaves']), str(r['minima']),
-         *(f'{100 * r[key]:.0f} %' for key in ('share', 'least', 'most'))]
-        for r in result['frontal']
-    ]  # fmt: skip
     trees = ', '.join(f'{chain} {count}' for chain, count in result['trees'].items())
     parts = [
         table(rows, left=2, markdown=markdown),
         'Against the best row of CSS; raw cost: of CSS and SS:',
         table(ratios, markdown=markdown),
-        table(others, markdown=markdown),
         f'Leaves of the chains at the start: {trees}. dgemm: {result["dgemm_gflops"]:.1f} GF/s.',
     ]
     return '\n\n'.join(parts)
 
 
-def all_samples(setting: Setting, count: int, seed: int) -> Iterator[Samples]:
+def all_samples(setting: Setting, count: int, seed: int, runs: int) -> Iterator[Samples]:
     """Kinematic jumps over all partitions, then random samples of all widths."""
     for name in PARTITIONS:
-        yield kinematic_jumps(setting, name)
+        yield kinematic_jumps(setting, name, runs)
     body, mean, covariance = setting.body, setting.start.x, setting.covariance[None]
     for sampler, draw in (('CSS', covariance_scaled_samples), ('SS', spherical_samples)):
         for scale in SCALES:
             drawing = partial(draw, body, mean, covariance, count, scale)
             yield sampled(
                 setting, sampler, f'{scale:.0f}' if scale else 'Cauchy',
-                lambda d=drawing: d(np.random.default_rng(seed))[0],
+                lambda d=drawing: d(np.random.default_rng(seed))[0], runs,
             )  # fmt: skip
 
 
-def kinematic_jumps(setting: Setting, name: str) -> Samples:
-    """All leaves of the product of the trees of some chains; of the whole body the most probable.
+def kinematic_jumps(setting: Setting, name: str, runs: int = 1) -> Samples:
+    """All leaves of the product of the trees of some chains.
 
     Nothing is pruned but by the limits, as the optimiser is to say what is a minimum.
     """
-    chains = PARTITIONS[name]
-
-    def draw() -> Array:
-        if chains is not None:
-            return enumerate_flips(setting.body, setting.pose, chains)[0]
-        product = full_body_flips(setting.body, setting.pose, most_overlap=np.inf)
-        return product.most_probable(MOST_LEAVES).poses
-
-    return sampled(setting, name, '', draw)
+    draw = partial(enumerate_flips, setting.body, setting.pose, PARTITIONS[name])
+    return sampled(setting, name, '', lambda: draw()[0], runs)
 
 
-def sampled(setting: Setting, sampler: str, scale: str, draw: Callable[[], Array]) -> Samples:
+def sampled(
+    setting: Setting, sampler: str, scale: str, draw: Callable[[], Array], runs: int
+) -> Samples:
     """Draws samples and optimises them, some times over, of which the fastest counts."""
     times = []
-    for _ in range(RUNS):
+    for _ in range(runs):
         start = time.process_time()
         raw = draw()
-        drawn = time.process_time()
         optimised = optimise(setting.body, setting.energy, raw)
-        times.append((drawn - start, time.process_time() - drawn))
-    drawing, optimising = min(times, key=sum)
+        times.append(time.process_time() - start)
     costs = setting.energy.energy(raw, derivatives=False).value - setting.start.value[0]
-    return Samples(
-        sampler, scale, raw, costs, optimised, minima_of(setting.body, optimised), drawing,
-        optimising,
-    )  # fmt: skip
+    minima = minima_of(setting.body, optimised)
+    return Samples(sampler, scale, raw, costs, optimised, minima, min(times))
 
 
 def minima_of(body: Body, optimised: Minimum) -> NDArray[np.intp]:
@@ -229,28 +206,23 @@ def minima_of(body: Body, optimised: Minimum) -> NDArray[np.intp]:
 
 def row(setting: Setting, found: Samples) -> dict[str, Any]:
     """What the table says about samples; medians of raw and of optimised ones."""
-    joints = setting.body.joint_positions(found.optimised.x[np.argsort(found.optimised.value)])
     optimised = found.optimised.value - setting.start.value[0]
     converged = found.optimised.status == Status.CONVERGED
     distances = [distances_from(setting, x) for x in (found.raw, found.optimised.x[converged])]
-    seconds = found.drawing + found.optimising
     return {
         'sampler': found.sampler,
         'scale': found.scale,
         'samples': len(found.raw),
         'minima': len(found.minima),
-        'distinct_with_unconverged': len(distinct_poses(joints, APART).kept),
         'alike': int((optimised[found.minima] < ALIKE).sum()),
         'unconverged': int((~converged).sum()),
         'distance': [float(np.median(d)) for d, _ in distances],
         'deviations': [float(np.median(m)) for _, m in distances],
         'cost': [float(np.median(found.costs)), float(np.median(optimised[converged]))],
-        'evaluations': int(found.optimised.iterations.sum()),
-        'drawing_cpu_s': found.drawing,
-        'cpu_s': seconds,
+        'cpu_s': found.seconds,
         'minima_per_sample': len(found.minima) / len(found.raw),
         'alike_per_sample': (optimised[found.minima] < ALIKE).sum() / len(found.raw),
-        'minima_per_cpu_s': len(found.minima) / seconds,
+        'minima_per_cpu_s': len(found.minima) / found.seconds,
     }
 
 
@@ -275,31 +247,6 @@ def ratios(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
         }
         for r in jumps
     }
-
-
-def frontal_rows(body: Body, count: int) -> list[dict[str, Any]]:
-    """Distinct minima of kinematic jumps at poses of the prior, whatever their links."""
-    poses = drawn_poses(body)[:count]
-    rows = []
-    for name in PARTITIONS:
-        leaves, minima = [], []
-        for pose in poses:
-            found = kinematic_jumps(setting_of(body, pose), name)
-            leaves.append(len(found.raw))
-            minima.append(len(found.minima))
-        shares = np.array(minima) / np.array(leaves)
-        rows.append(
-            {
-                'sampler': name,
-                'poses': len(poses),
-                'leaves': sum(leaves),
-                'minima': sum(minima),
-                'share': sum(minima) / sum(leaves),
-                'least': float(shares.min()),
-                'most': float(shares.max()),
-            }
-        )
-    return rows
 
 
 def setting_of(body: Body, pose: Array) -> Setting:

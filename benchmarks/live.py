@@ -16,7 +16,6 @@ the clip back and forth for so long.
 from __future__ import annotations
 
 import math
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.camera import with_stamp
 from benchmarks.clips import COMPRESSED, index_back_and_forth, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.live_clips import (
@@ -65,7 +65,7 @@ from msg_tools.messages.headers import stamp_in, time_ns
 from msg_tools.messages.keep_out import KEEP_OUT, KeepOutState
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, TrackState
 
-SECONDS, QUICK_SECONDS = 16.0, 3.0
+SECONDS, QUICK_SECONDS, QUICK = 16.0, 1.5, ('together',)
 POSTERIOR, SMOOTHED = 'pose_mixture', 'smoothed_pose_mixture'
 TOLD, LISTED = 'keep_out', 'people'
 # Options of a replay that leaves out the gravity of the bag.
@@ -84,13 +84,14 @@ STAGES = (*OFFLINE, *CASES)
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = benchmark_parser('live', __doc__, quick=f'{QUICK_SECONDS:g} seconds each')
+    parser = benchmark_parser('live', __doc__, quick=f'{QUICK_SECONDS:g} seconds of {QUICK[0]}')
     add_choice(parser, STAGES)
     parser.add_argument('--runs', type=int, default=1, help='runs of each case (1)')
     parser.add_argument('--minutes', type=float, help='of each case (as long as the clip)')
     options = parser.parse_args(argv)
     seconds = QUICK_SECONDS if options.quick else SECONDS
-    result = measure(seconds, tuple(options.only), options.runs, options.minutes)
+    only = QUICK if options.quick and options.only is STAGES else tuple(options.only)
+    result = measure(seconds, only, options.runs, options.minutes)
     return show(result, as_text, as_json=options.json)
 
 
@@ -145,12 +146,11 @@ def _errors(bag: Path, truth: Truth) -> dict[str, Any]:
 def _tried(
     folder: Path, stage: str, case: Case, seconds: float, runs: int, minutes: float | None
 ) -> Any:
-    environ = {PROFILES: str(PROFILE)} if case.room else {}
     clip = make_clip(folder, case.clip, seconds)
     try:
         if case.detector:
             BlazePose()
-        with changed_environment(environ):
+        with changed_environment({PROFILES: str(PROFILE)}):
             found = [live(clip, folder / f'{stage} {k}', case, minutes) for k in range(runs)]
     except (LiveNodeError, DetectorError) as error:
         return f'skipped: {error}'
@@ -357,7 +357,6 @@ def _received(player: Player, node: LiveNode) -> int:
 
 def _shifted(data: bytes, stamp_ns: int) -> bytes:
     """A mixture with the stamp of its image in the bag, as it is stored."""
-    from benchmarks.publisher import with_stamp
     from msg_tools.messages.cdr import canonical
 
     return canonical(with_stamp(data, stamp_ns), POSE_MIXTURE)
@@ -442,7 +441,3 @@ def _table_of_one(found: Mapping[str, Any], *, markdown: bool) -> str:
         ages = ('' if math.isnan(age[x]) else f'{age[x]:.2f} s' for x in ('median', '95 %'))
         rows.append([what, *_timing(one), str(one['nobody']), *ages, *errors])
     return table(rows, markdown=markdown)
-
-
-if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))

@@ -7,9 +7,9 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,26 +36,23 @@ class Case:
         what: in words.
         clip: that is shown, see `benchmarks.live_clips`.
         transport: of the images.
-        room: whether Fast DDS has room for raw images.
         keypoints: whether there are any; then there is no BME.
         detector: whether MediaPipe finds them, on the same machine.
         together: whether the nodes run in one process.
         smoothed: whether there is a smoother.
         keep_out: whether a robot listens to what it keeps out of.
-        filter, bme: parameters that are not the usual ones.
+        gravity: whether it is given.
     """
 
     what: str
     clip: str = 'dance'
     transport: str = 'raw'
-    room: bool = True
     keypoints: bool = False
     detector: bool = False
     together: bool = False
     smoothed: bool = True
     keep_out: bool = False
-    filter: Mapping[str, Any] = field(default_factory=dict)
-    bme: Mapping[str, Any] = field(default_factory=dict)
+    gravity: bool = False
 
     @property
     def people(self) -> int:
@@ -66,10 +63,8 @@ class Case:
 
 CASES = {
     'newest': Case('processes apart: newest complete image'),
-    'queue': Case('queue_size 5', filter={'queue_size': 5}, bme={'queue_size': 5}),
-    'predictions': Case('predictions from every image', bme={'tracked_interval': 0.0}),
     'compressed': Case('JPEG', transport='compressed'),
-    'gravity': Case('gravity given', filter={'gravity': (0.0, 1.0, 0.0)}),
+    'gravity': Case('gravity given', gravity=True),
     'keypoints': Case('images and keypoints', keypoints=True),
     'together': Case('one process: newest complete image', together=True),
     'together, keep_out': Case(
@@ -86,7 +81,6 @@ CASES = {
         'one process: images and MediaPipe', keypoints=True, detector=True, together=True
     ),
     'large': Case('processes apart: 1280x720, 15 images a second', clip=LARGE),
-    'usual DDS': Case('without fastdds.xml', room=False),
     'visit': Case('one process: images', clip=VISIT, together=True, keep_out=True),
     'visit, keypoints': Case(
         'one process: images and MediaPipe',
@@ -122,16 +116,16 @@ def start_nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> li
     if case.people:
         chosen = {PEOPLE_NODE: replace(PeopleParameters(), **images)}
     else:
-        given = {'use_keypoints': True} if case.keypoints else {}
-        chosen = {
-            FILTER: replace(FilterParameters(), **images, **used[FILTER] | given | case.filter)
-        }
+        given: dict[str, Any] = {'use_keypoints': True} if case.keypoints else {}
+        if case.gravity:
+            given['gravity'] = (0.0, 1.0, 0.0)
+        chosen = {FILTER: replace(FilterParameters(), **images, **used[FILTER] | given)}
         if case.smoothed:
             chosen[SMOOTHER] = SmootherParameters()
         if case.detector:
             chosen |= detector
         elif not case.keypoints:
-            chosen[BME] = replace(BmeParameters(), **images | used[BME] | case.bme)
+            chosen[BME] = replace(BmeParameters(), **images | used[BME])
     process = None
     if case.together:
         process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', tuple(chosen))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import platform
 import resource
@@ -67,17 +66,6 @@ def peak_memory(process: int | str = 'self') -> float:
     """
     lines = Path(f'/proc/{process}/status').read_text('utf-8').splitlines()
     return 1024.0 * float(next(line.split()[1] for line in lines if line.startswith('VmHWM:')))
-
-
-def peak_memory_apart(work: Callable[..., Any], *arguments: Any) -> float:
-    """Largest resident memory of a process of its own that does some work, bytes."""
-    with multiprocessing.get_context('spawn').Pool(1) as pool:
-        return pool.apply(_peak_memory_of, (work, *arguments))
-
-
-def _peak_memory_of(work: Callable[..., Any], *arguments: Any) -> float:
-    work(*arguments)
-    return peak_memory()
 
 
 def forget_peak(process: int | str = 'self') -> None:

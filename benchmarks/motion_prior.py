@@ -9,7 +9,6 @@ walk at the rates of the body, and the same with 0.7 of a velocity that is kept.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from benchmarks.clips import ROOT
-from benchmarks.command import benchmark_parser, show
+from benchmarks.command import benchmark_parser, run_benchmark
 from benchmarks.machine import description
 from hmt_learning.training.training_set import motion_files, recorded_sequence
 from hmt_ros.body import Body, load_body
@@ -137,9 +136,9 @@ def main(argv: list[str]) -> int:
     parser = benchmark_parser('motion_prior', __doc__, quick='two motions')
     parser.add_argument('--mocap', type=Path, help='folder of motions (the development motions)')
     options = parser.parse_args(argv)
-    try:
-        result = measure(options.mocap, quick=options.quick)
-    except (ValueError, OSError) as error:
-        print(f'motion_prior: {error}', file=sys.stderr)
-        return 1
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'motion_prior',
+        lambda: measure(options.mocap, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )

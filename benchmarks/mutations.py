@@ -1,17 +1,10 @@
-"""Messages and files that nobody would write: valid ones with damage, and ones made up by type."""
+"""Messages and files that nobody would write: valid ones with damage."""
 
 from __future__ import annotations
 
 import struct
-from typing import Any
 
 import numpy as np
-from hypothesis import strategies
-from hypothesis.strategies import SearchStrategy
-from rosbags.interfaces import Nodetype
-
-from msg_tools import RosbagsMessages
-from msg_tools.messages.message_types import typestore
 
 # Numbers at which code breaks, as they stand in CDR.
 _INTEGERS = (0, 1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1)
@@ -23,15 +16,6 @@ _MOST_CHANGES = 4
 # How often each kind of damage: most other than of bits and words can not even be read.
 _COUNTS = (0.6, 0.2, 0.1, 0.1)
 _KINDS = (0.35, 0.35, 0.06, 0.06, 0.06, 0.06, 0.06)
-
-_LIMITS = {
-    'int8': (-(2**7), 2**7 - 1), 'uint8': (0, 2**8 - 1), 'byte': (0, 2**8 - 1),
-    'char': (0, 2**8 - 1), 'octet': (0, 2**8 - 1),
-    'int16': (-(2**15), 2**15 - 1), 'uint16': (0, 2**16 - 1),
-    'int32': (-(2**31), 2**31 - 1), 'uint32': (0, 2**32 - 1),
-    'int64': (-(2**63), 2**63 - 1), 'uint64': (0, 2**64 - 1),
-}  # fmt: skip
-_SHORT = 6
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
@@ -59,48 +43,3 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
         else:
             content[at : at + length] = rng.bytes(length)
     return bytes(content)
-
-
-def messages_of(msgtype: str, words: tuple[str, ...] = ()) -> SearchStrategy[Any]:
-    """Messages of a type whose fields are anything that the type allows.
-
-    Args:
-        msgtype: for example 'hmt_msgs/msg/PoseMixture'.
-        words: that texts are made of as well, such as names that mean something.
-    """
-    factory = RosbagsMessages()
-    _, fields = typestore().fielddefs[msgtype]
-    parts = {name: _values(kind, words) for name, kind in fields}
-    return strategies.fixed_dictionaries(parts).map(
-        lambda values: factory.create(msgtype, **values)
-    )
-
-
-def _values(kind: Any, words: tuple[str, ...]) -> SearchStrategy[Any]:
-    node, what = kind
-    if node == Nodetype.BASE:
-        return _scalars(what[0], words)
-    if node == Nodetype.NAME:
-        return messages_of(what, words)
-    inner, length = what
-    least, most = (length, length) if node == Nodetype.ARRAY else (0, _SHORT)
-    if inner[0] == Nodetype.BASE and inner[1][0] not in ('string', 'wstring'):
-        dtype = np.dtype({'byte': 'u1', 'char': 'u1', 'octet': 'u1'}.get(inner[1][0], inner[1][0]))
-        lists = strategies.lists(_scalars(inner[1][0], words), min_size=least, max_size=most)
-        return lists.map(lambda values: np.array(values, dtype=dtype))
-    return strategies.lists(_values(inner, words), min_size=least, max_size=most)
-
-
-def _scalars(name: str, words: tuple[str, ...]) -> SearchStrategy[Any]:
-    if name in ('string', 'wstring'):
-        known = strategies.sampled_from(words) if words else strategies.nothing()
-        # Surrogates are no UTF-8, and a zero ends a text.
-        letters = strategies.characters(exclude_categories=['Cs'], exclude_characters='\0')
-        return known | strategies.text(letters, max_size=12)
-    if name == 'bool':
-        return strategies.booleans()
-    if name.startswith('float'):
-        width = 32 if name == 'float32' else 64
-        return strategies.floats(width=width) | strategies.floats(-10.0, 10.0, width=width)
-    low, high = _LIMITS[name]
-    return strategies.integers(low, high) | strategies.integers(max(low, 0), min(high, 100))

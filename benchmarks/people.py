@@ -9,7 +9,6 @@ heaviest mode and of the best one, means of both people, mm.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -157,7 +156,3 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     kept = sum(row['kept'] for row in rows)
     shown = table([['seed', 'kept', 'tracks', *columns], *lines], markdown=markdown)
     return f'{shown}\n\nBoth keep their tracks in {kept} of {len(rows)} crossings.'
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ from benchmarks.clips import (
     table,
     with_file,
 )  # fmt: skip
-from benchmarks.command import add_choice, benchmark_parser, show, told
+from benchmarks.command import add_choice, benchmark_parser, run_benchmark, told
 from benchmarks.machine import description
 from benchmarks.runs import BOTH, Run, run
 from benchmarks.tracking_scores import scores_of
@@ -195,9 +194,9 @@ def main(argv: list[str]) -> int:
     parser = benchmark_parser('real_clips', __doc__, quick='a second of one clip')
     add_choice(parser, CLIPS, 'CLIP')
     options = parser.parse_args(argv)
-    try:
-        found = measure(tuple(options.only), quick=options.quick)
-    except (FileNotFoundError, ValueError) as error:
-        print(f'real_clips: {error}', file=sys.stderr)
-        return 1
-    return show(found, as_text, as_json=options.json)
+    return run_benchmark(
+        'real_clips',
+        lambda: measure(tuple(options.only), quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )

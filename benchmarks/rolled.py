@@ -8,7 +8,6 @@ the errors.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -19,15 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.clips import SCHEME, Clip, find_clips, read_clip, read_detections, table
-from benchmarks.command import add_choice, benchmark_parser, show
+from benchmarks.command import add_choice, benchmark_parser, run_benchmark
 from benchmarks.machine import description
 from benchmarks.runs import GIVEN, GRAVITIES, follow, in_processes, new_tracker, recorded
-from benchmarks.tracker_changes import changed
 from benchmarks.tracking_scores import scores_of
 from hmt_ros.body import Camera, load_body
 from hmt_ros.experts.lifted_fit import lift_poses
 from hmt_ros.experts.lifter import load_lifter
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.tracking import TrackerSettings
 
 ANGLES = (0, 15, 90, 180)
 LIFT, TRACK = 'lift', 'track'
@@ -105,7 +104,7 @@ def scored(work: tuple[Path, str, str, float]) -> float:
         for stamp, one in read_detections(folder).keypoints.items()
     }
     if stage == TRACK:
-        tracker = new_tracker(clip, body, changed(()), 0, with_subject=False)
+        tracker = new_tracker(clip, body, TrackerSettings(), 0, with_subject=False)
         record = follow(clip, tracker, 0, found, gravity=gravity)
         return float(scores_of(record).get('heaviest_mm', np.nan))
     stamps = [s for s in clip.stamps if s in found and found[s].seen.any()]
@@ -120,9 +119,9 @@ def scored(work: tuple[Path, str, str, float]) -> float:
     ]  # fmt: skip
     record = recorded(
         clip, [body] * len(rows), [one for _, one in rows], [one.means[0] for _, one in rows],
-        [stamp for stamp, _ in rows], [0.0] * len(rows), [0.0] * len(rows), 0,
+        [stamp for stamp, _ in rows], 0,
     )  # fmt: skip
-    return float(scores_of(replace(record, cpu_seconds=np.zeros(0)))['heaviest_mm'])
+    return float(scores_of(record)['heaviest_mm'])
 
 
 def measure(
@@ -156,7 +155,7 @@ def measure(
         )
     kinds = list(product(stages, gravities, folders))
     work = [(x, stage, gravity, a) for stage, gravity, x in kinds for a in ANGLES]
-    found = dict(zip(work, in_processes(scored, work, 0, 'rolled'), strict=True))
+    found = dict(zip(work, in_processes(scored, work, 1 if quick else 0, 'rolled'), strict=True))
     rows = [
         {
             'stage': stage, 'gravity': gravity, 'clip': x.name,
@@ -187,12 +186,15 @@ def main(arguments: list[str]) -> int:
     parser.add_argument('--gravity', nargs='+', choices=GRAVITIES, default=(GIVEN,))
     add_choice(parser, STAGES)
     options = parser.parse_args(arguments)
-    try:
-        result = measure(
-            options.clips, tuple(options.names), tuple(options.only), tuple(options.gravity),
+    return run_benchmark(
+        'rolled',
+        lambda: measure(
+            options.clips,
+            tuple(options.names),
+            tuple(options.only),
+            tuple(options.gravity),
             quick=options.quick,
-        )  # fmt: skip
-    except (FileNotFoundError, ValueError) as error:
-        print(f'rolled: {error}', file=sys.stderr)
-        return 1
-    return show(result, as_text, as_json=options.json)
+        ),
+        as_text,
+        as_json=options.json,
+    )

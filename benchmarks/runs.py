@@ -16,29 +16,21 @@ import sys
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from benchmarks.clips import (
-    ROOT,
-    Clip,
-    at_rate,
-    at_size,
-    read_clip,
-    read_detections,
-    resized,
-)
-from benchmarks.tracker_changes import changed
+from benchmarks.clips import ROOT, Clip, at_rate, read_clip, read_detections
 from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import (
@@ -54,11 +46,10 @@ from hmt_ros.image.likelihood import OFF
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.tracking import (
     Lagged,
     LaggedWeights,
-    PosePrediction,
-    Subject,
     Tracker,
     TrackerSettings,
     read_subject,
@@ -95,7 +86,6 @@ class Run:
         seed: of the tracker.
         changes: settings of the tracker, by their path, that differ from the defaults.
         limit: number of images of the clip, of which `rate` may leave out some; None: all.
-        size: of the images against those in the bag; other sizes go with images alone.
         start: what the track starts from, one of `STARTS`.
         rate: images a second that the tracker is given at most; 0: all images of the clip.
         gravity: whether the tracker is given its direction with each image, one of `GRAVITIES`.
@@ -106,7 +96,6 @@ class Run:
     seed: int
     changes: tuple[tuple[str, Any], ...] = ()
     limit: int | None = None
-    size: float = 1.0
     start: str = SUBJECT
     rate: float = 0.0
     gravity: str = UNKNOWN
@@ -188,19 +177,91 @@ def new_tracker(
     background = None if clip.background is None else BackgroundModel.from_image(clip.background)
     tracker = Tracker(body, clip.camera, settings, background, seed)
     if with_subject:
-        tracker.reset(subject_of(clip, body))
+        tracker.reset(read_subject(clip.subject, body))
     return tracker
 
 
-def subject_of(clip: Clip, body: Body) -> Subject:
-    """The subject of a clip, with its keypoints where they are in images of the clip's size."""
-    subject = read_subject(clip.subject, body)
-    if clip.size == 1.0:
-        return subject
-    known = subject.keypoints
-    pixels = at_size(known.pixels, (clip.size, clip.size))
-    moved = replace(known, pixels=pixels, covariances=clip.size**2 * known.covariances)
-    return replace(subject, keypoints=moved)
+def begun(
+    clip: Clip,
+    inputs: str,
+    seed: int = 0,
+    settings: TrackerSettings | None = None,
+    *,
+    with_subject: bool = True,
+) -> tuple[Tracker, dict[int, Keypoints]]:
+    """A tracker for one of `INPUTS`, and the keypoints that it is given by stamp.
+
+    Raises:
+        ValueError: the clip has no keypoints, and the tracker needs them.
+    """
+    settings = settings or TrackerSettings()
+    if inputs == KEYPOINTS:
+        settings = keypoints_only(settings)
+    keypoints = {} if inputs == IMAGES else read_detections(clip.folder).keypoints
+    tracker = new_tracker(clip, load_body('human37'), settings, seed, with_subject=with_subject)
+    return tracker, keypoints
+
+
+class Step(NamedTuple):
+    """What the tracker says of an image, and the time and the processor time that it took, s."""
+
+    stamp: int
+    posterior: GaussianMixture | None
+    likelihood: GaussianMixture | None
+    seconds: float
+    cpu_seconds: float
+
+
+def stepped(
+    clip: Clip, tracker: Tracker, keypoints: Mapping[int, Keypoints], *, gravity: str = UNKNOWN
+) -> Iterator[Step]:
+    """The images of a clip through a tracker; it may be asked for more after each.
+
+    Args:
+        clip: images, and the views of a camera that moves.
+        tracker: before the first image.
+        keypoints: by stamp.
+        gravity: one of `GRAVITIES`; images of which the clip does not tell it go without.
+    """
+    for stamp, image in zip(clip.stamps, clip.images, strict=True):
+        start, cpu_start = time.perf_counter(), time.process_time()
+        if stamp in clip.views:
+            rotation, position = clip.views[stamp]
+            tracker.set_camera(position, rotation)
+        if gravity == GIVEN and stamp in clip.ups:
+            tracker.set_gravity(clip.ups[stamp])
+        found = tracker.step(image, stamp, keypoints.get(stamp))
+        yield Step(stamp, *found, time.perf_counter() - start, time.process_time() - cpu_start)
+
+
+class Seen(NamedTuple):
+    """What the tracker says of an image in which it sees somebody."""
+
+    stamp: int
+    body: Body
+    posterior: GaussianMixture
+    likelihood: GaussianMixture
+    errors: CueErrors
+    shape_covariance: NDArray[np.float64]
+    point: NDArray[np.float64]
+
+
+def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
+    """What the tracker says of the images of a clip; `inputs` and `gravity` as of a `Run`."""
+    tracker, keypoints = begun(clip, inputs)
+    return [
+        Seen(
+            one.stamp,
+            tracker.body,
+            one.posterior,
+            one.likelihood,
+            tracker.likelihood_errors,
+            tracker.shape_covariance,
+            tracker.point_estimate,
+        )
+        for one in stepped(clip, tracker, keypoints, gravity=gravity)
+        if one.posterior is not None and one.likelihood is not None
+    ]
 
 
 def run(one: Run) -> Record:
@@ -209,17 +270,10 @@ def run(one: Run) -> Record:
     Raises:
         ValueError: the clip can not be read, or lacks what the run needs.
     """
-    clip, body = read_clip(one.folder, one.limit), load_body('human37')
-    if one.size != 1.0:
-        if one.inputs != IMAGES:
-            raise ValueError(f'keypoints are for images of size 1, saw {one.size}')
-        clip = resized(clip, one.size)
-    clip = at_rate(clip, one.rate)
-    settings = changed(one.changes)
-    keypoints = None if one.inputs == IMAGES else read_detections(one.folder).keypoints
-    if one.inputs == KEYPOINTS:
-        settings = keypoints_only(settings)
-    tracker = new_tracker(clip, body, settings, one.seed, with_subject=one.start == SUBJECT)
+    clip = at_rate(read_clip(one.folder, one.limit), one.rate)
+    tracker, keypoints = begun(
+        clip, one.inputs, one.seed, changed(one.changes), with_subject=one.start == SUBJECT
+    )
     return follow(clip, tracker, one.seed, keypoints, gravity=one.gravity)
 
 
@@ -227,58 +281,43 @@ def follow(
     clip: Clip,
     tracker: Tracker,
     seed: int,
-    keypoints: dict[int, Keypoints] | None = None,
-    predict: Callable[[NDArray[np.uint8]], PosePrediction] | None = None,
+    keypoints: Mapping[int, Keypoints],
     *,
     gravity: str = UNKNOWN,
 ) -> Record:
-    """What a tracker says of the images of a clip.
+    """What a tracker says of the images of a clip, beside the truth.
 
     Args:
-        clip: images and truth.
-        tracker: before the first image.
+        clip, tracker, keypoints, gravity: as for `stepped`.
         seed: of the draws of the blind control and of the regions.
-        keypoints: by stamp; None: none are used.
-        predict: poses that a regression expects by an image; None: there is none.
-        gravity: one of `GRAVITIES`.
 
     Raises:
         ValueError: gravity is to be given, and the clip does not tell it.
     """
     if gravity == GIVEN and not clip.ups:
         raise ValueError(f'{clip.folder}: truth.npz has neither gravity nor up')
+    kept: list[Step] = []
     bodies: list[Body] = []
     mixtures: list[GaussianMixture] = []
-    points: list[NDArray[np.float64]] = []
-    stamps: list[int] = []
-    evaluations, seconds, cpu_seconds, statuses = [], [], [], []
+    points, evaluations, statuses = [], [], []
     lagged, later = LaggedWeights(LAG), list[Lagged]()
-    for stamp, image in zip(clip.stamps, clip.images, strict=True):
-        start, cpu_start = time.perf_counter(), time.process_time()
-        seen = None if keypoints is None else keypoints.get(stamp)
-        prediction = None if predict is None else predict(image)
-        if stamp in clip.views:
-            rotation, position = clip.views[stamp]
-            tracker.set_camera(position, rotation)
-        if gravity == GIVEN and stamp in clip.ups:
-            tracker.set_gravity(clip.ups[stamp])
-        posterior, _ = tracker.step(image, stamp, seen, prediction)
-        spent, cpu_spent = time.perf_counter() - start, time.process_time() - cpu_start
+    for one in stepped(clip, tracker, keypoints, gravity=gravity):
         statuses.append(tracker.status.value)
-        if posterior is not None:
-            later += lagged.update(stamp, posterior, tracker.origins)
-        if posterior is not None and stamp in clip.truth.joints:
+        if one.posterior is None:
+            continue
+        later += lagged.update(one.stamp, one.posterior, tracker.origins)
+        if one.stamp in clip.truth.joints:
+            kept.append(one)
             bodies.append(tracker.body)
-            mixtures.append(posterior)
+            mixtures.append(one.posterior)
             points.append(tracker.point_estimate)
-            stamps.append(stamp)
             evaluations.append(float(tracker.evaluations))
-            seconds.append(spent)
-            cpu_seconds.append(cpu_spent)
-    record = recorded(clip, bodies, mixtures, points, stamps, evaluations, seconds, seed)
+    record = recorded(clip, bodies, mixtures, points, [one.stamp for one in kept], seed)
     return replace(
         record,
-        cpu_seconds=np.array(cpu_seconds),
+        evaluations=np.array(evaluations),
+        seconds=np.array([one.seconds for one in kept]),
+        cpu_seconds=np.array([one.cpu_seconds for one in kept]),
         statuses=np.array(statuses),
         lagged=_lagged_weights([*later, *lagged.finish()], record),
     )
@@ -300,13 +339,11 @@ def recorded(
     mixtures: list[GaussianMixture],
     points: list[NDArray[np.float64]],
     stamps: list[int],
-    evaluations: list[float],
-    seconds: list[float],
     seed: int,
 ) -> Record:
     """Mixtures and point estimates (T,) with their scores against the truth of a clip.
 
-    T may be 0: nobody was found in any image.
+    T may be 0: nobody was found in any image. What they cost is unknown.
     """
     origin = origin_joints(clip.truth.joint_names)
     scored = clip.truth.evaluated_joints()
@@ -318,16 +355,29 @@ def recorded(
     weights = np.zeros((len(stamps), k))
     point = np.empty((len(stamps), len(JOINTS), 3))
     blind = np.empty(len(stamps))
+    contact, views = feet_and_views(clip, stamps)
+    record = Record(
+        np.array(stamps, dtype=np.int64),
+        joints,
+        weights,
+        point,
+        blind,
+        np.empty(0),
+        np.empty((0, len(scored))),
+        np.empty(0),
+        np.zeros(len(stamps)),
+        np.zeros(len(stamps)),
+        np.array([len(clip.images)]),
+        true,
+        contact,
+        views,
+    )
+    if not bodies:
+        return record
     rng = np.random.default_rng([seed, OF_BLIND_CONTROL])
     found, absolute = [], []
     # The body changes only while its flesh is fitted: its kinematics is computed in batches.
     first = 0
-    if not bodies:
-        return Record(
-            np.array(stamps, dtype=np.int64), joints, weights, point, blind, np.empty(0),
-            np.empty((0, len(scored))), np.empty(0), np.array(evaluations), np.array(seconds),
-            np.array([len(clip.images)]), true, *feet_and_views(clip, stamps),
-        )  # fmt: skip
     for i in range(1, len(bodies) + 1):
         if i == len(bodies) or bodies[i] is not bodies[first]:
             body = bodies[first]
@@ -349,12 +399,14 @@ def recorded(
     assert scores.levels is not None
     assert scores.joint_levels is not None
     assert scores.log_densities is not None
-    return Record(
-        np.array(stamps), joints, weights, point, blind, scores.levels, scores.joint_levels,
-        scores.log_densities, np.array(evaluations), np.array(seconds),
-        np.array([len(clip.images)]), true, *feet_and_views(clip, stamps),
-        absolute_levels=absolute_levels, volumes=volumes,
-    )  # fmt: skip
+    return replace(
+        record,
+        levels=scores.levels,
+        joint_levels=scores.joint_levels,
+        log_densities=scores.log_densities,
+        absolute_levels=absolute_levels,
+        volumes=volumes,
+    )
 
 
 def true_joints(clip: Clip, stamps: Sequence[int]) -> NDArray[np.float64]:
@@ -405,7 +457,7 @@ def run_all(runs: Sequence[Run], processes: int = 0, kept: Path = KEPT) -> list[
 
     Args:
         runs: to do.
-        processes: number of processes, one thread each; 0: one a core.
+        processes: number of processes, one thread each; 0: one a core; 1: this one.
         kept: folder of the records.
     """
     kept.mkdir(parents=True, exist_ok=True)
@@ -435,11 +487,11 @@ def in_processes(
     Args:
         work: function of a module.
         items: that can be pickled.
-        processes: number of processes; 0: one a core.
+        processes: number of processes; 0: one a core; 1: this one.
         what: is done, for the bar.
     """
-    if not items:
-        return []
+    if processes == 1 or not items:
+        return [work(item) for item in items]
     cores = sorted(os.sched_getaffinity(0))
     context = multiprocessing.get_context('spawn')
     turn = context.Value('i', 0)
@@ -532,12 +584,16 @@ def records_of(runs: Sequence[Run], folder: Path) -> list[Record | None]:
 def _normalised(text: str) -> str:
     """The same text for the same identity of a run; empty: the text is damaged.
 
-    What a file of an older checkout does not tell of a run is usual there.
+    What a file of an older checkout does not tell of a run is usual there; its runs over smaller
+    images are left out.
     """
     usual = {x.name: x.default for x in fields(Run) if x.default is not MISSING}
     try:
-        return json.dumps({**usual, **json.loads(text)}, sort_keys=True)
-    except (TypeError, ValueError):
+        told = json.loads(text)
+        if told.pop('size', 1.0) != 1.0:
+            return ''
+        return json.dumps({**usual, **told}, sort_keys=True)
+    except (AttributeError, TypeError, ValueError):
         return ''
 
 
@@ -570,3 +626,50 @@ def code_digest() -> str:
 def _length(one: Run) -> int:
     share = min(one.rate, USUAL_RATE) / USUAL_RATE if one.rate > 0 else 1.0
     return int(share * sum(path.stat().st_size for path in one.folder.glob('*.mcap')))
+
+
+# Settings of the tracker that differ from the defaults, named by their path, such as
+# `likelihood.edges.weight`.
+
+
+def changed(changes: Sequence[tuple[str, Any]]) -> TrackerSettings:
+    """Settings with those that are named by their path, such as `likelihood.edges.weight`.
+
+    Raises:
+        ValueError: the setting does not exist, or does not take the value.
+    """
+    settings: Any = TrackerSettings()
+    for path, value in changes:
+        settings = _with_value(settings, path.split('.'), value, path)
+    result: TrackerSettings = settings
+    return result
+
+
+def _with_value(settings: Any, names: list[str], value: Any, path: str) -> Any:
+    known = [field.name for field in fields(settings)] if is_dataclass(settings) else []
+    if names[0] not in known:
+        raise ValueError(f'no setting {path!r}: {names[0]!r} is none of {", ".join(known)}')
+    own = getattr(settings, names[0])
+    if names[1:]:
+        return replace(settings, **{names[0]: _with_value(own, names[1:], value, path)})
+    if isinstance(own, float) and isinstance(value, int):
+        value = float(value)
+    if not isinstance(value, type(own)):
+        raise ValueError(f'{path} is a {type(own).__name__}, saw {value!r}')
+    return replace(settings, **{names[0]: value})
+
+
+def parsed_changes(words: Sequence[str]) -> tuple[tuple[str, Any], ...]:
+    """Changes from words such as `max_hypotheses=4`.
+
+    Raises:
+        ValueError: a word of another form, or no such setting.
+    """
+    result = []
+    for word in words:
+        name, equals, value = word.partition('=')
+        if not equals:
+            raise ValueError(f'wanted SETTING=VALUE, saw {word!r}')
+        result.append((name, yaml.safe_load(value)))
+    changed(result)
+    return tuple(result)

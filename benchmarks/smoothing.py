@@ -1,291 +1,365 @@
-"""smoothing: exactness against known posteriors, speed, memory, peers, and clips with truth."""
+"""smoothing: what the smoother of the node makes of clips with known truth, live and offline.
+
+The tracker follows every clip with images, with keypoints as well, and with keypoints alone,
+gravity given and not, at the rate of the clip and at lower ones. What it says of each image goes
+through a `SmootherSession` with the defaults of the node, live, and through its smoother once, over
+the whole clip. Beside it stand
+
+- the filter;
+- the simplest smoother: the joints of the filter's heaviest mode, averaged over time with the
+  Gaussian kernel that is best in the mean over the clips;
+- the limit of what any choice of modes can bring: at each time the mode of the filter that is
+  nearest to the truth, averaged in the same way. It knows the truth; no method does.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
-from benchmarks.arm_waving import STEP, smooth_waving, waving
-from benchmarks.clips import table
-from benchmarks.command import add_choice, benchmark_parser, run_stages, show
-from benchmarks.exact_smoothing import (
-    divergence,
-    enumerated,
-    grid_marginals,
-    modes,
-    particle_marginals,
+from benchmarks.clips import Clip, at_rate, find_clips, read_clip, table
+from benchmarks.command import benchmark_parser, run_benchmark
+from benchmarks.machine import description
+from benchmarks.runs import (
+    GIVEN,
+    GRAVITIES,
+    IMAGES,
+    INPUTS,
+    Record,
+    Seen,
+    in_processes,
+    recorded,
+    tracked,
 )
-from benchmarks.machine import best_time, peak_memory_apart
-from benchmarks.smoothing_clips import clips, error_rows, motion_rows
-from benchmarks.smoothing_peers import (
-    RobustSequence,
-    gtsam_missing,
-    gtsam_trajectory,
-    scipy_trajectory,
+from benchmarks.tracking_means import GROUPS, group_of
+from benchmarks.tracking_scores import heaviest_joints, scores_of
+from hmt_ros.body import Body
+from hmt_ros.body.mirror import propagated
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.reduction import leaders
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.fixed_frame import FixedFrame
+from hmt_ros.sessions.handled import Output
+from hmt_ros.sessions.smoothed_messages import poses_apart
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
+from hmt_ros.sessions.transform_buffer import Transform
+from hmt_ros.tracking.camera_motion import CameraMotion
+from msg_tools import RosbagsMessages
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.pose_mixtures import (
+    MixtureKind,
+    PoseMixture,
+    TrackState,
+    pose_mixture_message,
+    pose_mixture_of,
 )
-from benchmarks.smoothing_relations import relations
-from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
-from hmt_ros.smoothing.embedded_network import embedded_network, k_best_paths
-from hmt_ros.smoothing.mode_sequence import ModeSequence
-from hmt_ros.smoothing.trajectory_refinement import refine
-from hmt_ros.smoothing.variational_mixture import laplace_weights, minimise_free_energy
 
 Array = NDArray[np.float64]
 
-TIMES = 47
-PARTS = ('memory', 'exactness', 'grid', 'stages', 'peers', 'length', 'relations', 'clips')
-# Variances that a step of the random walk adds, against modes of unit size.
-WALKS = (1.0, 4.0, 16.0)
+FILTER, LIVE, OFFLINE = 'filter', 'live', 'offline'
+AVERAGED, NEAREST = 'filter, averaged', 'nearest modes, averaged'
+# Images a second; 0: all of a clip.
+RATES = (0.0, 8.0, 3.0)
+# Mixtures that are kept for smoothing over the whole clip, and components of a smoothed pose.
+KEPT, COMPONENTS = 10_000, 8
+# Distance of the joints of two modes, in the mean, from which on they are counted apart, m.
+APART = 0.03
+# Standard deviations of the kernels that joints are averaged with, images.
+KERNELS = (1.0, 2.0, 3.0, 4.0, 6.0)
+SCORES = (
+    'heaviest_mm',
+    'best_mm',
+    'acceleration',
+    'feet',
+    'root_percent',
+    'joint_coverage_90',
+    'absolute_coverage_90',
+)
+MODES, MS = 'modes', 'ms'
+SMOOTHED = 'smoothed_pose_mixture'
+QUICK = 12  # images
+
+
+class Work(NamedTuple):
+    """A clip, and how it is seen: see `Run`; `limit` images at most, None: all."""
+
+    folder: Path
+    inputs: str
+    gravity: str
+    rate: float
+    limit: int | None
 
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = benchmark_parser('smoothing', __doc__, quick='fewer sequences and repetitions')
-    add_choice(parser, PARTS, 'PART')
+    parser = benchmark_parser('smoothing', __doc__, quick=f'{QUICK} images of one clip')
+    parser.add_argument('--clips', type=Path, help='folder of the clips')
+    parser.add_argument('--names', nargs='+', default=(), metavar='NAME', help='some of the clips')
     options = parser.parse_args(argv)
-    result = measure(quick=options.quick, only=options.only)
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'smoothing',
+        lambda: measure(options.clips, options.names, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )
 
 
-def measure(*, quick: bool = False, only: Sequence[str] = PARTS) -> dict[str, Any]:
-    """What was asked for; memory first, in a process of its own."""
-    times = 12 if quick else TIMES
-    parts: dict[str, Callable[[], Any]] = {
-        'memory': lambda: {'peak_mb': peak_memory_apart(smooth_waving, times) / 1e6},
-        'exactness': lambda: exactness(1 if quick else 4, WALKS[1:2] if quick else WALKS),
-        'grid': lambda: grid(1 if quick else 3, 20 if quick else 40),
-        'stages': lambda: stages(times, 0.0 if quick else 3.0),
-        'peers': lambda: peers(times, 0.0 if quick else 2.0),
-        'length': lambda: length(*((6, 12) if quick else (TIMES, 10 * TIMES))),
-        'relations': lambda: relations(6 if quick else TIMES),
-        'clips': lambda: clips(quick),
-    }
-    return run_stages('smoothing', parts, only)
+def measure(
+    clips: Path | None = None, names: Sequence[str] = (), *, quick: bool = False
+) -> dict[str, Any]:
+    """Scores by clip, and their means over groups of clips.
 
+    Args:
+        clips: folder of the clips; None: the development clips, or bags/.
+        names: of some of them; empty: all.
+        quick: a few images of one clip.
 
-def exactness(seeds: int, walks: tuple[float, ...] = WALKS) -> dict[str, Any]:
-    """Mean over t of KL(exact || smoothed), K = 3, T = 6, d = 2, and of a particle smoother."""
-    result: dict[str, Any] = {}
-    for kind in ('separated', 'overlapping'):
-        ours, particles, spent = [], [], []
-        for walk in walks:
-            dynamics = LinearGaussianDynamics.random_walk([walk, walk])
-            smoother = MixtureSmoother(dynamics)
-            for seed in range(seeds):
-                mixtures = modes(kind, seed, 6)
-                exact = enumerated(mixtures, dynamics)
-                smoother.smooth(mixtures)
-                begin = time.process_time()
-                found = smoother.smooth(mixtures)
-                spent.append(time.process_time() - begin)
-                rng = np.random.default_rng(seed)
-                ours.append(
-                    np.mean(
-                        [
-                            divergence(p, found.marginal(t).log_density, rng)
-                            for t, p in enumerate(exact)
-                        ]
-                    )
-                )
-                peer = particle_marginals(mixtures, dynamics, spent[-1], seed)
-                rng = np.random.default_rng(seed)
-                particles.append(
-                    np.mean([divergence(p, q.log_density, rng, 500) for p, q in zip(exact, peer)])
-                )
-        result[kind] = {
-            'mean_kl': float(np.mean(ours)),
-            'worst_kl': float(np.max(ours)),
-            'particle_mean_kl': float(np.mean(particles)),
-            'particle_better_in': int((np.array(particles) < np.array(ours)).sum()),
-            'sequences': len(ours),
-            'cpu_s': float(np.mean(spent)),
+    Raises:
+        ValueError: there are no such clips, or one can not be read.
+    """
+    folders, source = find_clips(clips, moving=True)
+    if names:
+        folders = [x for x in folders if x.name in names]
+    if not folders:
+        raise ValueError(f'{source}: none of the clips {list(names)} is there')
+    inputs, gravities, rates, limit = INPUTS, GRAVITIES, RATES, None
+    if quick:
+        folders, inputs, gravities, rates, limit = folders[:1], (IMAGES,), (GIVEN,), (0.0,), QUICK
+    work = [
+        Work(folder, given, known, rate, limit)
+        for rate in rates for given in inputs for known in gravities for folder in folders
+        if given == IMAGES or (folder / 'keypoints_mediapipe.npz').is_file()
+    ]  # fmt: skip
+    found = in_processes(of_clip, work, 1 if quick else 0, 'smoothing')
+    entries = [
+        {
+            'clip': one.folder.name, 'inputs': one.inputs, 'gravity': one.gravity,
+            'rate': one.rate, 'scores': scores,
         }
+        for one, scores in zip(work, found, strict=True)
+    ]  # fmt: skip
+    means = []
+    for rate in rates:
+        for group in GROUPS:
+            for given in inputs:
+                for known in gravities:
+                    kind = {'inputs': given, 'gravity': known, 'rate': rate}
+                    own = [
+                        x['scores'] for x in entries
+                        if group_of(x['clip']) == group and kind.items() <= x.items()
+                    ]  # fmt: skip
+                    if own:
+                        means.append({'clips': group, **kind, 'scores': mean(own)})
+    return {'machine': description(), 'clips': entries, 'means': means}
+
+
+def mean(scores: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Means over clips by way; of kernels the one that is best in the mean."""
+    result = {
+        way: {name: _known_mean([x[way][name] for x in scores]) for name in scores[0][way]}
+        for way in scores[0]
+    }
+    for way in (AVERAGED, NEAREST):
+        kernels = [name for name in result if name.startswith(way)]
+        best = min(kernels, key=lambda name: result[name]['heaviest_mm'])
+        for name in kernels:
+            if name != best:
+                del result[name]
     return result
 
 
-def grid(seeds: int, times: int = 40) -> dict[str, Any]:
-    """The same in one dimension over 40 times, against sums on a grid."""
-    result: dict[str, Any] = {}
-    points = np.linspace(-15, 15, 601)
-    for kind in ('separated', 'overlapping'):
-        ours = []
-        for seed in range(seeds):
-            dynamics = LinearGaussianDynamics.random_walk([1.0])
-            mixtures = modes(kind, seed, times, dimension=1)
-            exact = grid_marginals(mixtures, dynamics, points)
-            found = MixtureSmoother(dynamics).smooth(mixtures)
-            each = []
-            for t, density in enumerate(exact):
-                log = found.marginal(t).log_density(points[:, None])
-                inside = density > 1e-12
-                gap = density[inside] * (np.log(density[inside]) - log[inside])
-                each.append(gap.sum() * (points[1] - points[0]))
-            ours.append(np.mean(each))
-        result[kind] = {'mean_kl': float(np.mean(ours)), 'worst_kl': float(np.max(ours))}
+def _known_mean(values: Sequence[float]) -> float:
+    """The mean of the values that are known; NaN: none is."""
+    known = [x for x in values if np.isfinite(x)]
+    return float(np.mean(known)) if known else float('nan')
+
+
+def of_clip(work: Work) -> dict[str, dict[str, float]]:
+    """Scores of one clip by way."""
+    clip = at_rate(read_clip(work.folder, work.limit), work.rate)
+    seen = tracked(clip, work.inputs, work.gravity)
+    mixtures = {FILTER: {x.stamp: x.posterior for x in seen}}
+    found, ms = smoothed(seen, clip.views)
+    mixtures |= found
+    records = {way: record_of(clip, seen, found) for way, found in mixtures.items()}
+    result = {}
+    for way, record in records.items():
+        scores = scores_of(record)
+        result[way] = {name: float(scores[name]) for name in SCORES}
+        result[way] |= {MODES: modes_apart(record), MS: ms if way == LIVE else float('nan')}
+    own = records[FILTER]
+    plain = {AVERAGED: heaviest_joints(own), NEAREST: nearest_joints(own)}
+    for way, joints in plain.items():
+        for width in KERNELS:
+            smooth = gaussian_filter1d(joints, width, axis=0)
+            one = replace(
+                own, joints=smooth[:, None], weights=np.ones((len(smooth), 1)), point=smooth
+            )
+            result[f'{way} over {width:g} images'] = {
+                'heaviest_mm': float(scores_of(one)['heaviest_mm'])
+            }
     return result
 
 
-def stages(times: int, seconds: float) -> dict[str, Any]:
-    """Times of the stages at d = 32, K = 8, 64 trajectories."""
-    sequence = waving(times)
-    dynamics, mixtures = sequence.dynamics, sequence.mixtures
-    intervals = np.full(times - 1, STEP)
-    layers = ModeSequence(tuple(mixtures), dynamics, intervals)
-    prior, likelihood = layers.prior, layers.likelihood
-    starts = layers.states(layers.paths(64))
-    refined = refine(starts, prior, likelihood, sequence.lower, sequence.upper)
-    distinct = refined.without_duplicates()
-    weights = laplace_weights(distinct.energies, distinct.factors)
+def modes_apart(record: Record) -> float:
+    """How many modes of an image are apart by `APART`, in the mean over images."""
+    relative = record.joints - record.joints[:, :, :1]
+    counts = []
+    for joints, weights in zip(relative, record.weights, strict=True):
+        some = joints[weights > 0]
 
-    def descend() -> Any:
-        return minimise_free_energy(
-            weights, distinct.states, distinct.factors, prior, likelihood,
-            low=sequence.lower, high=sequence.upper, samples=4,
+        def distances(i: int, some: Array = some) -> Array:
+            return np.asarray(np.nanmean(np.linalg.norm(some - some[i], axis=2), axis=1))
+
+        counts.append(len(leaders(weights[weights > 0], distances, APART)))
+    return float(np.mean(counts))
+
+
+def nearest_joints(record: Record) -> Array:
+    """Joints (T, J, 3) of the modes that are nearest to the truth."""
+    away = (record.joints - record.joints[:, :, :1]) - (record.true - record.true[:, :1])[:, None]
+    known = np.isfinite(record.true).all((0, 2))
+    errors = np.linalg.norm(away, axis=3)[:, :, known].mean(2)
+    nearest = np.where(record.weights > 0, errors, np.inf).argmin(1)
+    return np.asarray(record.joints[np.arange(len(nearest)), nearest])
+
+
+def smoothed(
+    seen: Sequence[Seen], views: Mapping[int, tuple[Array, Array]] = MappingProxyType({})
+) -> tuple[dict[str, dict[int, GaussianMixture]], float]:
+    """What the node publishes, and what it makes of all images together, by way and stamp.
+
+    Also the median time that it takes over an image, ms.
+
+    Args:
+        seen: of the images.
+        views: stamp -> rotation (3, 3) and position (3,) of a camera that moves, in the world;
+            its node is given likelihoods in the frame of the world, as `fixed_frame` has them.
+    """
+    frames: dict[int, FixedFrame] = {}
+    turn = 0.0
+    for one in seen:
+        if one.stamp in views:
+            rotation, position = views[one.stamp]
+            frame = FixedFrame('world', Transform(rotation, position), turn)
+            turn = frame.turn_of(one.body, one.posterior.means[0])
+            frames[one.stamp] = frame
+    outputs: list[Output] = []
+    spent: list[float] = []
+    messages = RosbagsMessages()
+    parameters = with_values(SmootherParameters(), {'window_length': KEPT})
+    session = SmootherSession(parameters, outputs.append, SMOOTHED.__eq__)
+    shapes = {x.stamp: x.shape_covariance for x in seen}
+    for one in seen:
+        likelihood = one.likelihood
+        if one.stamp in frames:
+            in_world = frames[one.stamp].placed
+            likelihood = in_world(one.body, likelihood)[0]
+            at_best = replace(one.posterior[[0]], covariances=one.shape_covariance[None])
+            shapes[one.stamp] = in_world(one.body, at_best)[0].covariances[0]
+        content = PoseMixture.of_body(
+            one.body, likelihood, MixtureKind.LIKELIHOOD, one.stamp, 'camera',
+            state=TrackState.TRACKING, track_id=1, error_share=one.errors.independent,
+            error_time=one.errors.time, shape_covariance=shapes[one.stamp],
         )  # fmt: skip
-
-    found = descend()
-    return {
-        'times': times,
-        'trajectories': len(starts),
-        'distinct': len(distinct),
-        'network_and_paths_ms': 1e3
-        * best_time(
-            lambda: k_best_paths(embedded_network(mixtures, dynamics, intervals), 1),
-            seconds=seconds,
-        ),
-        'refinement_s': best_time(
-            lambda: refine(starts, prior, likelihood, sequence.lower, sequence.upper),
-            seconds=seconds,
-        ),
-        'variational_s': best_time(descend, seconds=seconds),
-        'most_iterations': int(refined.iterations.max()),
-        'not_converged': int((refined.status != 0).sum()),
-        'free_energy': found.free_energy.tolist(),
-        'free_energy_fresh': list(found.fresh),
+        message = pose_mixture_message(messages, content)
+        start = time.perf_counter()
+        handled = session.take(MIXTURE, message)
+        spent.append(time.perf_counter() - start)
+        if handled.faults:
+            raise ValueError(handled.faults[0])
+    whole, of = session.smoothed_span()
+    assert whole.stamps_ns is not None
+    offline = {
+        stamp: poses_apart(whole, t, of.body, COMPONENTS, shapes[stamp])[0]
+        for t, stamp in enumerate(whole.stamps_ns)
     }
-
-
-def robust_problem(times: int, seed: int = 0) -> tuple[RobustSequence, Array, Array]:
-    """Observations of a waving person with one outlier in eight, variances, and a start."""
-    rng = np.random.default_rng(seed)
-    sequence = waving(times, seed)
-    covariances = np.array([mixture.covariances[0] for mixture in sequence.mixtures])
-    whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
-    white = rng.normal(size=sequence.truth.shape)
-    white[::8] *= 4.0
-    means = sequence.truth + np.linalg.solve(whiteners, white[:, :, None])[:, :, 0]
-    variances = np.diagonal(sequence.dynamics.diffusion) * STEP
-    return RobustSequence(means, whiteners, 8.0), variances, means.copy()
-
-
-def peers(times: int, seconds: float) -> dict[str, Any]:
-    """One trajectory's refinement by us, scipy and GTSAM, to the same energy."""
-    sequence, variances, start = robust_problem(times)
-    dynamics = LinearGaussianDynamics.random_walk(variances)
-    prior = dynamics.prior(np.ones(times - 1))
-    found = refine(start[None], prior, sequence)
-    energy = float(found.energies[0] - prior.constant)
-    ours = best_time(lambda: refine(start[None], prior, sequence), seconds=seconds)
-    cost, spent, evaluations = scipy_trajectory(sequence, variances, start)
-    result: dict[str, Any] = {
-        'ours_s': ours,
-        'ours_iterations': int(found.iterations[0]),
-        'ours_energy': energy,
-        'scipy_s': spent,
-        'scipy_evaluations': evaluations,
-        'scipy_energy': cost,
-        'scipy_ratio': spent / ours,
+    session.finish()
+    found = [pose_mixture_of(deserialise(x.data, 'hmt_msgs/msg/PoseMixture')) for x in outputs]
+    result = {LIVE: {x.stamp_ns: x.mixture for x in found}, OFFLINE: offline}
+    bodies = {x.stamp: x.body for x in seen}
+    placed = {
+        way: {t: _seen_again(x, bodies[t], frames.get(t)) for t, x in of_way.items()}
+        for way, of_way in result.items()
     }
-    reason = gtsam_missing()
-    if reason:
-        return {**result, 'gtsam': f'skipped: {reason}'}
-    runs = [gtsam_trajectory(sequence, variances, start) for _ in range(3)]
-    spent = min(run[1] for run in runs)
-    return {
-        **result,
-        'gtsam_s': spent,
-        'gtsam_iterations': runs[0][2],
-        'gtsam_energy': runs[0][0],
-        'gtsam_ratio': spent / ours,
-    }
+    return placed, 1e3 * float(np.median(spent))
 
 
-def length(short: int, long: int) -> dict[str, Any]:
-    """Cost of a long sequence over that of a short one, whole smoother."""
-    spent = {}
-    for times in (short, long):
-        sequence = waving(times)
-        smoother = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper)
-        runs = []
-        for _ in range(2):
-            begin = time.perf_counter()
-            smoother.smooth(sequence.mixtures)
-            runs.append(time.perf_counter() - begin)
-        spent[times] = min(runs)
-    return {
-        'short_s': spent[short],
-        'long_s': spent[long],
-        'times_longer': long / short,
-        'ratio': spent[long] / spent[short],
-    }
+def _seen_again(mixture: GaussianMixture, body: Body, frame: FixedFrame | None) -> GaussianMixture:
+    """A mixture in the frame of the camera again."""
+    if frame is None:
+        return mixture
+    back = CameraMotion(
+        frame.motion.rotation.T, -frame.motion.rotation.T @ frame.motion.translation
+    )
+    means = back.free_poses(body, mixture.means)
+    jacobians = back.jacobians(body, mixture.means, means)
+    return replace(mixture, means=means, covariances=propagated(jacobians, mixture.covariances))
+
+
+def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixture]) -> Record:
+    """Mixtures by stamp, with the truth; their point estimate is the heaviest mode."""
+    rows = [x for x in seen if x.stamp in mixtures and x.stamp in clip.truth.joints]
+    found = [mixtures[x.stamp] for x in rows]
+    points = [one.means[one.weights.argmax()] for one in found]
+    return recorded(clip, [x.body for x in rows], found, points, [x.stamp for x in rows], 0)
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """Tables for people."""
-    rows = [['measure', 'value', 'wanted']]
-    for kind, limit in (('separated', 0.02), ('overlapping', 0.1)):
-        if 'exactness' in result:
-            entry = result['exactness'][kind]
-            value = f'{entry["mean_kl"]:.4f} ({entry["particle_mean_kl"]:.4f}) nats'
-            what = f'KL from exact, {kind} (particle smoother, same time)'
-            rows.append([what, value, f'{limit}'])
-        if 'grid' in result:
-            value = f'{result["grid"][kind]["mean_kl"]:.4f} nats'
-            rows.append([f'KL from a grid, 40 times, {kind}', value, f'{limit}'])
-    if 'stages' in result:
-        stage = result['stages']
-        rows += [
-            ['network and paths', f'{stage["network_and_paths_ms"]:.1f} ms', '10'],
-            ['refinement of 64 trajectories', f'{stage["refinement_s"]:.2f} s', '1.2'],
-            ['most iterations', str(stage['most_iterations']), '20'],
-            ['variational refinement', f'{stage["variational_s"]:.2f} s', '1.5'],
+    tables = (error_rows(result), motion_rows(result))
+    return '\n\n'.join(table(rows, left=2, markdown=markdown) for rows in tables)
+
+
+def error_rows(result: dict[str, Any]) -> list[list[str]]:
+    """A table for people: errors of the heaviest pose by way, means over groups of clips, mm."""
+    ways = [FILTER, LIVE, OFFLINE, AVERAGED, NEAREST]
+    rows = [['inputs', 'gravity', 'images a second', *ways]]
+    for group in dict.fromkeys(x['clips'] for x in result['means']):
+        rows.append([group, *[''] * (len(rows[0]) - 1)])
+        for entry in result['means']:
+            if entry['clips'] == group:
+                found = {
+                    name.split(' over ')[0]: scores['heaviest_mm']
+                    for name, scores in entry['scores'].items()
+                }
+                rate = f'{entry["rate"]:g}' if entry['rate'] else 'all'
+                cells = [f'{found[way]:.1f}' for way in ways]
+                rows.append([entry['inputs'], entry['gravity'], rate, *cells])
+    return rows
+
+
+def motion_rows(result: dict[str, Any]) -> list[list[str]]:
+    """A table for people: what filter and smoother are besides, of all images, by group."""
+    rows = [
+        [
+            'inputs', 'gravity', '', 'best of 8, mm', 'modes apart', 'acceleration', 'feet, m/s',
+            'root, %', 'joint 90 %', 'in the camera', 'ms an image',
         ]
-    if 'memory' in result:
-        rows.append(['peak memory', f'{result["memory"]["peak_mb"]:.0f} MB', '400'])
-    if 'length' in result:
-        rows.append(['ten times the length costs', f'{result["length"]["ratio"]:.1f} times', '11'])
-    if 'peers' in result:
-        peer = result['peers']
-        gtsam = f'{peer["gtsam_ratio"]:.1f} times' if 'gtsam_ratio' in peer else peer['gtsam']
-        rows += [
-            ['one trajectory', f'{1e3 * peer["ours_s"]:.1f} ms', ''],
-            ['faster than scipy', f'{peer["scipy_ratio"]:.0f} times', '25'],
-            ['faster than GTSAM', gtsam, '2'],
-        ]
-    if 'relations' in result:
-        found = result['relations']
-        ratios = ', '.join(f'{k}: {v:.0f}' for k, v in found['eigenvalue_ratio'].items())
-        rows += [
-            ['eigenvalue ratio by frames (generated: 4900)', ratios, 'falls'],
-            ['difference of paths and optima', f'{found["difference_deg"]:.1f} deg', ''],
-            ['roughness of optima over paths', f'{found["roughness_ratio"]:.2f}', 'below 1'],
-            ['change of -log likelihood', f'{100 * found["log_likelihood_change"]:+.1f} %', '10'],
-            [
-                'free energy falls by, in iterations',
-                f'{found["free_energy_fall"]:.2f} nats, {found["free_energy_iterations"]}',
-                '8',
-            ],
-        ]
-    parts = [table(rows, markdown=markdown)] if len(rows) > 1 else []
-    if 'clips' in result:
-        found = result['clips']
-        if isinstance(found, str):
-            parts.append(f'clips: {found}')
-        else:
-            parts.append(table(error_rows(found), left=2, markdown=markdown))
-            parts.append(table(motion_rows(found), left=3, markdown=markdown))
-    return '\n\n'.join(parts)
+    ]  # fmt: skip
+    for group in dict.fromkeys(x['clips'] for x in result['means']):
+        rows.append([group, *[''] * (len(rows[0]) - 1)])
+        for entry in result['means']:
+            if entry['clips'] != group or entry['rate']:
+                continue
+            for way in (FILTER, LIVE, OFFLINE):
+                s = entry['scores'][way]
+                cells = [
+                    f'{s["best_mm"]:.1f}', f'{s[MODES]:.1f}', f'{s["acceleration"]:.1f}',
+                    f'{s["feet"]:.2f}', f'{s["root_percent"]:.1f}',
+                ]  # fmt: skip
+                cells += [
+                    '-' if np.isnan(s[name]) else f'{100 * s[name]:.0f} %' for name in SCORES[-2:]
+                ]
+                cells.append('' if np.isnan(s[MS]) else f'{s[MS]:.1f}')
+                rows.append([entry['inputs'], entry['gravity'], way, *cells])
+    return rows

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.clips import development_folder, table
-from benchmarks.command import benchmark_parser, show, told
+from benchmarks.command import benchmark_parser, run_benchmark, told
 from benchmarks.machine import description
 from hmt_ros.app import lift, track_video
 from hmt_ros.app.evaluate import score_bag
@@ -151,9 +150,6 @@ def main(argv: list[str]) -> int:
     """Runs the benchmark."""
     parser = benchmark_parser('strangers', __doc__, quick='the first case')
     options = parser.parse_args(argv)
-    try:
-        found = measure(quick=options.quick)
-    except FileNotFoundError as error:
-        print(f'strangers: {error}', file=sys.stderr)
-        return 1
-    return show(found, as_text, as_json=options.json)
+    return run_benchmark(
+        'strangers', lambda: measure(quick=options.quick), as_text, as_json=options.json
+    )

@@ -1,4 +1,4 @@
-"""Scores of runs put together: by clip, means and medians over clips, and paired differences.
+"""Scores of runs put together: by clip, means over clips, and paired differences.
 
 An entry holds the scores of one clip, input, rate and knowledge of gravity, by seed, and their
 means over the seeds. The clips fall into groups: those that settings of the tracker were chosen on,
@@ -73,21 +73,14 @@ def _known(value: float) -> float | None:
 
 
 def grouped(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Entries by `GROUPS`, with means and medians over the clips of those that have some."""
+    """Entries by `GROUPS`, with means over the clips of those that have some."""
     result = []
     for title in GROUPS:
         mine = [entry for entry in entries if group_of(entry['clip']) == title]
         mine.sort(key=lambda entry: (entry['clip'], _rank(entry)))
         if mine:
             averaged = [] if title == OF_APART else mine
-            result.append(
-                {
-                    'group': title,
-                    'clips': mine,
-                    'means': means_of(averaged),
-                    'medians': medians_of(averaged),
-                }
-            )
+            result.append({'group': title, 'clips': mine, 'means': means_of(averaged)})
     return result
 
 
@@ -120,18 +113,6 @@ def means_of(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                 for name, total, count in zip(EVALUATED_JOINTS, sums, known.sum(0), strict=True)
             }
         result.append(means)
-    return result
-
-
-def medians_of(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Medians over the clips, by rate, input and gravity, of the means over their seeds."""
-    result = []
-    for mine in by_input(entries):
-        medians: dict[str, Any] = {name: mine[0][name] for name in CONDITIONS}
-        for name in mine[0]['by_seed']:
-            known = [entry[name] for entry in mine if entry[name] is not None]
-            medians[name] = float(np.median(known)) if known else None
-        result.append(medians)
     return result
 
 

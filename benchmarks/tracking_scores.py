@@ -32,9 +32,7 @@ SCORES = (
     'weights', 'coverage_50', 'coverage_90', 'joint_coverage_50', 'joint_coverage_90',
     'absolute_coverage_50', 'absolute_coverage_90', 'volume', 'negative_log_likelihood',
     'acceleration', 'feet', 'wrong_way', 'wrong_way_images', 'wrong_sign', 'nobody',
-    'evaluations', 'evaluations_99', 'ms', 'cpu_ms', *(
-        f'{joint}_{way}_mm' for joint in ('neck', 'shoulders', 'hips') for way in ('ahead', 'up')
-    ),
+    'evaluations', 'evaluations_99', 'ms', 'cpu_ms',
 )  # fmt: skip
 # Segments of limbs whose depth sign is scored, and the least angle to the image plane, rad.
 LIMBS = tuple(
@@ -74,7 +72,7 @@ def scores_of(record: Record) -> dict[str, Any]:
         `wrong_sign`, the share of slanted limbs whose slope in depth has the wrong sign. `nobody`
         is the share of all images in which the track had ended. `evaluations` is the mean number in
         an image, `evaluations_99` the 99th percentile; `ms` the median time of a step, `cpu_ms` its
-        mean processor time. The keys of `trunk_offsets` are there, too. What is unknown is NaN; of
+        mean processor time. What is unknown is NaN; of
         a run that found nobody, only `kept` is known.
     """
     if len(record.stamps) == 0:
@@ -124,7 +122,6 @@ def scores_of(record: Record) -> dict[str, Any]:
         'evaluations_99': np.percentile(record.evaluations, 99),
         'ms': 1e3 * np.median(record.seconds),
         'cpu_ms': 1e3 * record.cpu_seconds.mean() if len(record.cpu_seconds) else np.nan,
-        **trunk_offsets(record, heaviest < LOST),
     }
 
 
@@ -207,43 +204,6 @@ def facing(joints: Array) -> Array:
     across = (left_hip - right_hip) + (left_shoulder - right_shoulder)
     up = (left_shoulder + right_shoulder) - (left_hip + right_hip)
     return np.asarray(np.cross(across, up), dtype=np.float64)
-
-
-def trunk_offsets(record: Record, found: NDArray[np.bool_]) -> dict[str, float]:
-    """How far ahead and above the true ones joints of the heaviest mode lie, mm.
-
-    Both are seen from the pelvis, each in the frame of its own trunk: what is left comes from where
-    the model has the joints, and not from the pose. Left and right count together. NaN: no joint is
-    known.
-
-    Args:
-        record: of a run.
-        found: (T,) images that count.
-    """
-    sides = {name: [JOINTS.index(f'{side}_{name}') for side in ('left', 'right')]
-             for name in ('shoulder', 'hip')}  # fmt: skip
-    own, true = (
-        _in_trunk(joints[found], sides['hip']) for joints in (heaviest_joints(record), record.true)
-    )
-    result = {}
-    for name, which in (
-        ('neck', [JOINTS.index('neck')]), ('shoulders', sides['shoulder']), ('hips', sides['hip']),
-    ):  # fmt: skip
-        offsets = (own - true)[:, which].mean(1) if found.any() else np.full((1, 2), np.nan)
-        for i, way in enumerate(('ahead', 'up')):
-            result[f'{name}_{way}_mm'] = 1e3 * float(offsets[:, i].mean())
-    return result
-
-
-def _in_trunk(joints: Array, hips: list[int]) -> Array:
-    """Joints (T, J, 3) less the pelvis, ahead and up in the frame of the trunk, (T, J, 2) m."""
-    up = joints[:, JOINTS.index('neck')] - joints[:, hips].mean(1)
-    ahead = facing(joints)
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
-    ahead -= (ahead * up).sum(1, keepdims=True) * up
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    result: Array = np.einsum('tjc,tac->tja', joints - joints[:, :1], np.stack([ahead, up], axis=1))
-    return result
 
 
 def wrong_sign(record: Record) -> float:

@@ -1,4 +1,4 @@
-"""How long a step of the tracker takes, where the time goes, and how memory grows."""
+"""How long a step of the tracker takes, and where the time goes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.clips import Clip, at_rate, read_clip, read_detections, table
-from benchmarks.machine import forget_peak, peak_memory, resident_memory
-from benchmarks.runs import IMAGES, INPUTS, KEYPOINTS, keypoints_only, new_tracker
-from hmt_ros.app.progress import with_progress
-from hmt_ros.body import load_body
-from hmt_ros.tracking import TrackerSettings
+from benchmarks.clips import Clip, at_rate, read_clip, table
+from benchmarks.machine import forget_peak, peak_memory
+from benchmarks.runs import IMAGES, INPUTS, begun
 
 OPENCV = 'MOG2 + Canny + distance transform'
 # Images a second besides all of them, and images that start a track.
@@ -35,14 +32,14 @@ def speed(clip: Clip) -> dict[str, Any]:
 
     assert clip.background is not None
     forget_peak()
-    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    tracker = begun(clip, IMAGES)[0]
     subtractor = cv2.createBackgroundSubtractorMOG2()
     for _ in range(10):
         subtractor.apply(clip.background)
     # Compile, or load what was compiled, before anything is timed.
     for stamp, image in islice(zip(clip.stamps, clip.images, strict=True), 3):
         tracker.step(image, stamp)
-    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    tracker = begun(clip, IMAGES)[0]
     clock = StageClock()
     steps, reference = [], []
     with clock.running():
@@ -90,20 +87,16 @@ def costs(folder: Path, limit: int | None = None) -> list[dict[str, Any]]:
     Raises:
         ValueError: the clip can not be read.
     """
-    whole, body = read_clip(folder, limit), load_body('human37')
-    detected = (folder / 'keypoints_mediapipe.npz').is_file()
-    known = read_detections(folder).keypoints if detected else {}
+    whole, detected = read_clip(folder, limit), (folder / 'keypoints_mediapipe.npz').is_file()
     rows = []
     for inputs in INPUTS if detected else (IMAGES,):
         for rate in (0.0, LOW_RATE):
-            clip, settings = at_rate(whole, rate), TrackerSettings()
-            settings = keypoints_only(settings) if inputs == KEYPOINTS else settings
-            subtractor = cv2.createBackgroundSubtractorMOG2()
-            tracker = new_tracker(clip, body, settings, 0)
+            clip, subtractor = at_rate(whole, rate), cv2.createBackgroundSubtractorMOG2()
+            tracker, known = begun(clip, inputs)
             spent, floor, evaluations = [], [], []
             for stamp, image in zip(clip.stamps, clip.images, strict=True):
                 start = time.process_time()
-                tracker.step(image, stamp, None if inputs == IMAGES else known.get(stamp))
+                tracker.step(image, stamp, known.get(stamp))
                 middle = time.process_time()
                 opencv_work(subtractor, image)
                 floor.append(time.process_time() - middle)
@@ -152,29 +145,6 @@ def opencv_work(subtractor: Any, image: Any) -> Any:
     return mask, cv2.distanceTransform(255 - edges, cv2.DIST_L2, 5)
 
 
-def memory(clip: Clip, frames: int) -> dict[str, Any]:
-    """Resident memory while a clip is played back and forth."""
-    forget_peak()
-    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
-    every = max(frames // 50, 1)
-    seen: list[tuple[int, float]] = []
-    images = clip.back_and_forth(frames)
-    for i, (stamp, image) in enumerate(with_progress(images, 'memory', 'images', frames)):
-        tracker.step(image, stamp)
-        if i % every == every - 1:
-            seen.append((i + 1, resident_memory()))
-    # What grows at the beginning are caches and arenas that fill once.
-    late = np.array(seen[len(seen) // 5 :])
-    slope = float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) if len(late) > 1 else 0.0
-    return {
-        'clip': clip.name,
-        'images': frames,
-        'resident_mb': [[count, size / 1e6] for count, size in seen],
-        'growth_kb_per_1000_images': slope,
-        'peak_memory_mb': peak_memory() / 1e6,
-    }
-
-
 def speed_as_text(found: dict[str, Any], cores: int, *, markdown: bool = False) -> str:
     """A line and a table of the stages."""
     line = (
@@ -187,13 +157,3 @@ def speed_as_text(found: dict[str, Any], cores: int, *, markdown: bool = False) 
     rows = [['stage', 'ms']]
     rows += [[name, f'{value:.1f}'] for name, value in found['stages_ms'].items()]
     return f'{line}\n\n{table(rows, markdown=markdown)}'
-
-
-def memory_as_text(found: dict[str, Any]) -> str:
-    """A line."""
-    resident = found['resident_mb']
-    first, last = resident[len(resident) // 5], resident[-1]
-    return (
-        f'memory: {first[1]:.1f} MB after {first[0]} images, {last[1]:.1f} MB after {last[0]}; '
-        f'{found["growth_kb_per_1000_images"]:+.0f} kB per 1000 images'
-    )

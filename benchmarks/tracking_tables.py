@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from benchmarks.clips import table
 from benchmarks.runs import GIVEN
-from benchmarks.tracking_budgets import budgets_as_text
 from benchmarks.tracking_means import DETECTOR
-from benchmarks.tracking_oracle import as_text as oracle_as_text
-from benchmarks.tracking_speed import OPENCV, costs_as_text, memory_as_text, speed_as_text
+from benchmarks.tracking_speed import OPENCV, costs_as_text, speed_as_text
 
 
 class Column(NamedTuple):
@@ -70,12 +68,6 @@ MISTAKES = (
     WRONG_WAY, Column('images', 'wrong_way_images', '.1f'), WRONG_SIGN, NOBODY,
     EVALUATIONS, Column('99 %', 'evaluations_99'), Column('ms', 'ms'), CPU,
 )  # fmt: skip
-# Where the model has joints of the trunk.
-OFFSETS = tuple(
-    Column(f'{joint}, {way}', f'{joint}_{way}_mm', '+.0f')
-    for joint in ('neck', 'shoulders', 'hips')
-    for way in ('ahead', 'up')
-)
 # Of two kinds of settings.
 COMPARED = tuple(
     column._replace(form=column.form.replace('.0f', '.1f'))
@@ -84,14 +76,6 @@ COMPARED = tuple(
         WRONG_SIGN, NOBODY, EVALUATIONS, CPU,
     )
 )  # fmt: skip
-# Of the tracker without a rule.
-OF_RULES = tuple(
-    column._replace(form=column.form.replace('.0f', '.1f'))
-    for column in (
-        HEAVIEST, EXPECTED, BEST, BLIND, LOG_DENSITY, WEIGHTS, WRONG_WAY, NOBODY, EVALUATIONS, CPU,
-    )
-)  # fmt: skip
-OF_ABLATIONS = (HEAVIEST, POINT, BEST, BLIND, KEPT, WEIGHTS, JOINT_90, EVALUATIONS)
 WORST_JOINT = 'worst joint 90 %'
 
 
@@ -110,14 +94,6 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         parts.append(_table(group, CALIBRATION, markdown, worst_joint=True))
         parts.append(f'{group["group"]}: large mistakes, and what an image costs.')
         parts.append(_table(group, MISTAKES, markdown))
-        if group['means']:
-            parts.append(
-                f'{group["group"]}: how far joints lie ahead and above the true ones, mm, seen '
-                'from the pelvis in the frame of the trunk.'
-            )
-            parts.append(_table({**group, 'clips': []}, OFFSETS, markdown))
-    if 'budgets' in result:
-        parts.append(budgets_as_text(result['budgets'], markdown=markdown))
     if 'against' in result:
         found = result['against']
         what = f'{", ".join(found["changes"])} minus the usual settings'
@@ -128,35 +104,11 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
             which = f'{clip}, {given}, rate {_rate(rate)}, gravity {gravity}'
             parts.append(f'{which}: not in {found["folder"]}.')
         parts += _tables_of_comparison(found, f'this code minus {found["folder"]}', markdown)
-    if 'rules' in result:
-        parts += _tables_of_rules(result['rules'], markdown)
-    if 'ablations' in result:
-        found = result['ablations']
-        parts.append(f'Images alone, seed 0; mean over {", ".join(found["clips"])}.')
-        parts.append(_table_of_ablations(found['rows'], markdown))
-    if 'sizes' in result:
-        found = result['sizes']
-        rows = [['size of the images', 'heaviest, mm']]
-        rows += [[f'{x["size"]:g}', HEAVIEST.cell(x[HEAVIEST.key])] for x in found['rows']]
-        difference = 100.0 * found['largest_difference']
-        parts.append(
-            f'{found["clip"]} with smaller images, images alone: '
-            f'the error differs by {difference:.0f} % at most.'
-        )
-        parts.append(table(rows, markdown=markdown))
-    if 'oracle' in result:
-        parts.append(oracle_as_text(result['oracle'], markdown=markdown))
     if 'speed' in result:
         cores = result['machine']['cores']
         parts.append(speed_as_text(result['speed'], cores, markdown=markdown))
         parts.append(f'Processor time of a step in floors, that of {OPENCV} of the same images:')
         parts.append(costs_as_text(result['costs'], markdown=markdown))
-    if 'scaling' in result:
-        from benchmarks.tracking_scaling import scaling_as_text
-
-        parts.append(scaling_as_text(result['scaling'], markdown=markdown))
-    if 'memory' in result:
-        parts.append(memory_as_text(result['memory']))
     return '\n\n'.join(parts)
 
 
@@ -168,7 +120,7 @@ def _table(
     sign: str = '',
     worst_joint: bool = False,
 ) -> str:
-    """Clips and inputs, then means with their intervals and medians of each input."""
+    """Clips and inputs, then means of each input with their intervals."""
     extra = [WORST_JOINT] if worst_joint else []
     entries = [*group['clips'], *group['means']]
     rated = ['rate'] if any(entry['rate'] > 0 for entry in entries) else []
@@ -183,15 +135,13 @@ def _table(
         cells = [column.cell(entry.get(column.key), _sign(column, sign)) for column in columns]
         cells += [_worst_joint(entry)] if worst_joint else []
         rows.append([*head(entry['clip'], entry), *cells])
-    for means, medians in zip(group['means'], group['medians'], strict=True):
+    for means in group['means']:
         known = [(column, means.get(column.key, [None] * 3)) for column in columns]
         cells = [column.cell(values[0], _sign(column, sign)) for column, values in known]
         cells += [_worst_joint(means)] if worst_joint else []
         rows.append([*head('mean', means), *cells])
         ends = [_ends(column, values, sign) for column, values in known]
         rows.append([*head('95 %', means), *ends, *['' for _ in extra]])
-        cells = [column.cell(medians.get(column.key), _sign(column, sign)) for column in columns]
-        rows.append([*head('median', medians), *cells, *['' for _ in extra]])
     return table(rows, left=2 + len(rated) + len(upright), markdown=markdown)
 
 
@@ -235,72 +185,6 @@ def _number_of(clips: Sequence[str]) -> str:
     return f'{len(clips)} ({", ".join(clips)})' if clips else '0'
 
 
-def _tables_of_rules(found: dict[str, Any], markdown: bool) -> list[str]:
-    """Differences without each rule: the heaviest mode in short, then all scores."""
-    what = f'clips {", ".join(found["clips"])}; seeds {", ".join(map(str, found["seeds"]))}'
-    parts = [f'The tracker without each rule minus the usual one: {what}.']
-    parts += [f'Skipped: {name}: {why}.' for name, why in found['skipped'].items()]
-    groups = [group for rule in found['rules'] for group in rule['groups']]
-    titles = [group['group'] for group in groups if group['means']]
-    for title in dict.fromkeys(titles):
-        parts.append(
-            f'{title}: heaviest mode without the rule, mm, more is worse; by input, rate and '
-            'gravity. Last, how often a clip has an interval over its seeds wholly above or below '
-            '0.'
-        )
-        parts.append(_summary_of_rules(found['rules'], title, markdown))
-        parts.append(f'{title}: differences of all scores.')
-        head = ['group', 'rule', 'inputs', 'rate', 'gravity', *(column.head for column in OF_RULES)]
-        rows = [head]
-        for rule, means in _means_of_rules(found['rules'], title):
-            cells = [_with_ends(column, means[column.key]) for column in OF_RULES]
-            conditions = [means['inputs'], _rate(means['rate']), means['gravity']]
-            rows.append([rule['rule_group'], rule['rule'], *conditions, *cells])
-        parts.append(table(rows, left=5, markdown=markdown))
-    return parts
-
-
-def _summary_of_rules(rules: Sequence[dict[str, Any]], title: str, markdown: bool) -> str:
-    """One row a rule, one column an input, rate and gravity."""
-    every = [
-        (means['inputs'], means['rate'], means['gravity'])
-        for _, means in _means_of_rules(rules, title)
-    ]
-    columns = list(dict.fromkeys(every))
-    columns.sort(key=lambda column: -column[1] if column[1] > 0 else float('-inf'))
-    heads = [
-        f'{given}, {_rate(rate)}' + (', gravity given' if gravity == GIVEN else '')
-        for given, rate, gravity in columns
-    ]
-    rows = [['group', 'rule', *heads, 'above', 'below']]
-    for rule in rules:
-        own = {
-            (x['inputs'], x['rate'], x['gravity']): _with_ends(OF_RULES[0], x[OF_RULES[0].key])
-            for _, x in _means_of_rules([rule], title)
-        }
-        mine = [x for x in rule['paired'] if x['group'] == title]
-        counts = [str(sum(len(x[side]) for x in mine)) for side in ('above', 'below')]
-        cells = [own.get(column, '') for column in columns]
-        rows.append([rule['rule_group'], rule['rule'], *cells, *counts])
-    return table(rows, left=2, markdown=markdown)
-
-
-def _means_of_rules(
-    rules: Sequence[dict[str, Any]], title: str
-) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Rules with each of the means of a group of clips."""
-    for rule in rules:
-        for group in rule['groups']:
-            if group['group'] == title:
-                for means in group['means']:
-                    yield rule, means
-
-
-def _with_ends(column: Column, values: Sequence[float | None]) -> str:
-    mean = column.cell(values[0], _sign(column, '+'))
-    return mean if values[1] is None else f'{mean} ({_ends(column, values, "+")})'
-
-
 def _sign(column: Column, sign: str) -> str:
     return '' if column.form.startswith('+') else sign
 
@@ -317,12 +201,3 @@ def _worst_joint(entry: dict[str, Any]) -> str:
         return '-'
     name = min(shares, key=lambda name: shares[name])
     return f'{100 * shares[name]:.0f} {name}'
-
-
-def _table_of_ablations(rows: list[dict[str, Any]], markdown: bool) -> str:
-    result = [['setting', 'value', *(column.head for column in OF_ABLATIONS)]]
-    for row in rows:
-        cells = [f'{x.cell(row[x.key][0])} ({_ends(x, row[x.key])})' for x in OF_ABLATIONS[:-1]]
-        last = OF_ABLATIONS[-1]
-        result.append([row['setting'], str(row['value']), *cells, last.cell(row[last.key][0])])
-    return table(result, left=2, markdown=markdown)

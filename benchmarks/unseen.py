@@ -12,7 +12,6 @@ error of the joints in view.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.clips import Clip, at_rate, read_clip, read_detections, table, with_file
-from benchmarks.command import benchmark_parser, show
+from benchmarks.command import benchmark_parser, run_benchmark
 from benchmarks.machine import description
-from benchmarks.runs import BOTH, KEYPOINTS, in_processes, keypoints_only, new_tracker
-from hmt_ros.body import load_body
+from benchmarks.runs import BOTH, KEYPOINTS, begun, in_processes
 from hmt_ros.body.keep_out import keep_out_capsules
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, joint_mixtures
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -33,7 +31,6 @@ from hmt_ros.inference.calibration import (
     marginal_log_densities,
     stratified_samples,
 )
-from hmt_ros.tracking import TrackerSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -120,10 +117,7 @@ def of_clip(work: Work) -> dict[str, Any]:
     """Scores of the hidden joints, and the error of the others; see above."""
     whole = at_rate(read_clip(work.folder, work.limit), 0.0 if work.limit else RATE)
     clip, area = cut_clip(whole, work.cut)
-    body, settings = load_body('human37'), TrackerSettings()
-    if work.inputs == KEYPOINTS:
-        settings = keypoints_only(settings)
-    tracker = new_tracker(clip, body, settings, SEED, with_subject=False)
+    tracker, _ = begun(clip, work.inputs, SEED, with_subject=False)
     detections = read_detections(work.folder, lifted=False).keypoints
     names = [x for x in EVALUATED_JOINTS if x in clip.truth.joint_names]
     rows = [clip.truth.joint_names.index(x) for x in names]
@@ -194,7 +188,7 @@ def measure(
     if quick:
         folders, cuts, inputs, limit = folders[:1], cuts[:1], inputs[:1], QUICK
     work = [Work(x, cut, given, limit) for given in inputs for cut in cuts for x in folders]
-    found = in_processes(of_clip, work, 0, 'unseen')
+    found = in_processes(of_clip, work, 1 if quick else 0, 'unseen')
     rows = [
         {'clip': x.folder.name, 'cut': x.cut, 'inputs': x.inputs, **scores}
         for x, scores in zip(work, found, strict=True)
@@ -231,15 +225,15 @@ def main(argv: list[str]) -> int:
         help='what the tracker is given',
     )  # fmt: skip
     options = parser.parse_args(argv)
-    try:
-        result = measure(
-            options.clips, quick=options.quick, names=tuple(options.names),
-            cuts=tuple(options.cuts), inputs=tuple(options.inputs),
-        )  # fmt: skip
-    except FileNotFoundError as error:
-        print(f'unseen: skipped, {error}', file=sys.stderr)
-        return 0
-    except ValueError as error:
-        print(f'unseen: {error}', file=sys.stderr)
-        return 1
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'unseen',
+        lambda: measure(
+            options.clips,
+            quick=options.quick,
+            names=tuple(options.names),
+            cuts=tuple(options.cuts),
+            inputs=tuple(options.inputs),
+        ),
+        as_text,
+        as_json=options.json,
+    )

@@ -6,7 +6,6 @@ the background subtraction, edges and distances of one image, the least that a s
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,7 @@ import cv2
 import numpy as np
 
 from benchmarks.clips import at_rate, find_clips, read_clip, table
-from benchmarks.command import benchmark_parser, show, told
+from benchmarks.command import benchmark_parser, run_benchmark, told
 from benchmarks.machine import description
 from benchmarks.tracking_speed import opencv_work
 from hmt_ros.image.vertical_lines import seen_vertical, straight_lines
@@ -125,9 +124,9 @@ def main(arguments: list[str]) -> int:
     parser = benchmark_parser('vertical', __doc__, quick=f'only {QUICK} clips')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     options = parser.parse_args(arguments)
-    try:
-        result = measure(options.clips, quick=options.quick)
-    except ValueError as error:
-        print(f'vertical: {error}', file=sys.stderr)
-        return 1
-    return show(result, as_text, as_json=options.json)
+    return run_benchmark(
+        'vertical',
+        lambda: measure(options.clips, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )

@@ -18,7 +18,6 @@ import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
-from benchmarks.experts_toy import toy  # noqa: E402
 from hmt_ros.experts import (  # noqa: E402
     ConditionalDensity,
     ConditionalExperts,
@@ -30,6 +29,14 @@ EXPERTS = 5
 COLOURS = ('#c8553d', '#1f3a5f', '#e0a458', '#588157', '#7b5e9a')
 GREY = '#b8c4cf'
 LIGHTEST = 0.02  # weight below which a branch is not drawn
+
+
+def toy(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs x = y + 0.3 sin(2 pi y) + noise and targets y uniform in (0, 1), (N, 1) each."""
+    rng = np.random.default_rng(seed)
+    y = rng.uniform(0.0, 1.0, count)
+    x = y + 0.3 * np.sin(2.0 * np.pi * y) + 0.05 * rng.standard_normal(count)
+    return x[:, None], y[:, None]
 
 
 def main() -> int:

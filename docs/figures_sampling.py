@@ -1,6 +1,6 @@
-"""Draws the figures of sampling.md: flips, where minima are found, a dance, and numbers of modes.
+"""Draws the figures of sampling.md: flips, where minima are found, and a dance.
 
-python docs/figures_sampling.py     minutes; with no runs of `hypotheses` kept, half an hour
+python docs/figures_sampling.py     minutes
 
 All but the distances need the development data.
 """
@@ -21,10 +21,7 @@ sys.path.insert(0, str(DOCS.parent))
 
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-
-from benchmarks import hypotheses, kjs  # noqa: E402
-from benchmarks.body_pictures import (  # noqa: E402
+from body_pictures import (  # noqa: E402
     PAGE_STYLE,
     add_body,
     add_skeleton,
@@ -33,9 +30,11 @@ from benchmarks.body_pictures import (  # noqa: E402
     frame_image,
     from_above,
 )
+from matplotlib.axes import Axes  # noqa: E402
+
+from benchmarks import kjs  # noqa: E402
 from benchmarks.clips import Clip, read_clip, with_file  # noqa: E402
-from benchmarks.runs import IMAGES, UNKNOWN  # noqa: E402
-from benchmarks.smoothing_clips import Seen, tracked  # noqa: E402
+from benchmarks.runs import IMAGES, UNKNOWN, Seen, tracked  # noqa: E402
 from hmt_ros.app.report.skeletons import save_picture  # noqa: E402
 from hmt_ros.body import Body, load_body  # noqa: E402
 from hmt_ros.body.kinematics import forward  # noqa: E402
@@ -76,7 +75,6 @@ def main() -> int:
         draw_flips(seen[FLIPPED])
         draw_jumps({name: seen[name] for name in JUMPED})
         draw_strip(clips[DANCE], seen[DANCE])
-        draw_hypotheses()
     return 0
 
 
@@ -88,7 +86,7 @@ def draw_distances() -> None:
         2, 2, figsize=(8.4, 4.6), dpi=110, sharex='col', sharey='row', layout='constrained'
     )
     rows = iter(axes)
-    for found in kjs.all_samples(setting, 2000, 0):
+    for found in kjs.all_samples(setting, 2000, 0, 1):
         title = SHOWN.get((found.sampler, found.scale))
         if title is None:
             continue
@@ -348,34 +346,6 @@ def error_of(one: Seen, clip: Clip) -> float:
         )
     )
     return float(1e3 * np.linalg.norm(found - true, axis=1).mean())
-
-
-def draw_hypotheses() -> None:
-    """Errors by the number of modes."""
-    result = hypotheses.measure()
-    groups = list(dict.fromkeys(row['group'] for row in result['rows']))
-    figure, axes = plt.subplots(
-        1, len(groups), figsize=(8.4, 3.2), dpi=110, layout='constrained', sharey=True
-    )
-    styles: dict[str, dict[str, Any]] = {
-        'heaviest_mm': {'label': 'heaviest mode', 'color': DARK, 'marker': 'o', 'lw': 1.6},
-        'blind_mm': {'label': 'best of K draws around it', 'color': '#8a8a8a', 'marker': '^',
-                     'ls': ':', 'lw': 1.4},
-        'best_mm': {'label': 'best mode', 'color': MINIMA, 'marker': 's', 'ls': '--', 'lw': 1.6},
-    }  # fmt: skip
-    for ax, group in zip(axes, groups, strict=True):
-        rows = [row for row in result['rows'] if row['group'] == group]
-        for number, (name, style) in enumerate(styles.items()):
-            at = [row['modes'] * 1.05 ** (number - 1) for row in rows]
-            mean, low, high = (np.array([row[name][i] for row in rows]) for i in range(3))
-            ax.errorbar(at, mean, [mean - low, high - mean], ms=4, elinewidth=0.7, **style)
-        ax.set_xscale('log', base=2)
-        counts = [row['modes'] for row in rows]
-        ax.set_xticks(counts, [str(count) for count in counts])
-        ax.set(xlabel='modes, K', ylim=(0, None), title=', '.join(rows[0]['clips']))
-    axes[0].set_ylabel('error of a joint, mm')
-    axes[0].legend(frameon=False, loc='lower left')
-    save(figure, 'sampling_hypotheses.png')
 
 
 def save(figure: plt.Figure, name: str) -> None:

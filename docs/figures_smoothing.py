@@ -20,10 +20,7 @@ sys.path.insert(0, str(DOCS.parent))
 
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-from matplotlib.ticker import MaxNLocator  # noqa: E402
-
-from benchmarks.body_pictures import (  # noqa: E402
+from body_pictures import (  # noqa: E402
     PAGE_STYLE,
     add_body,
     add_skeleton,
@@ -31,7 +28,7 @@ from benchmarks.body_pictures import (  # noqa: E402
     frame_above,
     frame_image,
 )
-from benchmarks.clip_trajectories import (  # noqa: E402
+from clip_trajectories import (  # noqa: E402
     EVERY,
     TIMES,
     ClipTrajectories,
@@ -39,10 +36,11 @@ from benchmarks.clip_trajectories import (  # noqa: E402
     descent,
     pose_covariance,
 )
+from matplotlib.axes import Axes  # noqa: E402
+from matplotlib.ticker import MaxNLocator  # noqa: E402
+
 from benchmarks.clips import ROOT, Clip, read_clip, with_file  # noqa: E402
-from benchmarks.runs import IMAGES, UNKNOWN  # noqa: E402
-from benchmarks.smoothing_clips import Seen, tracked  # noqa: E402
-from benchmarks.smoothing_relations import descent as generated_descent  # noqa: E402
+from benchmarks.runs import IMAGES, UNKNOWN, Seen, tracked  # noqa: E402
 from hmt_ros.app.report.skeletons import save_picture  # noqa: E402
 from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories  # noqa: E402
 from hmt_ros.smoothing.variational_mixture import VariationalMixture, laplace_weights  # noqa: E402
@@ -119,8 +117,6 @@ def draw_clips(clips: Sequence[Clip]) -> None:
             share = np.linspace(0, 1, len(values))
             label = f'{name}: {ratios}' if width > 2 else None
             axes[1, 0].semilogy(share, values, **{**style, 'lw': width, 'label': label})
-    trace = generated_descent(TIMES).held_out
-    axes[1, 1].plot(trace - trace[0], color='#888888', ls='-.', marker='.', label='generated')
     for ax in axes.flat:
         ax.legend(frameon=False)
     axes[1, 0].legend(title=f'largest / smallest, {SPECTRUM} images', frameon=False)

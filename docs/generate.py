@@ -4,8 +4,7 @@
 
 The name of a node, such as filter_node, writes the table of its parameters in NAME.md, between
 `<!-- begin NAME -->` and `<!-- end -->`, and hmt_ros/config/NAME.yaml. The name of a benchmark
-runs it and writes benchmarks/results/NAME.md (minutes; soak ten, experts fifteen, tracking thirty
-or more).
+runs it and writes benchmarks/results/NAME.md (minutes; soak ten, tracking thirty or more).
 """
 
 from __future__ import annotations

@@ -38,7 +38,6 @@ LONGEST = (
     'app/report/test_command.py',
     'learning/app/test_train.py',
     'test_docs.py',
-    'test_tracking_benchmark.py',
     'test_launch.py',
     'app/replay/test_many_bags.py',
     'app/report/test_page.py',

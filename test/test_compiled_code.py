@@ -89,23 +89,17 @@ def test_folders_of_other_states_go_after_a_day(package, monkeypatch):
     assert recent.exists()
 
 
-@pytest.mark.parametrize('given', ['', '/somewhere/else'])
-def test_numba_uses_it_unless_the_environment_names_another(given):
-    code = 'import hmt_ros, numba; print(numba.config.CACHE_DIR)'
+@pytest.mark.parametrize(
+    ('imports', 'given'),
+    [('hmt_ros, numba', ''), ('numba, hmt_ros', ''), ('hmt_ros, numba', '/somewhere/else')],
+)
+def test_numba_uses_it_unless_the_environment_names_another(imports, given):
+    code = f'import {imports}; print(numba.config.CACHE_DIR)'
     environment = {**os.environ, VARIABLE: given}
     found = subprocess.run(
         [sys.executable, '-c', code], env=environment, capture_output=True, text=True, check=True
     ).stdout.strip()
     assert found == (given or str(folder_of(Path(hmt_ros.__file__).parent)))
-
-
-def test_it_counts_where_numba_came_first():
-    code = 'import numba, hmt_ros; print(numba.config.CACHE_DIR)'
-    environment = {**os.environ, VARIABLE: ''}
-    found = subprocess.run(
-        [sys.executable, '-c', code], env=environment, capture_output=True, text=True, check=True
-    ).stdout.strip()
-    assert found == str(folder_of(Path(hmt_ros.__file__).parent))
 
 
 def test_what_was_compiled_at_install_serves_who_can_not_write_there(

@@ -11,11 +11,9 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import pytest
 import yaml
 
-from benchmarks import BENCHMARKS
 from hmt_learning import app as learning
 from hmt_ros import app
 from hmt_ros.body import load_body
@@ -141,7 +139,7 @@ def test_commands_are_understood(page):
         if words[:2] == ['python', '-m'] and words[2] in COMMANDS:
             parse(words[2], words[3:])
         elif words[:3] == ['python', '-m', 'benchmarks']:
-            assert words[3] in BENCHMARKS
+            assert (RESULTS / f'{words[3]}.md').is_file(), words
         elif words[0] == 'python':
             assert words[1].startswith('examples/'), words
             assert (ROOT / words[1]).is_file(), words
@@ -209,33 +207,6 @@ def test_generated_parts_are_up_to_date():
     assert set(generate['NODES']) == {*NODES}
     with pytest.raises(ValueError, match="no part 'weather'"):
         generate['with_part'](page, 'weather', '')
-
-
-@pytest.mark.parametrize('node', NODES)
-def test_page_of_a_node_tells_of_every_parameter(node):
-    """In its table, or by reference to that of filter_node, where default and meaning are equal."""
-    described = {codes(row[0])[0]: row[1:] for row in rows(page_of(node), '## Parameters')}
-    known = [] if node == 'filter_node' else declared_parameters(FilterParameters())
-    declared = {p.name: p for p in declared_parameters(NODES[node][0])}
-    shared = {name for name, p in declared.items() if p in known}
-    assert set(described) == set(declared) - shared
-    for name, (default, _) in described.items():
-        value = declared[name].default
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        assert codes(default) == ([text] if value not in ('', ()) else []), name
-    after = page_of(node).partition('New values take effect at once')[2].partition('<!-- end')[0]
-    if node == 'people_node':
-        assert f'The other {len(shared)} are as for [filter_node]' in after
-    else:
-        assert set(codes(after)) == shared
-
-
-def test_every_benchmark_has_its_results():
-    pages = {page.stem: page.read_text('utf-8') for page in RESULTS.glob('*.md')}
-    assert set(pages) == {*BENCHMARKS}
-    for name, text in pages.items():
-        assert text.startswith(f'# {name}: {BENCHMARKS[name]}\n'), name
-        assert text.count('\n|') > 2, f'run: python docs/generate.py {name}'
 
 
 def rows(page: str, heading: str) -> list[list[str]]:
@@ -332,14 +303,6 @@ def test_rosdoc2_finds_the_pages():
     folder = (ROOT / name).parent / builder['sphinx']['sphinx_sourcedir']
     assert (folder / 'conf.py').is_file()
     assert (folder / 'index.md').is_file()
-
-
-def test_the_picture_of_the_readme():
-    path = ROOT / 'docs' / 'overview.png'
-    assert path.stat().st_size < 300_000
-    height, width = cv2.imread(str(path)).shape[:2]
-    assert width >= 800
-    assert height >= 400
 
 
 @pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)

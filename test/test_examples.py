@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import runpy
 import subprocess
 import sys
@@ -17,12 +16,10 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.body import load_body
-from hmt_ros.body.keep_out import keep_out_capsules
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.cdr import serialise
@@ -116,32 +113,6 @@ def test_everything_is_occupied_where_nothing_is_known(state, unseen, frame, sha
     cells = example('keep_out_grid')['occupancy'](message)
     assert set(np.unique(cells)) <= {0, 100}
     assert np.mean(cells == 100) == pytest.approx(share, abs=1e-3)
-
-
-def test_the_person_of_a_bag_stands_on_occupied_cells():
-    """Truth of bags/reach, in odom, where its camera stands."""
-    body = load_body('human37')
-    with BagReader(ROOT / 'bags' / 'reach') as bag:
-        (stored,) = bag.messages(['/tf_static'])
-    (place,) = stored.message.transforms
-    x, y, z, w = (getattr(place.transform.rotation, name) for name in 'xyzw')
-    across = [getattr(place.transform.translation, name) for name in 'xyz']
-    turn = Rotation.from_quat([x, y, z, w])
-    with np.load(ROOT / 'bags' / 'reach' / 'truth.npz') as truth:
-        poses, joints = truth['poses'][::15], truth['joints'][::15]
-    for pose, true in zip(poses, joints, strict=True):
-        posterior = GaussianMixture([1.0], pose[None], [1e-4 * np.eye(body.dimension)])
-        capsules = keep_out_capsules(body, posterior)
-        content = KeepOut(
-            10**9, place.header.frame_id, KeepOutState.TRACKING,
-            turn.apply(capsules.starts) + across, turn.apply(capsules.ends) + across,
-            capsules.radii, unseen=0.0,
-        )  # fmt: skip
-        message = keep_out_message(MESSAGES, content)
-        cells = example('keep_out_grid')['occupancy'](message)
-        columns, rows = np.floor((turn.apply(true) + across)[:, :2].T / 0.05).astype(int) + 100
-        assert (cells[rows, columns] == 100).all()
-        assert 0.3 < 0.05**2 * np.sum(cells == 100) < 2.0  # m^2
 
 
 def mixture(*heights, weights=(0.75, 0.25)):
@@ -385,20 +356,3 @@ def test_examples_answer(standing):
         'keep_out_grid': ('keep_out', 'keep_out_grid', OccupancyGrid, LYING),
     }
     check_answers(standing, {name: (python(name), *rest) for name, rest in programs.items()})
-
-
-@pytest.mark.ros
-def test_the_example_in_cpp_answers(standing, tmp_path):
-    """With the real rclcpp, where there is one; test_workspace.py builds it everywhere."""
-    from std_msgs.msg import Bool
-
-    prefixes = os.environ['AMENT_PREFIX_PATH'].split(os.pathsep)
-    if not any(Path(prefix, 'share', 'rclcpp').is_dir() for prefix in prefixes):
-        pytest.skip('no rclcpp in AMENT_PREFIX_PATH: it has no wheel')
-    for step in (['-S', str(EXAMPLES), '-B', 'build'], ['--build', 'build']):
-        done = subprocess.run(
-            ['cmake', *step], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-    command = [tmp_path / 'build' / 'stop_near_hand']
-    check_answers(standing, {'cpp': (command, 'pose_mixture', 'stop', Bool, 0.0)})

@@ -10,8 +10,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from hmt_ros.app.replay.command import main
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from msg_tools import BagReader
@@ -118,21 +116,3 @@ def test_layout_of_bags_shows_what_replay_writes(still: Any, tmp_path: Path) -> 
         there = {x.name: x.msgtype for x in reader.topics.values() if x.message_count}
         transforms = next(reader.messages(['/tf'])).message.transforms
     check_layout(OF_BAGS, there, {str(one.header.frame_id) for one in transforms})
-
-
-@pytest.mark.parametrize(('layout', 'other'), [(LIVE, OF_BAGS), (OF_BAGS, LIVE)])
-def test_both_show_the_same_of_the_person(layout: str, other: str) -> None:
-    own, shown = (
-        {
-            topic.removeprefix(PERSON_1)
-            for panel, settings in read(name)['configById'].items()
-            for topic in topics_of(panel, settings)
-        }
-        for name in (layout, other)
-    )
-    assert own - shown <= {'/diagnostics', '/rosout'}
-
-
-def test_nothing_is_shown_of_the_robot_itself() -> None:
-    for name in (LIVE, OF_BAGS):
-        assert '/robot_description' not in (ROOT / 'foxglove' / name).read_text('utf-8')

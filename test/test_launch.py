@@ -6,7 +6,6 @@ what they are given take their place; what is given is then started as launch_ro
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import runpy
 import subprocess
@@ -362,13 +361,6 @@ def test_what_is_not_installed_is_told_before_a_node_starts(actions, description
     assert len(actions(camera_frame='lens')) == 4
 
 
-def test_values_are_in_the_section_of_the_configuration_file(actions):
-    """ROS merges sections of one name: the same one in a params_file then goes before both."""
-    for name, options in actions().items():
-        config, values = (yaml.safe_load(Path(one).read_text()) for one in options['parameters'])
-        assert list(values) == list(config) == [f'/**/{name}']
-
-
 def test_views_are_upright(actions):
     made = actions(rviz='true', camera_frame='lens', body_id='anna')
     rviz = made['rviz2']
@@ -439,23 +431,12 @@ def test_arguments_of_the_camera_that_can_not_be_used():
             actions_of({**usual, **given}, ROOT)
 
 
-@pytest.mark.parametrize('installed', [False, True])
-def test_a_detector_is_used_where_there_is_one(installed, monkeypatch):
-    has_detector = with_stand_ins(CAMERA_FILE)['_has_detector']
-    monkeypatch.setitem(has_detector.__globals__, 'DETECTOR', detector(installed))
-    assert has_detector('auto') is installed
-    assert has_detector('true') is True
-    assert has_detector('false') is False
-
-
 @pytest.mark.parametrize(
     ('installed', 'given', 'said'),
     [
         (True, {}, None),
         (False, {}, 'not installed, and no image of the empty scene is given: nothing tells where'),
-        (False, {'detector': 'true'}, 'MediaPipe Pose is not installed, and no image of'),
         (False, {'background_file': 'empty.png'}, 'not installed: keypoints help most, run "ros2'),
-        (False, {'detections_source': 'yolo'}, 'not installed: keypoints help most, run "ros2'),
         (True, {'detector': 'false'}, 'no detector is wanted, and no image of the empty scene'),
         (True, {'detector': 'false', 'background_file': 'empty.png'}, None),
     ],
@@ -515,24 +496,6 @@ def test_an_uncertain_focal_length_and_a_jump_of_simulated_time(actions):
             actions(focal_length_sigma=text)
 
 
-def test_everything_is_installed(monkeypatch):
-    import setuptools
-
-    given: dict[str, Any] = {}
-    monkeypatch.setattr(setuptools, 'setup', lambda **arguments: given.update(arguments))
-    monkeypatch.chdir(ROOT)
-    runpy.run_path('setup.py', run_name='__main__')
-    installed = {f'{target}/{Path(x).name}' for target, files in given['data_files'] for x in files}
-    assert {
-        'share/hmt_ros/launch/hmt.launch.py',
-        'share/hmt_ros/launch/camera.launch.py',
-        'share/hmt_ros/rviz/hmt.rviz',
-        'share/hmt_ros/foxglove/hmt.json',
-        'share/hmt_ros/foxglove/hmt_bag.json',
-        *(f'share/hmt_ros/config/{name}.yaml' for name in SETTINGS),
-    } <= installed
-
-
 def test_rviz_shows_topics_of_the_nodes_relative_to_a_namespace():
     text = (ROOT / 'rviz' / 'hmt.rviz').read_text('utf-8')
     displays = yaml.safe_load(text)['Visualization Manager']['Displays']
@@ -588,25 +551,11 @@ def test_page_lists_the_arguments(description):
 
 
 def test_a_configuration_file_alone_changes_nothing(actions):
+    """ROS merges sections of one name: the same one in a params_file then goes before both."""
     for name, options in actions().items():
         assert read_parameter_file(options['parameters'][0], name) == values_of(SETTINGS[name])
-
-
-@pytest.mark.skipif(
-    importlib.util.find_spec('launch_ros') is None,
-    reason='launch and launch_ros are not installed (they come with ROS 2, not as wheels)',
-)
-def test_the_real_launch_package_understands_the_file(tmp_path, monkeypatch):
-    from launch import LaunchContext, LaunchDescription
-
-    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
-    made = runpy.run_path(str(FILE))['generate_launch_description']()
-    assert isinstance(made, LaunchDescription)
-    context = LaunchContext()
-    *declared, function = made.entities
-    for one in declared:
-        one.execute(context)
-    assert [type(one).__name__ for one in function.execute(context)] == ['Node']
+        config, values = (yaml.safe_load(Path(one).read_text()) for one in options['parameters'])
+        assert list(values) == list(config) == [f'/**/{name}']
 
 
 # The nodes, started with what the launch file gives launch_ros.
@@ -866,7 +815,7 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
 
 @pytest.mark.ros
 @pytest.mark.parametrize('name', SETTINGS)
-def test_policy_allows_what_the_nodes_do_and_nothing_else(started, name):
+def test_policy_and_page_have_what_the_nodes_do_and_nothing_else(started, name):
     started.wait_until_active(name)
     allowed = policy()[name]
     found = started.graph(name)
@@ -877,14 +826,7 @@ def test_policy_allows_what_the_nodes_do_and_nothing_else(started, name):
     assert allowed['subscribe'] - optional == set(found['subscribe'])
     assert allowed['publish'] == set(found['publish'])
     assert allowed['reply'] == set(found['reply'])
-
-
-@pytest.mark.ros
-@pytest.mark.parametrize('name', SETTINGS)
-def test_page_names_what_the_nodes_have(started, name):
-    """The page of the node: subscribed, published, services, each with its type."""
-    started.wait_until_active(name)
-    found = started.graph(name)
+    # The page of the node: subscribed, published, services, each with its type.
     page = (ROOT / 'docs' / f'{name}.md').read_text('utf-8')
     for heading, key, elsewhere in (
         ('## Subscribed topics', 'subscribe', ()),

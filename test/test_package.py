@@ -14,7 +14,6 @@ import xml.etree.ElementTree as ET
 import zipfile
 from fnmatch import fnmatch
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -178,11 +177,6 @@ def test_all_but_the_nodes_imports_without_ros_and_nothing_slow_before_it_is_nee
     assert result.stdout.splitlines() == ['[]', str(len(names))]
 
 
-def test_every_folder_of_modules_is_a_package() -> None:
-    folders = {path.parent for path in MODULES.values()}
-    assert [folder for folder in folders if not (folder / '__init__.py').is_file()] == []
-
-
 def setup_arguments_of(command: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What setup.py hands to setuptools for a command."""
     arguments: dict[str, Any] = {}
@@ -209,6 +203,14 @@ def test_versions_agree(setup_arguments: dict[str, Any]) -> None:
     assert xml(ROOT / 'package.xml').findtext('version') == hmt_ros.__version__
     for folder in (HMT_MSGS, ROOT / 'examples'):
         assert xml(folder / 'package.xml').findtext('version') == hmt_ros.__version__
+
+
+def test_launch_files_and_views_are_installed(setup_arguments: dict[str, Any]) -> None:
+    files = setup_arguments['data_files']
+    installed = {f'{target}/{Path(x).name}' for target, some in files for x in some}
+    wanted = ('launch/hmt.launch.py', 'launch/camera.launch.py', 'rviz/hmt.rviz')
+    wanted += ('foxglove/hmt.json', 'foxglove/hmt_bag.json', 'config/filter_node.yaml')
+    assert {f'share/hmt_ros/{name}' for name in wanted} <= installed
 
 
 def test_tests_are_found_by_colcon(setup_arguments: dict[str, Any]) -> None:
@@ -366,30 +368,6 @@ def test_data_files_are_installed() -> None:
             for path in (ROOT / package).rglob(f'*.{suffix}')
         }
         assert {path for path in sources if not (site / path).is_file()} == set()
-
-
-HEADS = {
-    'smoothing/variational_mixture.py': '    F(q) = KL(q || p(X | R)) - log p(R) =',
-    'smoothing/mode_sequence.py': '    w_k N(X; M_k, P_k^-1),',
-    'smoothing/path_hypotheses.py': '    N(x; A m,',
-    'smoothing/trajectory_refinement.py': '    E(X) = -log p(x_1) - sum_t log p(x_t | x_{t-1})',
-    'inference/bounded_newton.py': '    rho = (E(x) - E(x + s)) / (m(0) - m(s))',
-    'inference/reduction.py': '    w = sum_i w_i,   m = sum_i w_i m_i / w,',
-}
-
-
-def test_module_heads_keep_their_equations_on_lines_of_their_own() -> None:
-    for name, equation in HEADS.items():
-        head = ast.get_docstring(ast.parse((ROOT / 'hmt_ros' / name).read_text('utf-8')))
-        assert head is not None
-        assert [line for line in head.splitlines() if line.startswith(equation)], name
-        for block in head.split('\n\n'):
-            lines = block.splitlines()
-            if any(line.startswith((' ', '- ')) for line in lines):
-                continue
-            # Text that is filled: a formatter that wraps again leaves words on lines of their own.
-            for line, following in pairwise(lines):
-                assert len(line) + len(following.split()[0]) >= 100, f'{name}: {line}'
 
 
 def test_tests_that_begin_first_exist() -> None:

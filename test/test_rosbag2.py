@@ -81,14 +81,3 @@ def test_lines_for_playing_and_recording_are_there() -> None:
     for topic in track_messages.TOPICS.keys() - {'/tf'}:
         assert re.fullmatch(pattern, f'/humans/bodies/p1/{topic}')
     assert not re.search(pattern, '/camera/image_raw')
-
-
-def test_overrides_name_topics_of_the_bag() -> None:
-    page = (ROOT / 'docs' / 'bags.md').read_text('utf-8')
-    (text,) = re.findall(r'```yaml\n(/.*?)```', page, re.DOTALL)
-    assert yaml.safe_load(text).keys() <= recorded('bags/reach')
-
-
-@pytest.mark.parametrize('folder', sorted((ROOT / 'bags').glob('*/')), ids=lambda x: x.name)
-def test_bags_of_the_repository_have_absolute_names(folder: Path) -> None:
-    assert all(name.startswith('/') for name in recorded(f'bags/{folder.name}'))

@@ -165,6 +165,9 @@ def test_colcon_build_in_a_workspace_builds_the_messages(workspace: Path) -> Non
     path, weight = json.loads(done.stdout)
     assert Path(path).is_relative_to(workspace / 'install')
     assert weight == 0.25
+    share = workspace / 'install' / 'hmt_ros' / 'share' / 'hmt_msgs'
+    for path in (*HMT_MSGS.glob('msg/*.msg'), *HMT_MSGS.glob('srv/*.srv')):
+        assert (share / path.relative_to(HMT_MSGS)).read_bytes() == path.read_bytes()
 
 
 @pytest.mark.ros
@@ -184,48 +187,6 @@ def test_packages_that_use_the_messages_run(workspace: Path) -> None:
     assert (ran.returncode, ran.stdout) == (0, 'listener.node\n'), ran.stderr
 
 
-# Asks for the support of a message, which loads the libraries of its package and of the middleware.
-CONSUMER = """
-#include <hmt_msgs/msg/pose_mixture.hpp>
-#include <rosidl_typesupport_cpp/message_type_support.hpp>
-int main() {
-  namespace support = rosidl_typesupport_cpp;
-  auto any = support::get_message_type_support_handle<hmt_msgs::msg::PoseMixture>();
-  return get_message_typesupport_handle(any, "rosidl_typesupport_fastrtps_cpp") == nullptr;
-}
-"""
-
-
-@pytest.mark.ros
-def test_a_program_in_cpp_starts_in_the_environment_of_a_clone(tmp_path: Path) -> None:
-    if not (ROOT / 'install' / 'local_setup.bash').is_file() or not (ROOT / '.venv').is_dir():
-        pytest.skip('no clone that "make setup" has set up')
-    source, program = tmp_path / 'consumer.cpp', tmp_path / 'consumer'
-    source.write_text(CONSUMER, 'utf-8')
-    built = (ROOT / 'install' / 'hmt_msgs', ROOT / '.venv')
-    names = 'hmt_msgs__rosidl_typesupport_cpp', 'rosidl_typesupport_cpp', 'rosidl_runtime_c'
-    subprocess.run(
-        [
-            *(os.environ.get('CXX', 'c++'), '-std=c++17', str(source), '-o', str(program)),
-            *(f'-I{folder}' for prefix in built for folder in prefix.glob('include/*')),
-            *(f'-L{prefix}/lib' for prefix in built),
-            *(f'-l{name}' for name in names),
-            '-Wl,--allow-shlib-undefined',
-        ],
-        check=True,
-    )
-    bare = {name: value for name, value in os.environ.items() if name != 'LD_LIBRARY_PATH'}
-    outside = subprocess.run([program], env=bare, capture_output=True, text=True, check=False)
-    assert 'error while loading shared libraries' in outside.stderr
-    inside = subprocess.run(
-        ['bash', '-c', f'source tools/environment.bash && {program} && echo $LD_LIBRARY_PATH'],
-        cwd=ROOT, env=bare, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert inside.returncode == 0, inside.stderr
-    # An empty element would be the working directory.
-    assert all(inside.stdout.strip().split(':'))
-
-
 @pytest.mark.ros
 def test_a_node_of_a_workspace_starts(workspace: Path) -> None:
     node = subprocess.Popen(
@@ -242,13 +203,6 @@ def test_a_node_of_a_workspace_starts(workspace: Path) -> None:
     rest = node.communicate(timeout=60)[1]
     assert 'compiling kernels, once after an update' in first, first + rest
     assert node.returncode == 0
-
-
-@pytest.mark.ros
-def test_definitions_of_messages_are_installed(workspace: Path) -> None:
-    share = workspace / 'install' / 'hmt_ros' / 'share' / 'hmt_msgs'
-    for path in (*HMT_MSGS.glob('msg/*.msg'), *HMT_MSGS.glob('srv/*.srv')):
-        assert (share / path.relative_to(HMT_MSGS)).read_bytes() == path.read_bytes()
 
 
 # ---- What setup.py does about the messages, without building them ----
@@ -319,27 +273,6 @@ def test_cmake_does_not_see_the_prefix_that_colcon_gives_to_setup_py(
     assert environment['CMAKE_PREFIX_PATH'].startswith(str(tmp_path / 'ros'))
     assert command[-2:] == ['-DCMAKE_BUILD_TYPE=Release', '-DX=a b']
     assert environment['DESTDIR'] == '/root'
-
-
-@pytest.mark.parametrize(
-    ('name', 'value', 'level'),
-    [('MAKEFLAGS', '-j1', None), ('CMAKE_BUILD_PARALLEL_LEVEL', '3', '3'), (None, '', 'all')],
-)
-def test_messages_are_built_by_as_many_processes_as_the_user_wants(
-    install_messages: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    name: str | None,
-    value: str,
-    level: str | None,
-) -> None:
-    for other in ('MAKEFLAGS', 'CMAKE_BUILD_PARALLEL_LEVEL'):
-        monkeypatch.delenv(other, raising=False)
-    if name is not None:
-        monkeypatch.setenv(name, value)
-    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
-    wanted = str(os.cpu_count()) if level == 'all' else level
-    assert install_messages.calls[1][1].get('CMAKE_BUILD_PARALLEL_LEVEL') == wanted
 
 
 def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_path: Path) -> None:
@@ -513,12 +446,6 @@ def order(folder: Path, *options: str) -> list[str]:
     return done.stdout.split()
 
 
-def test_both_pages_name_one_package_to_depend_on() -> None:
-    workspace = (ROOT / 'docs' / 'workspace.md').read_text('utf-8')
-    assert code('xml') == '<depend>hmt_ros</depend>\n'
-    assert f'```xml\n{code("xml")}```' in workspace
-
-
 def test_messages_alone_are_linked_into_a_workspace(tmp_path: Path) -> None:
     """The lines of docs/workspace.md, with the clone beside the workspace."""
     text = (ROOT / 'docs' / 'workspace.md').read_text('utf-8')
@@ -547,21 +474,14 @@ def test_colcon_builds_the_messages_first_where_both_are_named(tmp_path: Path) -
     assert described == {'dependencies': ['hmt_msgs']}
 
 
-@pytest.mark.parametrize('folder', [ROOT, HMT_MSGS, EXAMPLES], ids=lambda folder: folder.name)
-def test_metadata_of_a_release(folder: Path) -> None:
-    package = pytest.importorskip('catkin_pkg.package').parse_package(str(folder))
-    assert {url.type for url in package.urls} == {'website', 'bugtracker', 'repository'}
-    assert [person.name for person in package.authors] == ['hmt_ros contributors']
-    assert [person.email for person in package.maintainers] == ['hmt-ros@example.com']
-    assert package.licenses == ['Apache-2.0']
-
-
-def test_all_packages_have_the_same_metadata() -> None:
+def test_metadata_of_a_release() -> None:
     package = pytest.importorskip('catkin_pkg.package')
     ours, *others = (package.parse_package(str(folder)) for folder in (ROOT, HMT_MSGS, EXAMPLES))
+    assert {url.type for url in ours.urls} == {'website', 'bugtracker', 'repository'}
+    assert ours.licenses == ['Apache-2.0']
     for other in others:
         assert [url.url for url in ours.urls] == [url.url for url in other.urls]
-        assert ours.version == other.version
+        assert (ours.version, ours.licenses) == (other.version, other.licenses)
 
 
 # ---- A file that is not run here: its one command is ----

@@ -5,8 +5,8 @@
 #   tools/learn.sh DATA OUT
 #
 # DATA holds mocap/train, mocap/train_more, mocap/dev with tables index.csv, and video. OUT gets
-# files to compare with those that ship; nothing that ships is changed. Tables of YAML files and of
-# hmt_ros/inference/error_model.py are printed to OUT/*.txt, and are put in by hand.
+# files to compare with those that ship; nothing that ships is changed. Tables of YAML files are
+# printed to OUT/*.txt, and are put in by hand.
 set -euo pipefail
 data=${1:?the folder of mocap and video} out=${2:?the folder of the results}
 mocap=$data/mocap
@@ -31,7 +31,6 @@ learn motion hmt_learning learn motion "$mocap"/train "$mocap"/train_more --with
   --acknowledgement "$thanks" -o "$out/human37_motion.npz" --overwrite
 learn keypoint_noise benchmarks keypoint_noise
 learn contour_noise benchmarks contour_noise
-learn error_model benchmarks error_model
 learn joint_errors benchmarks joint_errors
 if python -c 'import jax, optax' 2>/dev/null; then
   # People of the clips that experts are scored on; what ships did not have the last motion either.

@@ -11,22 +11,18 @@ from tqdm import tqdm
 
 from benchmarks.clips import table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
-from benchmarks.soak.disk import disk
 from benchmarks.soak.files import files
 from benchmarks.soak.messages import messages
 from benchmarks.soak.nodes import nodes
 from benchmarks.soak.outcome import MOST_GROWTH, Amount, Outcome
-from benchmarks.soak.replay import replay
 
 MINUTES = 10.0
 
 # Each case: what does it, how often in full and with --quick, and its share of the time.
 CASES: dict[str, tuple[Callable[[Amount], Iterator[Outcome]], int, int, float]] = {
-    'messages': (messages, 100_000, 600, 0.45),
-    'nodes': (nodes, 200, 12, 0.35),
-    'files': (files, 3000, 90, 0.10),
-    'disk': (disk, 60, 12, 0.05),
-    'replay': (replay, 2, 1, 0.05),
+    'messages': (messages, 100_000, 60, 0.45),
+    'nodes': (nodes, 200, 2, 0.35),
+    'files': (files, 3000, 30, 0.20),
 }
 
 

@@ -15,8 +15,7 @@ import numpy as np
 from benchmarks.clips import ROOT
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.mutations import damaged
-from benchmarks.soak.faults import place, warnings_as_errors
-from benchmarks.soak.outcome import Amount, Outcome
+from benchmarks.soak.outcome import Amount, Outcome, place, warnings_as_errors
 from benchmarks.soak.scenes import CLIP
 from hmt_ros.body import load_body
 from hmt_ros.experts import load_predictor

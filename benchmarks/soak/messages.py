@@ -1,4 +1,4 @@
-"""The soak without DDS: random and damaged messages into the sessions behind the nodes."""
+"""The soak without DDS: damaged messages into the sessions behind the nodes."""
 
 from __future__ import annotations
 
@@ -8,14 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from hypothesis import HealthCheck, Phase, given, seed, settings
 
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
-from benchmarks.mutations import damaged, messages_of
-from benchmarks.soak.faults import place, warnings_as_errors
-from benchmarks.soak.outcome import Amount, Outcome
-from benchmarks.soak.scenes import Scene, scenes, stamped
-from hmt_ros.body import load_body
+from benchmarks.mutations import damaged
+from benchmarks.soak.outcome import Amount, Outcome, place, warnings_as_errors
+from benchmarks.soak.scenes import Scene, scenes
 from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import PREDICTION
 from hmt_ros.sessions.session import Session
@@ -24,12 +21,8 @@ from hmt_ros.sessions.track_start import prepare_start
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import deserialise, serialise
 
-# Share of the messages that hypothesis makes up by their type, which takes longer than damage.
-_MADE_UP = 0.05
 # So many damaged messages, then a valid one, which has to be used.
 _BETWEEN = 200
-# Messages that are made up, and then given, at a time.
-_AT_ONCE = 100
 # A session is replaced after so many: damage may have put it where little more can happen.
 _LIFE = 500
 
@@ -46,11 +39,10 @@ def messages(amount: Amount) -> Iterator[Outcome]:
 
 
 def _through(scene: Scene, amount: Amount) -> Outcome:
-    outcome = Outcome(scene.node, 'random and damaged messages, in process')
+    outcome = Outcome(scene.node, 'damaged messages, in process')
     fed = _Fed(scene, outcome)
     fed.check()
-    _damage(fed, amount.part(1.0 - _MADE_UP))
-    _make_up(fed, amount.part(_MADE_UP))
+    _damage(fed, amount)
     return outcome
 
 
@@ -181,50 +173,3 @@ def _damage(fed: _Fed, amount: Amount) -> None:
             else:
                 fed.ask(damaged(serialise(fed.valid[fed.asked]), rng))
         fed.check()
-
-
-def _make_up(fed: _Fed, amount: Amount) -> None:
-    words = _words()
-    sources = dict(fed.valid)
-    for source, valid in sources.items():
-        msgtype = valid.__msgtype__
-        part = amount.part(1.0 / len(sources))
-        # What makes messages up keeps more of them than it tells: they are given afterwards.
-        for number, data in _made_up(msgtype, words, part.times):
-            with _watched_memory(fed.outcome):
-                for each in data:
-                    message = deserialise(each, msgtype) if number % 2 else None
-                    if message is not None:
-                        each = serialise(stamped(message, fed.scene.stamp(fed.outcome.times)))
-                    if fed.valid[source].__msgtype__ == msgtype:
-                        fed.take(source, each)
-        fed.check()
-
-
-def _made_up(msgtype: str, words: tuple[str, ...], count: int) -> Iterator[tuple[int, list[bytes]]]:
-    """Bytes of messages that are made up by their type, some at a time, with a number."""
-    for number, first in enumerate(range(0, count, _AT_ONCE)):
-        made: list[bytes] = []
-
-        @seed(number)
-        @settings(
-            max_examples=min(_AT_ONCE, count - first),
-            database=None,
-            deadline=None,
-            phases=[Phase.generate],
-            suppress_health_check=list(HealthCheck),
-        )
-        @given(messages_of(msgtype, words))
-        def make(message: Any) -> None:
-            made.append(serialise(message))  # noqa: B023
-
-        make()
-        yield number, made
-
-
-def _words() -> tuple[str, ...]:
-    body = load_body('human37')
-    return (
-        *body.dof_names, *body.joint_names[:6], body.name, 'plumb_bob', 'equidistant', 'bgr8',
-        'mono8', 'rgba16', 'nv12', 'jpeg', 'png',
-    )  # fmt: skip

@@ -1,26 +1,299 @@
-"""The soak of the nodes, in processes of their own, over DDS."""
+"""The soak of nodes in processes of their own, which are fed over DDS."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+import signal
+import time
+from array import array
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
 
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
-from benchmarks.soak.node_damage import damaged_bytes
-from benchmarks.soak.node_lifecycle import killed, shut_down, transitions
-from benchmarks.soak.node_parameters import changed_parameters
-from benchmarks.soak.node_streams import (
-    OVERLOAD,
-    jumping_clock,
-    overload,
-    publisher_killed,
-    two_publishers,
-)
+from benchmarks.mutations import damaged
 from benchmarks.soak.outcome import Amount, Outcome
-from benchmarks.soak.scenes import scenes
-from benchmarks.soak.watched_node import Silent, Watched
+from benchmarks.soak.scenes import STEP_NS, scenes, stamped
+from benchmarks.soak.watched_node import PATIENCE, SHORT, Silent, Watched
 from hmt_ros.app.replay.player import LiveNodeError
+from hmt_ros.sessions.declared_parameters import DeclaredParameter, declared_parameters
+from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.image_inputs import PREDICTION
 from msg_tools.files.error_line import error_line
+from msg_tools.messages.cdr import canonical, serialise
+
+# Messages against what the node can take.
+OVERLOAD = 5.0
+# States are 1 unconfigured, 2 inactive, 3 active; state and transition to the state that follows.
+_CONFIGURE, _CLEANUP, _ACTIVATE, _DEACTIVATE = 1, 2, 3, 4
+_FOLLOWING = {
+    (1, _CONFIGURE): 2,
+    (2, _CLEANUP): 1,
+    (2, _ACTIVATE): 3,
+    (3, _DEACTIVATE): 2,
+}
+
+
+def transitions(watched: Watched, amount: Amount, outcome: Outcome) -> None:
+    """Every transition in every state, and on at random; those that do not exist are refused."""
+    rng = np.random.default_rng(0)
+    state = watched.state()
+    open_pairs = set(itertools.product((1, 2, 3), (1, 2, 3, 4)))
+    for _ in amount.counted():
+        here = sorted(transition for at, transition in open_pairs if at == state)
+        transition = int(rng.choice(here if here and rng.random() < 0.7 else [1, 2, 3, 4]))
+        open_pairs.discard((state, transition))
+        following = _FOLLOWING.get((state, transition))
+        done = watched.change(transition)
+        outcome.times += 1
+        outcome.refused += not done
+        if done != (following is not None):
+            outcome.fault(f'transition {transition} in state {state}: success is {done}')
+        state = following or state
+        if (found := watched.state()) != state:
+            outcome.fault(f'transition {transition} leads to {found}, wanted {state}')
+            state = found
+        if state == 3 and transition == _ACTIVATE and rng.random() < 0.3:
+            watched.anew()
+    while state != 3:
+        watched.change({1: _CONFIGURE, 2: _ACTIVATE}[state])
+        state = watched.state()
+    watched.anew()
+
+
+def killed(watched: Watched, amount: Amount, outcome: Outcome) -> None:
+    """Killed while it computes: what it had answered is there; the next one takes over."""
+    rng = np.random.default_rng(0)
+    for _ in amount.counted():
+        begin = time.monotonic()
+        for _ in range(3):
+            watched.next()
+        one = (time.monotonic() - begin) / 3
+        watched.node.publish(watched.scene.session.COUNTED, watched.scene.message(watched.index))
+        watched.spin(float(rng.uniform(0.0, 1.5)) * one)
+        watched.node.process.send_signal(signal.SIGKILL)
+        watched.node.process.wait()
+        watched.spin(0.2)
+        while watched.node.has_answered:
+            outcome.lost += not _has_come(watched)
+        outcome.times += 1
+        watched.restart()
+        watched.anew()
+
+
+def _has_come(watched: Watched) -> bool:
+    """Whether all has come that an answer tells of, of a node that lives no more."""
+    try:
+        watched.node.answer('message', 0.0)
+    except LiveNodeError:
+        return False
+    return True
+
+
+def changed_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> None:
+    """Random values, valid or not, between messages; what was agreed to is there."""
+    rng = np.random.default_rng(0)
+    declared = [p for p in declared_parameters(watched.scene.parameters) if p.effect != 'at launch']
+    names = [parameter.name for parameter in declared]
+    usual = dict(zip(names, watched.get(names), strict=True))
+    known = dict(usual)
+    for number in amount.counted():
+        chosen = declared[int(rng.integers(0, len(declared)))]
+        value = _any_value(chosen, rng)
+        done, why = watched.set(**{chosen.name: value})
+        outcome.times += 1
+        outcome.refused += not done
+        if done:
+            known[chosen.name] = value
+        elif not why or '\n' in why:
+            outcome.fault(f'{chosen.name} = {value!r} is refused with {why!r}')
+        (found,) = watched.get([chosen.name])
+        if _plain(found) != _plain(known[chosen.name]):
+            outcome.lost += 1
+            outcome.fault(f'{chosen.name} is {found!r}, was set to {known[chosen.name]!r}')
+        if number % 4 == 0:
+            watched.next()
+        if number % 25 == 24:
+            _set_back(watched, usual, known, outcome)
+    _set_back(watched, usual, known, outcome)
+    watched.next()
+
+
+def _set_back(
+    watched: Watched, usual: Mapping[str, Any], known: dict[str, Any], outcome: Outcome
+) -> None:
+    changed = {name: usual[name] for name in usual if _plain(known[name]) != _plain(usual[name])}
+    if not changed:
+        return
+    done, why = watched.set(**changed)
+    if not done:
+        outcome.fault(f'the usual values are refused: {why}')
+    known.update(usual)
+
+
+def _plain(value: Any) -> Any:
+    """A value as it is compared: ROS gives lists back as arrays."""
+    return list(value) if isinstance(value, list | array | tuple) else value
+
+
+def _any_value(parameter: DeclaredParameter, rng: np.random.Generator) -> Any:
+    """A value of a parameter: near the usual one, at a limit, beyond, or of another type."""
+    default, kind = parameter.default, rng.random()
+    if kind < 0.1:
+        wrong: tuple[Any, ...] = ('', 'pigeon', -1, 2**40, float('nan'), True, [1, 2], [b'x'])
+        return wrong[int(rng.integers(0, len(wrong)))]
+    if isinstance(default, bool):
+        return bool(rng.random() < 0.5)
+    if isinstance(default, tuple):
+        lists: tuple[Any, ...] = ([], [0.0, 1.0, 0.0], [0, 1, 0], [0.0, 0.0, 0.0], [1.0], ['down'])
+        return lists[int(rng.integers(0, len(lists)))]
+    if isinstance(default, str):
+        return ('', default, 'nowhere', default * 2, '/dev/null', '\n')[int(rng.integers(0, 6))]
+    low, high = parameter.limits or (-1e9, 1e9)
+    if kind < 0.2:
+        value = (low - 1, high + 1, -1e300, np.inf, -np.inf)[int(rng.integers(0, 5))]
+        whole = isinstance(default, int) and np.isfinite(value)
+        return int(max(value, -(2.0**63))) if whole else value  # as small as a message holds
+    near = float(np.clip(default * np.exp2(rng.uniform(-1.0, 1.0)), low, high))
+    return near if isinstance(default, float) else round(near)
+
+
+def jumping_clock(watched: Watched, amount: Amount, outcome: Outcome) -> None:
+    """Stamps and the clock of the simulation jump; every message is answered."""
+    from rosgraph_msgs.msg import Clock
+
+    rng = np.random.default_rng(0)
+    clock = watched.player.node.create_publisher(Clock, '/clock', 10)
+    watched.set(use_sim_time=True)
+    for number in amount.counted():
+        if number == amount.times // 2:
+            watched.set(reset_on_time_jump=False)
+        jump = (0, 1, -1, 3600, -3600, 2**31 - 1, -(2**31))[int(rng.integers(0, 7))]
+        seconds = int(np.clip(watched.scene.start_ns // 10**9 + jump, -(2**31), 2**31 - 1))
+        if abs(jump) > 10**9:
+            seconds = jump
+        time_message = Clock()
+        time_message.clock.sec = seconds
+        clock.publish(time_message)
+        stamp = seconds * 10**9 + int(rng.integers(0, 10)) * STEP_NS
+        handled = watched.send(
+            watched.scene.session.COUNTED, stamped(watched.scene.message(0), stamp)
+        )
+        outcome.times += 1
+        outcome.refused += bool(handled.faults)
+        if handled.stamp_ns != stamp:
+            outcome.fault(f'answered {handled.stamp_ns}, wanted {stamp}')
+    watched.values()
+    watched.player.node.destroy_publisher(clock)
+    watched.set(reset_on_time_jump=True, use_sim_time=False)
+    watched.anew()
+
+
+def overload(watched: Watched, amount: Amount, outcome: Outcome) -> None:
+    """Messages faster than they can be used: bounded, the newest is used, drops are counted."""
+    watched.settle(0.1)
+    begin = time.monotonic()
+    for _ in range(5):
+        watched.next()
+    interval = (time.monotonic() - begin) / 5 / OVERLOAD
+    counts = _counts(watched)
+    heard: list[Handled] = []
+    due = time.monotonic()
+    for _ in amount.counted():
+        watched.node.publish(watched.scene.session.COUNTED, watched.scene.message(watched.index))
+        watched.index += 1
+        outcome.times += 1
+        due += interval
+        watched.spin(max(due - time.monotonic(), 0.0))
+        while watched.node.has_answered:
+            heard.append(watched.node.answer('message', PATIENCE))
+    end = time.monotonic() + PATIENCE
+    change: dict[str, int] = {}
+    while time.monotonic() < end:
+        heard += watched.settle(1.0)
+        change = {what: count - counts[what] for what, count in _counts(watched).items()}
+        if change['received'] == len(heard):
+            break
+    if heard[-1].stamp_ns != watched.scene.stamp(watched.index - 1):
+        outcome.fault('the newest message is not the last that is used')
+    if change['received'] != change['used'] + change['skipped'] + change['dropped']:
+        outcome.fault(f'counts do not add up: {change}')
+    # Those that were dropped are answered, too.
+    outcome.lost += abs(change['received'] - len(heard))
+    unheard = outcome.times - change['received']
+    outcome.done += f': {change["used"]} used, {change["dropped"]} dropped and answered'
+    if unheard:
+        outcome.done += f', {unheard} not heard'
+
+
+def _counts(watched: Watched) -> dict[str, int]:
+    values = watched.values()
+    session = watched.scene.session
+    names = {
+        'received': 'received',
+        'used': session.DONE,
+        'skipped': 'skipped',
+        'dropped': 'dropped',
+    }
+    return {what: int(values[f'{session.UNIT}s {name}']) for what, name in names.items()}
+
+
+def damaged_bytes(watched: Watched, amount: Amount, outcome: Outcome) -> None:
+    """Damaged bytes on every topic and in every service; each is answered."""
+    rng = np.random.default_rng(0)
+    valid = {source: serialise(message) for source, message in watched.scene.valid().items()}
+    sources = list(valid)
+    for _ in amount.counted():
+        chosen = int(rng.integers(0, len(sources) + 1))
+        outcome.times += 1
+        if chosen == len(sources):
+            outcome.refused += not _asked(watched, rng)
+            continue
+        source = sources[chosen]
+        # A message of no bytes, which no ROS publisher can send, stops a reliable topic in DDS.
+        watched.node.publish_bytes(source, damaged(valid[source], rng) or b'\0')
+        try:
+            handled = watched.answer(SHORT)
+        except Silent:
+            outcome.fault(f'no answer to damaged bytes on {source}')
+            continue
+        outcome.refused += bool(handled.faults)
+    watched.anew()
+
+
+def _asked(watched: Watched, rng: np.random.Generator) -> bool:
+    """Whether the service of a node takes a damaged request."""
+    from builtin_interfaces.msg import Time
+    from hmt_msgs.srv import PredictPose, Reset, SmoothWindow
+    from rclpy.serialization import deserialize_message
+
+    scene = watched.scene
+    if scene.node == 'smoother_node':
+        times = [
+            Time(
+                sec=int(rng.choice([0, 10**9, 2**31 - 1, -1])), nanosec=int(rng.integers(0, 2**32))
+            )
+            for _ in range(2)
+        ]
+        return bool(
+            watched.node.call(
+                SmoothWindow, 'smooth_window', from_time=times[0], to_time=times[1]
+            ).success
+        )
+    valid = scene.others[PREDICTION] if scene.node == 'filter_node' else scene.message(0)
+    msgtype = valid.__msgtype__
+    try:
+        data = canonical(damaged(serialise(valid), rng), msgtype)
+        message = deserialize_message(data, watched.player.classes[msgtype])
+    except Exception:  # noqa: BLE001
+        # Not even a client could send it.
+        return False
+    if scene.node == 'filter_node':
+        return bool(watched.node.call(Reset, 'reset', initial=message).success)
+    return bool(watched.node.call(PredictPose, 'predict_pose', compressed_image=message).success)
+
 
 Case = Callable[[Watched, Amount, Outcome], None]
 
@@ -29,11 +302,8 @@ CASES: tuple[tuple[str, Case, float], ...] = (
     ('transitions of the lifecycle in every order', transitions, 1.0),
     ('parameters changed while it runs', changed_parameters, 2.0),
     ('stamps and /clock that jump', jumping_clock, 1.0),
-    ('a second publisher, an hour behind', two_publishers, 0.25),
     ('damaged bytes on topics and in services', damaged_bytes, 10.0),
-    ('its publisher killed and replaced', publisher_killed, 0.02),
     (f'messages at {OVERLOAD:g} times its rate', overload, 2.5),
-    ('shut down in every state, started again', shut_down, 0.015),
     ('killed while it computes, started again', killed, 0.02),
 )
 

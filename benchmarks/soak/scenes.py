@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from benchmarks.clips import COMPRESSED, ROOT, index_back_and_forth, read_messages
-from benchmarks.publisher import STEP_NS
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.inference import GaussianMixture
@@ -32,6 +31,7 @@ from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixt
 from msg_tools.messages.states import transforms_message
 
 PERSON = 'person_node'
+STEP_NS = 100_000_000  # between two messages
 CLIP = ROOT / 'bags' / 'reach'
 _SMALL = TrackerSettings(max_hypotheses=2, candidates=4)
 

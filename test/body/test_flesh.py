@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import load_body
 from hmt_ros.body.flesh import Flesh, Superquadric
 from hmt_ros.body.kinematics import Frames, forward
+from test.oracles.numpy_contour import occluding_contour
 
 HUMAN = load_body('human37')
 

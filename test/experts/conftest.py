@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.experts_toy import toy
+from test.oracles.branching import toy
 
 
 def branches(count, seed, inputs=6, outputs=3):

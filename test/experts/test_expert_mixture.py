@@ -1,13 +1,15 @@
 """The mixtures of experts as models: likelihood, bound, oracles, files, bad input."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 from scipy.stats import chi2, multivariate_normal
 
-from benchmarks import experts_toy
 from hmt_ros.experts import ConditionalExperts, JointExperts, RelevanceVectorRegression
 from hmt_ros.inference import GaussianMixture
+from test.oracles.branching import styles, true_log_density
 
 MODELS = [
     ConditionalExperts(3, n_starts=2),
@@ -169,9 +171,28 @@ def test_linear_joint_experts_are_the_conditional_of_a_gaussian_mixture(branch_p
 
 
 def test_linear_joint_experts_are_those_of_scikit_learn():
-    pytest.importorskip('sklearn.mixture', reason='scikit-learn is not installed')
-    found = experts_toy.gaussian_mixture_oracle(seeds=2, iterations=30)
-    assert found['largest_difference'] < 1e-8
+    """Both go on from the first iteration of scikit-learn, equally many iterations."""
+    mixture = pytest.importorskip('sklearn.mixture', reason='scikit-learn is not installed')
+    for seed in range(2):
+        inputs, targets = styles(400, seed, inputs=4, outputs=3)
+        points = np.hstack([inputs, targets])
+        peer = mixture.GaussianMixture(
+            3, reg_covar=0.0, tol=0.0, max_iter=1, random_state=seed, warm_start=True
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            peer.fit(points)
+            start = peer.predict_proba(points)
+            peer.set_params(max_iter=31).fit(points)
+        model = JointExperts(
+            3, 'linear', learning='maximum_likelihood', tolerance=-1.0, max_iterations=30
+        ).fit(inputs, targets, responsibilities=start)
+        joint = GaussianMixture(peer.weights_, peer.means_, peer.covariances_)
+        marginal = GaussianMixture(
+            peer.weights_, peer.means_[:, :4], np.ascontiguousarray(peer.covariances_[:, :4, :4])
+        )
+        expected = joint.log_density(points) - marginal.log_density(inputs)
+        assert np.abs(model.log_density(inputs, targets) - expected).max() < 1e-8
 
 
 # ---- hard cases
@@ -249,14 +270,16 @@ def test_bad_parameters_are_named(parameters, message, branch_pairs):
         JointExperts().set_params(n_expert=3)
 
 
-def test_the_ceiling_of_the_toy_is_the_truth():
-    inputs, targets = experts_toy.toy(5000, 1000)
-    assert experts_toy.true_log_density(inputs, targets).mean() == pytest.approx(1.227, abs=0.03)
-
-
-def test_the_toy_benchmark_says_what_is_wanted():
-    found = experts_toy.toy_scores(seeds=1, experts=(3,), test=500)
-    for name in ('conditional', 'joint'):
-        assert found[name]['3']['mean'] > found[name]['3']['wanted']
-        assert found[name]['3']['gates'] > 0.9
-    assert found['regression']['mean'] < 0.3
+def test_experts_come_near_the_truth_of_the_toy(toy_pairs, toy_test):
+    """log p(y | x) in nats: of the truth 1.23, of one regression 0.18."""
+    assert true_log_density(*toy_test).mean() == pytest.approx(1.227, abs=0.03)
+    for model in (ConditionalExperts, JointExperts):
+        found = model(3, seed=0).fit(*toy_pairs)
+        assert found.log_density(*toy_test).mean() > 1.0
+        # Where the toy has one branch, experts of that branch have the weight.
+        weights, means, _ = found.predict_arrays(np.array([[-0.05], [0.0], [1.0], [1.05]]))
+        heaviest = means[np.arange(4), weights.argmax(1)]
+        near = np.abs(means - heaviest[:, None])[:, :, 0] < 0.15
+        assert (weights * near).sum(1).mean() > 0.9
+    one = RelevanceVectorRegression(seed=0).fit(*toy_pairs)
+    assert one.log_density(*toy_test).mean() < 0.3

@@ -1,36 +1,12 @@
-"""Best sums and distinct poses against full enumeration."""
+"""Distinct poses against all pairs."""
 
 from __future__ import annotations
-
-import itertools
 
 import numpy as np
 import pytest
 
-from benchmarks.whole_body_flips import least_sums
 from hmt_ros.body import load_body
 from hmt_ros.flips.interpretation_tree import distinct_poses
-
-
-@pytest.mark.parametrize('count', [1, 5, 40, 1000])
-@pytest.mark.parametrize('ruled_out', [False, True])
-def test_least_sums_of_lists_with_ties(count, ruled_out):
-    """Costs are small whole numbers, so that sums are exact and often equal."""
-    rng = np.random.default_rng(count)
-    costs = [rng.integers(0, 4, size).astype(float) for size in (4, 5, 3, 4)]
-    tables = {(0, 1): rng.random((4, 5)) < 0.7, (1, 3): rng.random((5, 4)) < 0.7}
-    allowed = tables if ruled_out else None
-    sums, picks = least_sums(costs, count, allowed)
-    wanted = sorted(
-        sum(cost[i] for cost, i in zip(costs, pick))
-        for pick in itertools.product(*(range(len(cost)) for cost in costs))
-        if not ruled_out or all(table[pick[i], pick[j]] for (i, j), table in tables.items())
-    )
-    assert sums.tolist() == wanted[:count]
-    assert len({tuple(pick) for pick in picks.tolist()}) == len(sums)
-    assert np.array_equal(sum(cost[i] for cost, i in zip(costs, picks.T)), sums)
-    if ruled_out:
-        assert all(table[picks[:, i], picks[:, j]].all() for (i, j), table in tables.items())
 
 
 @pytest.fixture(scope='module')

@@ -7,13 +7,13 @@ import itertools
 import numpy as np
 import pytest
 
-from benchmarks.whole_body_flips import rehang_chain
 from hmt_ros.body import load_body
 from hmt_ros.body.skeleton import other_side
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.flips.limb_products import LimbProducts
 from hmt_ros.flips.limb_products_kernel import Configurations, limbs_of
 from hmt_ros.flips.torso_flips import flip_torso
+from test.oracles.rehung import rehang_chain
 
 APART, PRICE, MOST = 0.08, 3.5, 10
 SHARE = 0.3

@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import numpy_likelihood as oracle
-from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import directed_derivatives, forward
 from hmt_ros.body.pose_terms import AnglePrior
@@ -18,6 +16,8 @@ from hmt_ros.image.terms.image_term import TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
 from hmt_ros.image.terms.residuals import contour_sigma
 from hmt_ros.inference.energy import Derivatives
+from test.oracles import numpy_likelihood as oracle
+from test.oracles.numpy_contour import occluding_contour
 
 IMAGE_TERMS = ('coverage', 'edges')
 MAGNIFICATION = 100.0  # px/m

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.contour_noise import signed_distance
 from hmt_ros.image.observation import MARGIN, observe
 from hmt_ros.image.terms.edges import ORIENTATIONS
 from hmt_ros.image.terms.image_term import ImageWindow
@@ -29,19 +28,6 @@ def whole(image_map, channel=0, size=SIZE, fill=np.nan):
     h, w = values.shape[1:]
     result[top : top + h, left : left + w] = values[channel]
     return result
-
-
-def test_signed_distance_is_that_to_the_border_between_the_pixels():
-    mask = disc() | disc((110, 70), 12)
-    found = signed_distance(mask.astype(np.uint8))
-    inside, outside = np.argwhere(mask), np.argwhere(~mask)
-    rng = np.random.default_rng(0)
-    for v, u in rng.integers(0, SIZE, (200, 2)):
-        other = outside if mask[v, u] else inside
-        nearest = np.linalg.norm(other - [v, u], axis=1).min()
-        wanted = 0.5 - nearest if mask[v, u] else nearest - 0.5
-        # OpenCV's fast transform is exact to a few percent.
-        assert found[v, u] == pytest.approx(wanted, abs=0.1 + 0.03 * nearest)
 
 
 def test_the_window_holds_the_silhouette_and_its_margin():

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import numpy_likelihood as oracle
 from hmt_ros.body import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.observation import observe
@@ -15,6 +14,7 @@ from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface import lens_of
 from hmt_ros.image.surface_points import seen_points
 from hmt_ros.inference.energy import Derivatives
+from test.oracles import numpy_likelihood as oracle
 
 WEIGHT = 5.0
 LENSES = {

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import numpy_likelihood as oracle
 from hmt_ros.body import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.surface_points import FACING, SurfacePoints, seen_points
+from test.oracles import numpy_likelihood as oracle
 
 
 @pytest.fixture(scope='module')

@@ -6,10 +6,8 @@ import itertools
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from benchmarks.clip_trajectories import visiting_probabilities
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing import LinearGaussianDynamics
@@ -87,18 +85,6 @@ def test_k_best_paths_are_those_of_enumeration(network, every_path):
     assert len(np.unique(everything.nodes, axis=0)) == 243
     with pytest.raises(ValueError, match='k must be'):
         k_best_paths(network, 0)
-
-
-def test_visiting_probabilities(network, every_path):
-    paths, values = every_path
-    everything = k_best_paths(network, 27)
-    for t, table in enumerate(visiting_probabilities(network, everything)):
-        np.testing.assert_allclose(table.sum(1), 1.0)
-        for source, k in itertools.product(range(3), repeat=2):
-            of = [v for p, v in zip(paths, values) if p[0] == source]
-            through = [v for p, v in zip(paths, values) if p[0] == source and p[t] == k]
-            expected = np.exp(logsumexp(through) - logsumexp(of)) if through else 0.0
-            assert table[source, k] == pytest.approx(expected)
 
 
 def test_a_diverse_subset_differs_more_than_the_best_paths(network):

@@ -22,6 +22,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import Status, Tracker, TrackerSettings
 from hmt_ros.tracking.beginning import STARTS, Source, with_reversals
 from hmt_ros.tracking.proposals import PosePrediction
+from test.clips import read_clip
 
 FRAME = 100_000_000  # ns
 SHARED = Path(os.environ.get('HMT_SHARED', Path(__file__).resolve().parents[3] / 'shared'))
@@ -219,14 +220,12 @@ def test_keypoints_of_a_detector_start_a_track(human37, name):
     folder = SHARED / 'video' / name
     if not (folder / 'keypoints_mediapipe.npz').is_file():
         pytest.skip(f'{folder} is absent')
-    from benchmarks.clips import read_clip, read_detections
-
-    clip, seen = read_clip(folder, 8), read_detections(folder).keypoints
+    clip = read_clip(folder, 8)
     background = None if clip.background is None else BackgroundModel.from_image(clip.background)
     tracker = Tracker(human37, clip.camera, FAST, background)
-    for stamp, image in zip(clip.stamps, clip.images, strict=True):
-        tracker.step(image, stamp, seen[stamp])
-    names, stamp = clip.truth.joint_names, clip.stamps[-1]
+    for stamp, image in clip.images.items():
+        tracker.step(image, stamp, clip.keypoints[stamp])
+    names = clip.truth.joint_names
     rows = [names.index(x) for x in NAMES]
     true = clip.truth.joints[stamp][rows]
     found = tracker.body.joint_positions(tracker.posterior.means[:1])[0]

@@ -17,7 +17,7 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
-from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings
+from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings, read_subject
 from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath, CameraPose
 from hmt_ros.tracking.contact import FootContacts
 from hmt_ros.tracking.ground import GroundEstimator
@@ -25,6 +25,7 @@ from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.prediction import dynamics_of, predicted_states
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
+from test.clips import read_clip
 
 FRAME = 100_000_000  # ns
 UP = np.array([0.0, -1.0, 0.0])
@@ -371,12 +372,22 @@ def test_frames_of_a_pose_are_the_carried_ones(body, walking):
 @pytest.mark.skipif(
     not (SHARED / 'video' / 'follow').is_dir(), reason='the development clips are absent'
 )
-def test_root_path_of_a_clip_with_a_moving_camera():
-    from benchmarks.runs import BOTH, Run, run
-    from benchmarks.tracking_scores import in_world
-
-    record = run(Run(SHARED / 'video' / 'follow', BOTH, 0, limit=30))
-    own, true = (in_world(record, x[:, :1])[:, 0] for x in (record.point, record.true))
+def test_root_path_of_a_clip_with_a_moving_camera(human37):
+    folder = SHARED / 'video' / 'follow'
+    clip = read_clip(folder, 30)
+    tracker = Tracker(human37, clip.camera)
+    tracker.reset(read_subject(folder / 'subject.yaml', human37))
+    pelvis = clip.truth.joint_names.index('pelvis')
+    own, true = [], []
+    for stamp, image in clip.images.items():
+        rotation, position = clip.views[stamp]
+        tracker.set_camera(position, rotation)
+        tracker.step(image, stamp, clip.keypoints[stamp])
+        root = tracker.body.joint_positions(tracker.point_estimate[None])[0]
+        seen = (root[human37.joint_names.index('pelvis')], clip.truth.joints[stamp][pelvis])
+        for path, point in zip((own, true), seen, strict=True):
+            path.append(rotation @ point + position)
+    own, true = np.array(own), np.array(true)
     length = np.linalg.norm(np.diff(true[::10], axis=0), axis=1).sum()
     assert np.linalg.norm(own - true, axis=1).mean() < 0.08
     assert np.linalg.norm((own[-1] - own[0]) - (true[-1] - true[0])) < 0.1 * length

@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import numpy_likelihood as oracle
-from benchmarks.numpy_contour import occluding_contour
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
@@ -24,7 +22,12 @@ from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.posterior import WIDEST, Posterior
 from hmt_ros.tracking.settings import MAX_ANGLE_SHIFT, MAX_SHAPE_CHANGE, MAX_SHAPE_STEP
-from hmt_ros.tracking.shape_estimation import Linearised, ShapeEstimate
+from hmt_ros.tracking.shape_estimation import (
+    Linearised,
+    ShapeEstimate,
+)
+from test.oracles import numpy_likelihood as oracle
+from test.oracles.numpy_contour import occluding_contour
 
 VIEW = Viewpoint(distance=3.2)
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)

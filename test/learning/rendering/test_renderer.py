@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.numpy_contour import occluding_contour
 from hmt_learning.motion.limb_motions import arm_posture
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_learning.rendering.renderer import render, render_frames
@@ -14,6 +13,7 @@ from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.flesh import Flesh
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.rasterisation import render_silhouettes
+from test.oracles.numpy_contour import occluding_contour
 
 VIEW = Viewpoint(distance=3.2)
 BARE = Scene(viewpoint=VIEW, noise=0.0, shadow=0.0, clutter=2)

@@ -20,11 +20,11 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
-from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.images import decode_image
 from msg_tools.messages.message_types import typestore
+from test.memory import forget_peak, peak_memory, resident_memory
 
 STRING = 'std_msgs/msg/String'
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from benchmarks.smoothing_clips import Seen
+from benchmarks.runs import Seen
 from hmt_ros.body import Body
 from hmt_ros.body.mirror import free_limits, without_turns
 from hmt_ros.body.motion_prior import motion_prior

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import Frames, assemble, forward, segment_sums
 from hmt_ros.image.likelihood import ImageLikelihood
@@ -25,6 +24,7 @@ from hmt_ros.image.surface_points import FACING, SurfacePoints, coarse_mesh
 from hmt_ros.image.terms.edges import FEWEST
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.silhouette import SPACING, TURN, Outline
+from test.oracles.numpy_contour import occluding_contour
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

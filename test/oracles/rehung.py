@@ -1,0 +1,38 @@
+"""Limbs that hang on another trunk, and keep the image that they had or take that of another."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmt_ros.body.kinematics import forward
+from hmt_ros.flips.interpretation_tree import _ends, _grown
+from hmt_ros.flips.tree_growth import chain_links
+
+
+def rehang_chain(body, poses, new_poses, chain, *, image_of=None, slack=0.1):
+    """Poses whose chain hangs on another trunk and still has the image that it had.
+
+    Its joints are put back onto the rays through their images, in all ways that lengths and limits
+    allow.
+
+    Args:
+        body: the body.
+        poses: (N, d) that have the image.
+        new_poses: (N, d) with the other trunk.
+        chain: name of the chain.
+        image_of: name of the chain whose image is taken; None: the chain itself.
+        slack: a ray that misses its sphere by less than this touches it, m.
+
+    Returns:
+        poses (M, d), equal to the new ones outside the chain, and the index (M,) of each.
+    """
+    skeleton = body.skeleton
+    links = chain_links(skeleton, chain)
+    ends = links if image_of is None else chain_links(skeleton, image_of)
+    new = np.array(new_poses, dtype=np.float64, ndmin=2, order='C')
+    seen = forward(skeleton, np.array(poses, dtype=np.float64, ndmin=2))
+    angles, valid = _grown(forward(skeleton, new), new, links, _ends(seen, ends), slack)
+    parents, choice = np.nonzero(valid)
+    result = new[parents]
+    result[:, links.dofs] = angles[parents, choice]
+    return result, parents
