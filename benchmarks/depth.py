@@ -26,9 +26,9 @@ from benchmarks.runs import Record, recorded
 from benchmarks.tracking_scores import scores_of
 from hmt_learning.app.make_bag import MotionOptions, motion_of
 from hmt_learning.app.rendered_bag import write_bag
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import ShapeSpace
 from hmt_ros.image.background import BackgroundModel

@@ -27,10 +27,10 @@ from benchmarks.kernel_flops import ALL, KINDS, PLACING, counts, energies
 from benchmarks.machine import best_time, description, dgemm_rate
 from benchmarks.smoothing_relations import CLOSE, layers_of
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips.interpretation_tree import enumerate_flips

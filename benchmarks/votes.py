@@ -25,11 +25,11 @@ from benchmarks.flips import random_poses
 from benchmarks.machine import description
 from benchmarks.runs import keypoints_only
 from hmt_learning.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.background import BackgroundModel

@@ -36,10 +36,10 @@ from benchmarks.clips import find_clips, read_clip, table
 from benchmarks.command import run_stages
 from benchmarks.machine import best_time, forget_peak, peak_memory, resident_memory
 from benchmarks.stages import StageClock
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.tracking import Status

@@ -10,10 +10,10 @@ import pytest
 from benchmarks import numpy_likelihood as oracle
 from benchmarks.numpy_contour import occluding_contour
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import ShapeSpace
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
