@@ -229,6 +229,7 @@ setup(
     extras_require={
         'test': ['pytest', 'hypothesis'],
         'dask': ['distributed'],
+        # What hmt_learning, which is not installed, imports beside the requirements above.
         'learning': ['jax', 'optax'],
         'detector': ['ai-edge-litert'],
         'video': ['av'],

@@ -17,10 +17,10 @@ from benchmarks.clips import COMPRESSED, read_messages
 from hmt_learning.app import make_bag
 from hmt_learning.app.rendered_bag import Take, write_people
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.headers import FRAME_ID

@@ -18,7 +18,9 @@ from msg_tools.messages import detections, images, keypoints, pose_mixtures
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(
-    path for folder in ('hmt_ros', 'msg_tools', 'launch') for path in (ROOT / folder).rglob('*.py')
+    path
+    for folder in ('hmt_ros', 'hmt_learning', 'msg_tools', 'launch')
+    for path in (ROOT / folder).rglob('*.py')
 )
 # Modules that execute what they read, or open connections.
 FORBIDDEN_MODULES = {

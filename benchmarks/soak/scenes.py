@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.clips import COMPRESSED, ROOT, index_back_and_forth, read_messages
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession

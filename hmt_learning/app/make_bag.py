@@ -26,6 +26,7 @@ from hmt_learning.motion.limb_motions import sole
 from hmt_learning.motion.motion_file import Motion, read_motion
 from hmt_learning.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
 from hmt_learning.motion.retarget import body_from_motion, retarget
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.app.command_line import (
     CommandParser,
@@ -36,7 +37,6 @@ from hmt_ros.app.command_line import (
     whole_number,
 )
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.inference.arrays import Array
 
 DURATION, HEADING = 4.0, 30.0  # s; degrees, of recorded motions

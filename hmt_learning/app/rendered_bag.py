@@ -28,11 +28,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render_frames, render_people, sensed_depth
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, Camera
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints

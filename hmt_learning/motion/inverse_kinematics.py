@@ -1,8 +1,7 @@
 """Iterative inverse kinematics: poses that put joints where they should be (KJS 3.2).
 
 Bounded damped Newton on the squared distances of the joints to their targets, with the hard limits
-and the soft prior. It is used where the closed form of `interpretation_tree` fails: a ray misses
-its sphere, a limit is violated, or joints have no closed form.
+and the soft prior. Procedural motions take their arms and legs from it.
 """
 
 from __future__ import annotations

@@ -26,8 +26,8 @@ from hmt_learning.motion.limb_motions import (
     standing_foot,
     walking_foot,
 )
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.limb_angles import SIDES
 from hmt_ros.body.mirror import root_angles, root_rotations
 from hmt_ros.inference.arrays import Array

@@ -19,8 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera, Viewpoint
+from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference.arrays import Array, Index
 

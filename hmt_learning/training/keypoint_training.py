@@ -34,7 +34,7 @@ from hmt_ros.experts.lifter import (
 )
 from hmt_ros.experts.pose_encoding import AXES
 from hmt_ros.experts.pose_predictor import RATE
-from hmt_ros.image.keypoint_schemes import DetectorErrors, detector_errors, landmarks, schemes
+from hmt_ros.image.keypoint_schemes import landmarks, schemes
 from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.inference.arrays import Array, Index
 
@@ -69,6 +69,48 @@ OF_SPREAD, SHORTEST_LENGTH = 0.8, 0.4
 # Angles that wander: standard deviations of joints, and of the lean of root and trunk; time, s.
 WANDER, LEAN, WANDERING = np.radians(7.0), np.radians(4.0), 2.0
 SHORTEST = 10  # frames of a motion
+
+
+@dataclass(frozen=True)
+class DetectorErrors:
+    """How the keypoints of a detector err together.
+
+    `sigma`, how much of the variance lasts and how often sides are exchanged are near what
+    `benchmarks keypoint_noise` measures on rendered clips; the rest is chosen.
+
+    Attributes:
+        sigma: Standard deviation of a keypoint that is sure, m at the person.
+        spread: Standard deviation of its logarithm over persons.
+        white, lasting, constant: Shares of the variance of errors that differ from image to image,
+            that last for `time`, and that stay.
+        time: Time for which the second kind lasts, s.
+        hidden, always_hidden: Shares of the landmarks that are unsure for a while, and always.
+        hidden_time: Half of that while, s.
+        hidden_factor: Largest factor on the errors of an unsure landmark.
+        heavy: Share of the landmarks that err as much although they seem sure.
+        unconfident: Share of detectors that have no confidences.
+        missing: Share of landmarks, of single keypoints and of images that are missing.
+        cut: Share of windows in which the border of the image cuts the person.
+        exchanged: Shares of windows where nothing, all, arms, legs are called by the other side.
+        exchange_time: Half of the time for which they are, s; half of them stay.
+    """
+
+    sigma: float = 0.016
+    spread: float = 0.35
+    white: float = 0.08
+    lasting: float = 0.64
+    constant: float = 0.25
+    time: float = 0.2
+    hidden: float = 0.12
+    always_hidden: float = 0.04
+    hidden_time: float = 0.5
+    hidden_factor: float = 6.0
+    heavy: float = 0.03
+    unconfident: float = 0.2
+    missing: float = 0.02
+    cut: float = 0.06
+    exchanged: tuple[float, ...] = (0.91, 0.04, 0.025, 0.025)
+    exchange_time: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -362,7 +404,7 @@ def with_errors(
         times: (N, S) of the images, s; the same order in all windows.
         amount: factor on the deviations.
     """
-    e = detector_errors()
+    e = DetectorErrors()
     n, s, count = confidences.shape
     f32 = np.float32
 

@@ -29,7 +29,8 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.reduction import reduced
 
-# Below it no kernel fires: the experts have seen nothing like the input.
+# Minimum of `ConditionalDensity.support`: below it no kernel fires, the experts have seen nothing
+# like the input.
 LEAST_SUPPORT = 1e-3
 
 
@@ -40,7 +41,6 @@ def propagate(
     *,
     n_components: int | None = None,
     without_past: GaussianMixture | None = None,
-    least_support: float = LEAST_SUPPORT,
 ) -> GaussianMixture:
     """p(x_t | R_t) by rule (1).
 
@@ -53,7 +53,6 @@ def propagate(
         observation: r_t (q,); q may be 0.
         n_components: Number of components M of the result; None takes the number of experts.
         without_past: p(x_t | r_t); None trusts the model everywhere.
-        least_support: Minimum of `ConditionalDensity.support`.
 
     Raises:
         ValueError: dimensions do not fit, or the observation is not finite.
@@ -67,7 +66,7 @@ def propagate(
                 f'without_past has dimension {without_past.dimension}, '
                 f'wanted {model.n_outputs_} as the model predicts'
             )
-        trusted = model.support(inputs) >= least_support
+        trusted = model.support(inputs) >= LEAST_SUPPORT
     lost = float(previous.weights[~trusted].sum())
     parts = []
     if trusted.any():

@@ -92,7 +92,7 @@ def m_step(features: TrainingPairs, state: EMState, shares: Array, learn: Learne
 
 def climb(
     features: TrainingPairs, state: EMState, learn: Learner, iterations: int, tolerance: float
-) -> tuple[EMState, list[float], Array]:
+) -> tuple[EMState, list[float]]:
     """Alternates E-steps and M-steps; prunes experts that have lost their samples.
 
     Args:
@@ -100,7 +100,7 @@ def climb(
         tolerance: Gain of an iteration below which the iterations end, nats per sample.
 
     Returns:
-        The last state, the bounds since the last pruning, the last responsibilities (N, M).
+        The last state, and the bounds since the last pruning.
     """
     bounds = [state.bound]
     total = float(features.weights.sum())
@@ -117,4 +117,4 @@ def climb(
         if len(bounds) > 1 and bounds[-1] - bounds[-2] < tolerance * total:
             break
         shares = e_step(features, state)
-    return state, bounds, shares
+    return state, bounds

@@ -74,7 +74,6 @@ class ExpertMixture(ConditionalDensity):
         experts_: Regressions of the experts, in units of standardised targets.
         gates_: Gates of the experts.
         bound_: F after each iteration since the last expert was pruned, nats, standardised targets.
-        responsibilities_: (N, M) of the training samples.
         width_: Width of the kernels.
     """
 
@@ -83,7 +82,6 @@ class ExpertMixture(ConditionalDensity):
     experts_: tuple[SparseRegression, ...]
     gates_: Gates
     bound_: Array
-    responsibilities_: Array
     _gates: ClassVar[type[Gates]]
 
     def __init__(
@@ -153,9 +151,7 @@ class ExpertMixture(ConditionalDensity):
         else:
             basis, features, state = self._best_start(pairs)
         self.basis_ = basis
-        state, bounds, self.responsibilities_ = climb(
-            features, state, self._expert, self.max_iterations, self.tolerance
-        )
+        state, bounds = climb(features, state, self._expert, self.max_iterations, self.tolerance)
         self.experts_, self.gates_ = state.experts, state.gates
         self.bound_ = np.array(bounds)
         self._keep_used()

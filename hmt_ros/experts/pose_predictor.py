@@ -55,8 +55,8 @@ SHIPPED = 'silhouettes'
 KIND = 'pose_predictor'
 MAX_COMPONENTS = 8
 LIGHTEST = 1e-3  # weight below which a component is dropped
-# Time step of the sequences that rule (1) learns from, s.
-RATE = 30.0  # of the step that dynamics learn, Hz
+# Rate of the sequences that rule (1) learns from, Hz, and their time step, s.
+RATE = 30.0
 STEP = 1.0 / RATE
 JITTER = 1e-9  # variance that is added to poses, m^2 and rad^2
 # How a mixture is propagated: by rule (9), by rule (1), or not at all.

@@ -174,45 +174,6 @@ def noise_of(confidences: Array) -> Array:
     return result
 
 
-@dataclass(frozen=True)
-class DetectorErrors:
-    """The model of a detector's errors, for the training of experts.
-
-    Attributes:
-        sigma: Standard deviation of a keypoint that is sure, m at the person.
-        spread: Standard deviation of its logarithm over persons.
-        white, lasting, constant: Shares of the variance of errors that differ from image to image,
-            that last for `time`, and that stay.
-        time: Time for which the second kind lasts, s.
-        hidden, always_hidden: Shares of the landmarks that are unsure for a while, and always.
-        hidden_time: Half of that while, s.
-        hidden_factor: Largest factor on the errors of an unsure landmark.
-        heavy: Share of the landmarks that err as much although they seem sure.
-        unconfident: Share of detectors that have no confidences.
-        missing: Share of landmarks, of single keypoints and of images that are missing.
-        cut: Share of windows in which the border of the image cuts the person.
-        exchanged: Shares of windows where nothing, all, arms, legs are called by the other side.
-        exchange_time: Half of the time for which they are, s; half of them stay.
-    """
-
-    sigma: float
-    spread: float
-    white: float
-    lasting: float
-    constant: float
-    time: float
-    hidden: float
-    always_hidden: float
-    hidden_time: float
-    hidden_factor: float
-    heavy: float
-    unconfident: float
-    missing: float
-    cut: float
-    exchanged: tuple[float, ...]
-    exchange_time: float
-
-
 @cache
 def position_deviations(scheme: str | None) -> Mapping[str, float]:
     """Standard deviations of depths of a detector, by the kind of the joint, m.
@@ -222,13 +183,6 @@ def position_deviations(scheme: str | None) -> Mapping[str, float]:
     """
     content = _table()['positions']
     return {**content['usual'], **content.get(scheme, {})}
-
-
-@cache
-def detector_errors() -> DetectorErrors:
-    """The model of the errors of detectors."""
-    content = dict(_table()['errors'])
-    return DetectorErrors(exchanged=tuple(content.pop('exchanged')), **content)
 
 
 @cache

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.app.truth import read_truth
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.evaluation.ground_scores import FEET, TrueGround, ground_scores
 
 SECOND = 1_000_000_000

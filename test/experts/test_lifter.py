@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hmt_learning.training.keypoint_training import (
     JOINTS,
+    DetectorErrors,
     WindowSettings,
     keypoint_tracks,
     training_windows,
@@ -337,6 +338,12 @@ def test_training_windows_show_what_the_camera_sees():
     seen = plane[:, knee] - plane[:, hips].mean(1)
     assert np.corrcoef(seen[:, 0], joints[:, of_pose, 0])[0, 1] > 0.9
     assert np.corrcoef(seen[:, 1], joints[:, of_pose, 1])[0, 1] > 0.8
+
+
+def test_errors_of_detectors_are_shares():
+    e = DetectorErrors()
+    assert e.white + e.lasting + e.constant == pytest.approx(1.0, abs=0.05)
+    assert sum(e.exchanged) == pytest.approx(1.0)
 
 
 def test_windows_are_the_same_with_the_same_seed():

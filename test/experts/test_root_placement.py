@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.experts.descriptor.contour import PersonBlob, person_blob
 from hmt_ros.experts.pose_encoding import PoseEncoding

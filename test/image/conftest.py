@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 
 VIEW = Viewpoint(distance=3.2)
 

@@ -7,7 +7,6 @@ import pytest
 
 from hmt_ros.body import load_body
 from hmt_ros.image.keypoint_schemes import (
-    detector_errors,
     exchange_rates,
     noise_of,
     position_deviations,
@@ -96,12 +95,6 @@ def test_depths_of_unknown_detectors_are_less_sure():
     assert known.keys() == other.keys()
     assert all(known[name] <= other[name] for name in known)
     assert position_deviations('coco17') == other
-
-
-def test_errors_of_detectors_are_shares():
-    e = detector_errors()
-    assert e.white + e.lasting + e.constant == pytest.approx(1.0, abs=0.05)
-    assert sum(e.exchanged) == pytest.approx(1.0)
 
 
 def test_exchanges_are_rare():

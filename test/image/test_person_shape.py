@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import Camera
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.person_shape import (
     covered,

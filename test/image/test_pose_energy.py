@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.pose_terms import Posed

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hmt_ros.body.camera import Viewpoint
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints

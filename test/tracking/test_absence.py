@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render, render_frames
 from hmt_learning.rendering.scene import Scene
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture

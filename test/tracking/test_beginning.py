@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
-from hmt_ros.body.camera import Viewpoint
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body.mirror import left_directions
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.background import BackgroundModel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_learning.motion.procedural_motion import procedural_motion
-from hmt_ros.body.camera import Viewpoint
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body.mirror import left_directions
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings

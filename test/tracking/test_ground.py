@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.ground_terms import GroundSettings, sole_points, soles
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.likelihood import LikelihoodSettings

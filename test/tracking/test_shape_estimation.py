@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import GROWTH_SIGMAS, MIN_LENGTH_SIGMA, ShapeSpace
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings

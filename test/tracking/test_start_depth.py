@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render_frames, sensed_depth
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.joint_depths import depths_of, joint_depths, moved_to_depth
 from hmt_ros.image.sampling import ImageMap

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import load_body
-from hmt_ros.body.camera import Viewpoint, shortest_turn
+from hmt_ros.body.camera import shortest_turn
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_rotations

@@ -17,8 +17,8 @@ from avatar import Avatar
 from scipy.spatial.transform import Rotation
 
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 
 FPS = 15.0

@@ -20,8 +20,8 @@ from hmt_learning.app.rendered_bag import (
     true_gravity,
     write_camera_place,
 )
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.detectors.blazepose import BlazePose
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message

@@ -5,10 +5,10 @@ import pytest
 
 from hmt_learning.app.make_bag import main as make_bag
 from hmt_learning.app.rendered_bag import PEOPLE, crossing_takes
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import load_body
-from hmt_ros.body.camera import Viewpoint
 from msg_tools import BagReader
 from msg_tools.messages.detections import people_of_message
 from msg_tools.messages.pose_mixtures import pose_mixture_of

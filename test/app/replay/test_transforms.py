@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.inputs import recorded_input, upright_frame
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.sessions.camera_frames import UP_SIGMA
 from msg_tools import BagReader, RosbagsMessages
 from msg_tools.bags.bag_metadata import absolute_name

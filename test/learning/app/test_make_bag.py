@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hmt_learning.app.make_bag import main
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.subject import read_subject
 from hmt_ros.sessions.transform_buffer import TransformBuffer

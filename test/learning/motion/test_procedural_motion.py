@@ -15,8 +15,8 @@ from hmt_learning.motion.procedural_motion import (
     rests,
     smooth_below,
 )
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 

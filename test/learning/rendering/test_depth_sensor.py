@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import DARK, FURTHEST, NEAREST, NOISE, sensed_depth
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
-from hmt_ros.body.camera import Viewpoint
 
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
 

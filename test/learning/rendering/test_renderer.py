@@ -6,10 +6,10 @@ import pytest
 
 from hmt_learning.motion.limb_motions import arm_posture
 from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render, render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.flesh import Flesh
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.rasterisation import render_silhouettes
