@@ -203,6 +203,7 @@ setup(
         'numba',
         'PyYAML',
         'matplotlib',
+        'pillow',
         'mcap',
         'rosbags',
         'tqdm',
