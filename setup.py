@@ -219,6 +219,7 @@ setup(
         'numba',
         'PyYAML',
         'matplotlib',
+        'pillow',
         'mcap',
         'rosbags',
         'tqdm',

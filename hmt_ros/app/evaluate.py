@@ -234,7 +234,7 @@ def score_bag(
     model_sigma: float = MODEL_SIGMA,
     body_model: str | None = None,
     seed: int = 0,
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int], object] = lambda count: None,
 ) -> dict[str, TrackScores]:
     """Scores of the topics of a bag, by name in the order of the bag.
 
@@ -260,8 +260,7 @@ def score_bag(
                 _read_pose(stored, found[stored.topic], bodies)
             else:
                 _read_trajectories(stored, found[stored.topic], bodies)
-            if progress is not None:
-                progress(1)
+            progress(1)
         return {name: track.finish() for name, track in found.items()}
 
 

@@ -279,7 +279,7 @@ def read_tracked_motion(
     *,
     body_model: str | None = None,
     camera_axes: bool = False,
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int], object] = lambda count: None,
 ) -> TrackedMotion:
     """The motion of a recorded run; of several poses with the same stamp, the first.
 
@@ -349,13 +349,12 @@ def _topic(bag: BagReader, wanted: str | None) -> str:
 
 
 def _mixtures(
-    bag: BagReader, name: str, bodies: RecordedBodies, progress: Callable[[int], object] | None
+    bag: BagReader, name: str, bodies: RecordedBodies, progress: Callable[[int], object]
 ) -> Iterator[PoseMixture]:
     """The mixtures on a topic, which are all over the same variables; teaches the bodies."""
     names: tuple[tuple[str, ...], tuple[str, ...]] | None = None
     for stored in bag.messages([*body_topics(bag), name]):
-        if progress is not None:
-            progress(1)
+        progress(1)
         if stored.msgtype == BODY:
             bodies.learn(stored)
             continue

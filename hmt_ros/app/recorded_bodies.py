@@ -1,8 +1,7 @@
 """The bodies that the mixtures in a bag are about, and the ground that they stand on.
 
-A mixture that carries segment lengths names its own body. One without (of another publisher, or in
-a bag older than the fields) is about the body on the Body topic of its namespace, or of the bag's
-only Body topic.
+A mixture that carries segment lengths names its own body. One without, of another publisher, is
+about the body on the Body topic of its namespace, or of the bag's only Body topic.
 """
 
 from __future__ import annotations

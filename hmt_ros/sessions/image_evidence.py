@@ -85,8 +85,7 @@ def evidence_of(content: PoseMixture) -> Evidence:
     if math.isnan(share) or math.isnan(time):
         if content.kind is MixtureKind.LIKELIHOOD:
             raise MessageError(
-                f'likelihood has error_share {share:g} and error_time {time:g}, wanted numbers: '
-                'earlier versions lack them; record the bag again with this version',
+                f'likelihood has error_share {share:g} and error_time {time:g}, wanted numbers',
                 MessageFault.ERRORS,
             )
         share, time = 1.0, 0.0

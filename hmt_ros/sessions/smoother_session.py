@@ -15,7 +15,7 @@ The rules, besides those of `Session`:
   smoothed mixture without components and markers that remove those before go out.
 - Errors of images last: an image counts with a share of its evidence, by the error model that its
   likelihood carries and the time since the image before (`error_model`). A likelihood without an
-  error model, as in bags of earlier versions, and a forecast, which is no evidence, are skipped.
+  error model, and a forecast, which is no evidence, are skipped.
 - The pose may be none of the modes of an image: each image has a wide component more
   (`or_missed`), and a motion passes over images that would turn it round and back.
 - The uncertainty of the person's shape is the same in all images. It is added once, to the

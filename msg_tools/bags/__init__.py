@@ -1,1 +1,1 @@
-"""Bags in and out: MCAP and SQLite files, metadata, recovery."""
+"""Bags in and out: MCAP and SQLite files, metadata, videos."""

@@ -17,11 +17,8 @@ last one. Chunks, data and summary have checksums. The same calls write the same
 from __future__ import annotations
 
 import os
-import re
-import secrets
-import shutil
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -38,12 +35,17 @@ from msg_tools.bags.bag_metadata import (
     quality_of_service,
     reason,
 )
+from msg_tools.files.new_folder import FolderKind
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.message_types import typestore
 
 LIBRARY = 'hmt_ros'
 CHUNK_BYTES = 2**20
-_PARTIAL = '.partial'
+_FOLDER = FolderKind('a bag', FILE_NAME, tuple(f'*{suffix}' for suffix in SUFFIXES))
+
+
+class _Dropped(Exception):
+    """Ends a folder that is not to come to its place."""
 
 
 @dataclass
@@ -73,19 +75,19 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self, path: str | os.PathLike[str], *, overwrite: bool = False, namespace: str = ''
     ) -> None:
         self.path = Path(path).absolute()
-        self._overwrite, self._namespace = overwrite, namespace
-        self._check_target()
+        if self.path.name in ('', '..'):
+            raise BagError(f'{self.path} is not the name of a folder')
+        self._namespace = namespace
         self._topics: dict[str, _Topic] = {}
         self._schemas: dict[str, int] = {}
         self._start: int | None = None
         self._end = 0
-        self._folder: Path | None = self.path.with_name(
-            f'.{self.path.name}.{secrets.token_hex(4)}{_PARTIAL}'
-        )
         self._file: BinaryIO | None = None
         self._handed_over = 0
+        self._place = ExitStack()
         with self._dropping_on_error():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            new = _FOLDER.new(self.path, overwrite=overwrite)
+            self._folder = self._place.enter_context(new)
             self._folder.mkdir()
             self._file = (self._folder / self._file_name).open('xb')
             self._writer = Writer(
@@ -179,7 +181,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         Raises:
             BagError: the disk is full, or the place is taken meanwhile; nothing is left behind.
         """
-        if self._folder is None or self._file is None:
+        if self._file is None or self._file.closed:
             return
         with self._dropping_on_error():
             information = self._information()
@@ -193,20 +195,17 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 file.flush()
                 os.fsync(file.fileno())
             _sync_folder(self._folder)
-            self._move_into_place(self._folder)
-        self._folder = None
+            self._place.close()
+            _sync_folder(self.path.parent)
 
     def abort(self) -> None:
         """Drops everything that was written."""
-        folder, self._folder = self._folder, None
-        if folder is None:
-            return
         if self._file is not None:
-            # Closing writes the buffer, and fails again on a full disk: nothing is to be
-            # saved.
+            # Closing writes the buffer, and fails again on a full disk: nothing is to be saved.
             with suppress(OSError):
                 self._file.close()
-        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(_Dropped), self._place:
+            raise _Dropped
 
     @property
     def _file_name(self) -> str:
@@ -215,49 +214,19 @@ class BagWriter(AbstractContextManager['BagWriter']):
     @contextmanager
     def _dropping_on_error(self) -> Iterator[None]:
         """Removes the unfinished bag when an exception passes, and turns OSError into BagError."""
-        if self._folder is None:
+        if self._file is not None and self._file.closed:
             raise BagError(f'{self.path} is closed')
         try:
             yield
         except OSError as error:
             self.abort()
             raise BagError(f'{self.path} can not be written: {reason(error)}') from error
+        except ValueError as error:
+            self.abort()
+            raise BagError(str(error)) from error
         except BaseException:
             self.abort()
             raise
-
-    def _check_target(self) -> None:
-        """The place must be free, or hold a bag that may be replaced."""
-        if self.path.name in ('', '..'):
-            raise BagError(f'{self.path} is not the name of a folder')
-        if not os.path.lexists(self.path):
-            return
-        if not self._overwrite:
-            raise BagError(f'{self.path} exists; give another name, or ask to overwrite it')
-        try:
-            names = sorted(path.name for path in self.path.iterdir())
-        except OSError as error:
-            raise BagError(f'{self.path} can not be replaced: {reason(error)}') from error
-        foreign = [name for name in names if name != FILE_NAME and not name.endswith(SUFFIXES)]
-        if self.path.is_symlink() or (names and FILE_NAME not in names) or foreign:
-            what = f'it has {foreign[0]}' if foreign else 'it is not the folder of a bag'
-            raise BagError(f'{self.path} is not replaced: {what}; give another name')
-
-    def _move_into_place(self, folder: Path) -> None:
-        self._check_target()
-        aside = folder.with_suffix('.replaced')
-        replaces = self.path.exists()
-        if replaces:
-            self.path.rename(aside)
-        try:
-            folder.rename(self.path)
-        except BaseException:
-            if replaces:
-                aside.rename(self.path)
-            raise
-        _sync_folder(self.path.parent)
-        if replaces:
-            shutil.rmtree(aside, ignore_errors=True)
 
     def _hand_over(self) -> None:
         """Hands the bytes of the library to the system, where they outlive the process."""
@@ -299,15 +268,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
             'custom_data': None,
             'ros_distro': 'jazzy',
         }
-
-
-def unfinished_folders(path: Path) -> list[Path]:
-    """Hidden folders of a bag whose writers were killed, or still write."""
-    path = path.absolute()
-    if not path.parent.is_dir():
-        return []
-    pattern = re.compile(rf'\.{re.escape(path.name)}\.[0-9a-f]{{8}}{re.escape(_PARTIAL)}')
-    return [folder for folder in sorted(path.parent.iterdir()) if pattern.fullmatch(folder.name)]
 
 
 def _sync_folder(folder: Path) -> None:

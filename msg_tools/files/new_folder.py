@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 
@@ -18,7 +20,7 @@ class FolderKind:
     Attributes:
         what: name of such a folder in messages: 'a bag'.
         marker: name of the file without which it is no such folder.
-        own: names of the other files that it may have.
+        own: patterns of the names of the other files that it may have.
     """
 
     what: str
@@ -36,7 +38,8 @@ class FolderKind:
         if not overwrite:
             raise ValueError(f'{target} exists; give another name, or --overwrite')
         names = sorted(path.name for path in target.iterdir()) if target.is_dir() else []
-        foreign = [name for name in names if name not in (self.marker, *self.own)]
+        own = (self.marker, *self.own)
+        foreign = [x for x in names if not any(fnmatchcase(x, pattern) for pattern in own)]
         if target.is_symlink() or self.marker not in names or foreign:
             why = f'it has {foreign[0]}' if foreign else f'it is not the folder of {self.what}'
             raise ValueError(f'{target} is not replaced: {why}; give another name')
@@ -75,3 +78,12 @@ class FolderKind:
             for folder in missing:
                 with suppress(OSError):  # the new folder is in it
                     folder.rmdir()
+
+
+def unfinished_folders(target: Path) -> list[Path]:
+    """Hidden folders in which a folder is made, or was when its process was killed."""
+    target = target.absolute()
+    if not target.parent.is_dir():
+        return []
+    pattern = re.compile(rf'\.{re.escape(target.name)}\.[a-z0-9_]{{8}}\.partial')
+    return [folder for folder in sorted(target.parent.iterdir()) if pattern.fullmatch(folder.name)]

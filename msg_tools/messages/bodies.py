@@ -56,8 +56,8 @@ def body_of(
 ) -> Body:
     """The person that a mixture is about: a body model at the lengths that the message carries.
 
-    A message without lengths (of another publisher, or in a bag older than the fields) is taken to
-    be about the model at its own lengths.
+    A message without lengths, of another publisher, is taken to be about the model at its own
+    lengths.
 
     Args:
         any_name: whether the message may call the model by another name.

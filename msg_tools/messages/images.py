@@ -10,14 +10,15 @@ nothing was measured; `32FC1` counts metres, NaN where nothing was measured.
 
 from __future__ import annotations
 
-import struct
-import zlib
+from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Pillow
 
+from msg_tools.files.error_line import error_line
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import MessageFactory
 
@@ -32,6 +33,7 @@ _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 # Where the header of a PNG says how many bits a channel has; the colour type follows, 0 is grey.
 _PNG_DEPTH = 24
 
+_JPEG_SCAN, _JPEG_END = b'\xff\xda', b'\xff\xd9'
 # A progressive JPEG has a dozen; each costs the decoder a pass over the whole picture.
 MAX_JPEG_SCANS = 100
 
@@ -209,10 +211,10 @@ def decode_picture(
             so many bytes can hold.
     """
     if content.startswith(b'\xff\xd8\xff'):
-        width, height = _jpeg_size(content)
+        width, height = _checked_size(content, 'jpeg')
         densest = _JPEG_PIXELS_PER_BYTE
     elif content.startswith(_PNG_SIGNATURE):
-        width, height = _png_size(content)
+        width, height = _checked_size(content, 'png')
         densest = _PNG_PIXELS_PER_BYTE
     else:
         raise ImageError(
@@ -254,50 +256,29 @@ def _bytes_of(data: Any) -> Picture:
         raise ImageError(f'image data is a {type(data).__name__}, wanted bytes') from error
 
 
-def _png_size(content: bytes) -> tuple[int, int]:
-    """Width and height of a file whose chunks are whole; OpenCV believes any length of a chunk."""
-    at = len(_PNG_SIGNATURE)
-    kind = b''
-    while kind != b'IEND':
-        length = int.from_bytes(content[at : at + 4], 'big')
-        kind = content[at + 4 : at + 8]
-        end = at + 12 + length
-        first = at == len(_PNG_SIGNATURE)
-        if end > len(content) or (first and (kind, length) != (b'IHDR', 13)):
-            raise ImageError(f'png of {len(content)} bytes breaks off or is damaged')
-        if zlib.crc32(content[at + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], 'big'):
-            raise ImageError(f'png of {len(content)} bytes is damaged: a checksum differs')
-        at = end
-    width, height = struct.unpack_from('>II', content, len(_PNG_SIGNATURE) + 8)
-    return int(width), int(height)
-
-
-# Start-of-frame markers; C4, C8 and CC between them are something else.
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-
-
-def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height of a file that has its end; a decoder would invent a missing part."""
-    size: tuple[int, int] | None = None
-    at = 2
-    while at + 4 <= len(content) and content[at] == 0xFF:
-        marker = content[at + 1]
-        if marker == 0xFF or 0xD0 <= marker <= 0xD7 or marker == 0x01:
-            at += 1 if marker == 0xFF else 2
-            continue
-        if marker in _JPEG_FRAMES and at + 9 <= len(content):
-            height, width = struct.unpack('>HH', content[at + 5 : at + 9])
-            size = width, height
-        if marker == 0xDA:
-            if size is None or content.find(b'\xff\xd9', at) < 0:
-                break
-            # Within a scan a byte ff is never followed by the number of a marker like this.
-            scans = content.count(b'\xff\xda', at)
-            if scans > MAX_JPEG_SCANS:
-                raise ImageError(f'jpeg has {scans} scans, the limit is {MAX_JPEG_SCANS}')
-            return size
-        at += 2 + int.from_bytes(content[at + 2 : at + 4], 'big')
-    raise ImageError(f'jpeg of {len(content)} bytes breaks off or is damaged')
+def _checked_size(content: bytes, form: str) -> tuple[int, int]:
+    """Width and height of a JPEG or PNG file that is whole; a decoder would invent what is not."""
+    what = f'{form} of {len(content)} bytes'
+    try:
+        with Pillow.open(BytesIO(content), formats=(form,)) as opened:
+            width, height = opened.size
+            if form == 'png':
+                _check_size(width, height)
+                opened.verify()
+    except ImageError:
+        raise
+    except Exception as error:
+        # The parser meets any bytes here, and does not say what it may raise.
+        why = error_line(error).partition(' <')[0]  # an address in memory tells nobody anything
+        raise ImageError(f'{what} breaks off or is damaged: {why}') from error
+    if form == 'jpeg':
+        # Within a scan a byte ff is never followed by the number of a marker like these.
+        scans = content.count(_JPEG_SCAN)
+        if scans > MAX_JPEG_SCANS:
+            raise ImageError(f'jpeg has {scans} scans, the limit is {MAX_JPEG_SCANS}')
+        if content.rfind(_JPEG_END) < content.rfind(_JPEG_SCAN):
+            raise ImageError(f'{what} breaks off or is damaged: its end is missing')
+    return width, height
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int = 90) -> bytes:

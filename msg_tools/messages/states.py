@@ -103,19 +103,13 @@ Array = NDArray[np.float64]
 def quaternions(rotations: ArrayLike) -> Array:
     """Unit quaternions (N, 4), x y z w with w >= 0, of rotation matrices (N, 3, 3)."""
     r = np.asarray(rotations, dtype=np.float64)
-    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    xx, yy, zz = np.diagonal(r, axis1=1, axis2=2).T
     # 4 q q^T for q = (x, y, z, w), linear in R; its longest row is the quaternion to full accuracy.
     outer = np.empty((len(r), 4, 4))
-    outer[:, 0, 0] = 1 + xx - yy - zz
-    outer[:, 1, 1] = 1 - xx + yy - zz
-    outer[:, 2, 2] = 1 - xx - yy + zz
-    outer[:, 3, 3] = 1 + xx + yy + zz
-    outer[:, 0, 1] = outer[:, 1, 0] = r[:, 0, 1] + r[:, 1, 0]
-    outer[:, 0, 2] = outer[:, 2, 0] = r[:, 0, 2] + r[:, 2, 0]
-    outer[:, 1, 2] = outer[:, 2, 1] = r[:, 1, 2] + r[:, 2, 1]
-    outer[:, 0, 3] = outer[:, 3, 0] = r[:, 2, 1] - r[:, 1, 2]
-    outer[:, 1, 3] = outer[:, 3, 1] = r[:, 0, 2] - r[:, 2, 0]
-    outer[:, 2, 3] = outer[:, 3, 2] = r[:, 1, 0] - r[:, 0, 1]
+    outer[:, :3, :3] = r + r.swapaxes(1, 2)
+    outer[:, 3, :3] = outer[:, :3, 3] = (r - r.swapaxes(1, 2))[:, (2, 0, 1), (1, 2, 0)]
+    squares = 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz
+    outer[:, range(4), range(4)] = np.stack(squares, axis=1)
     longest = np.argmax(np.diagonal(outer, axis1=1, axis2=2), axis=1)
     q = outer[np.arange(len(r)), longest]
     q = q / np.linalg.norm(q, axis=1, keepdims=True)

@@ -32,8 +32,8 @@ from hmt_ros.app.replay.options import ReplayOptions, parameters_of_bag
 from hmt_ros.inference.threads import limit_threads
 from msg_tools import BagError
 from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES
-from msg_tools.bags.bag_writer import unfinished_folders
 from msg_tools.files.error_line import error_line
+from msg_tools.files.new_folder import unfinished_folders
 
 # Options that change the new bag, besides the parameters.
 _DECIDING = (

@@ -108,7 +108,7 @@ def film_strip(
     allowed: int,
     *,
     keep: Collection[int] = (),
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int], object] = lambda count: None,
 ) -> FilmStrip:
     """The images at some stamps.
 
@@ -131,8 +131,7 @@ def film_strip(
     level, left = 0, allowed
     with BagReader(source.bag) as bag:
         for stored in with_pictures(bag.messages([source.topic]), source.topic):
-            if progress is not None:
-                progress(1)
+            progress(1)
             message = stored.message
             stamp = time_ns(message.header.stamp)
             if stamp not in wanted and stored.log_time_ns in wanted:

@@ -256,7 +256,7 @@ def read_mixtures(
     topics: Sequence[str] = (),
     body_model: str | None = None,
     grounds: Mapping[int, GroundState] | None = None,
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int], object] = lambda count: None,
 ) -> RecordedMixtures:
     """The mixtures in a bag; of several on one topic with the same stamp, the first.
 
@@ -284,8 +284,7 @@ def read_mixtures(
                 _take(found, stored, bodies, grounds or {})
                 if stored.msgtype == POSE_MIXTURE:
                     answered.setdefault(time_ns(stored.message.header.stamp), '')
-            if progress is not None:
-                progress(1)
+            progress(1)
     for name, layer in found.items():
         found[name] = replace(layer, mixtures=dict(sorted(layer.mixtures.items())))
     layers = [found[name] for name in names if name in found]

@@ -330,12 +330,12 @@ def test_defects_of_compressed_images() -> None:
         (compressed(b''), r"of format 'jpeg' starts with b'', wanted jpeg or png"),
         (compressed(b'\x00\x00\x00\x01h264', 'h264'), r"of format 'h264' starts with"),
         (compressed(png, '16UC1; compressedDepth png'), r'depth, wanted a picture'),
-        (compressed(huge), r'image has size 65535x65535, the limit is'),
+        (compressed(huge), r'is damaged: Image size .* exceeds limit'),
         (compressed(large), rf'of {len(large)} bytes can not have a size of 4096x4096'),
-        (compressed(with_size(png, 2**30, 2**30), 'png'), r'the limit is'),
-        (compressed(with_size(png, 0, 0), 'png'), r'image has size 0x0'),
+        (compressed(with_size(png, 8192, 8200), 'png'), r'8192x8200, the limit is'),
+        (compressed(with_size(png, 0, 0), 'png'), r'is damaged: cannot identify image file$'),
         (compressed(with_size(png, 8000, 8000), 'png'), r'can not have a size of 8000x8000'),
-        (compressed(png[:40] + b'?' + png[41:], 'png'), r'is damaged: a checksum differs'),
+        (compressed(png[:40] + b'?' + png[41:], 'png'), r'breaks off or is damaged: '),
         (compressed(png[:33] + b'\x7f' + png[34:], 'png'), r'breaks off or is damaged'),
     ):
         with pytest.raises(ImageError, match=error):
