@@ -55,8 +55,9 @@ def replayed(folder: Path, *, quick: bool = False) -> list[dict[str, Any]]:
     }
     if quick:
         ways = {'filter': ways['filter']}
-    # Kernels are compiled.
-    _run(source, folder / 'first', [*ways.values()][-1])
+    else:
+        # Kernels are compiled.
+        _run(source, folder / 'first', ways['filter, smoother and BME'])
     found = []
     for number, (what, options) in enumerate(ways.items()):
         clock = StageClock(ESTIMATORS)

@@ -192,8 +192,8 @@ def measure(
     Raises:
         ValueError: there are none, or one can not be read.
     """
-    folders, source = find_clips(clips, moving=True)
-    if clips is None:
+    folders, source = find_clips(clips, moving=True, quick=quick)
+    if clips is None and not quick:
         folders += [x for x in find_clips(Path('bags'))[0] if x not in folders]
     folders = [x for x in folders if 'pelvis' in read_clip(x, 1).truth.joint_names]
     if quick:

@@ -114,19 +114,24 @@ def index_back_and_forth(number: int, count: int) -> int:
     return min(number % turn, turn - number % turn)
 
 
-def find_clips(folder: Path | None, *, moving: bool = False) -> tuple[list[Path], str]:
+def find_clips(
+    folder: Path | None, *, moving: bool = False, quick: bool = False
+) -> tuple[list[Path], str]:
     """Folders of clips with truth, and where they come from.
 
     Args:
         folder: that holds the clips; None: the development data, and where that is absent the
             bags of this repository.
         moving: whether those are wanted too that have no image of the empty scene.
+        quick: whether, without a folder, one short clip of this repository is enough.
 
     Raises:
         ValueError: there are none.
     """
     if folder is not None:
         return _clips_in(folder, moving), str(folder)
+    if quick:
+        return [ROOT / 'bags' / 'reach'], 'bags/reach'
     shared = development_folder()
     if shared.is_dir():
         return _clips_in(shared, moving), 'development clips'

@@ -264,7 +264,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
     Args:
         clips: folder of the clips; None: the development clips.
-        quick: a few images of two clips, and one step of the fit.
+        quick: a few images of one clip, and one step of the fit.
 
     Raises:
         FileNotFoundError: a clip is not there.
@@ -349,7 +349,7 @@ def signed_distance(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
 def main(argv: list[str]) -> int:
     """Runs the benchmark; without the clips it tells so and does nothing."""
     parser = benchmark_parser(
-        'contour_noise', __doc__, quick='a few images of two clips, and one step of the fit'
+        'contour_noise', __doc__, quick='a few images of one clip, and one step of the fit'
     )
     parser.add_argument('--clips', type=Path, metavar='DIR', help='folder of the clips')
     options = parser.parse_args(argv)

@@ -40,7 +40,7 @@ COLUMNS = (
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = benchmark_parser('experts', __doc__, quick=f'{QUICK} images of two clips')
+    parser = benchmark_parser('experts', __doc__, quick=f'{QUICK} images of one clip')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     options = parser.parse_args(argv)
     return run_benchmark(
@@ -57,8 +57,8 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     Raises:
         ValueError: there are no clips, or one can not be read.
     """
-    folders, _ = find_clips(clips, moving=True)
-    work = [(folder, QUICK if quick else None) for folder in (folders[:2] if quick else folders)]
+    folders, _ = find_clips(clips, moving=True, quick=quick)
+    work = [(folder, QUICK if quick else None) for folder in folders]
     found = in_processes(of_clip, work, 1 if quick else 0, 'experts')
     by_clip = {folder.name: one for (folder, _), one in zip(work, found, strict=True) if one}
     means: dict[str, Any] = {}

@@ -66,14 +66,13 @@ def of_clip(work: Work) -> dict[str, dict[str, float]]:
             }
             for way, (at, mixture) in made.items():
                 scorers[f'{way} {ahead:g}'].take(_estimate(at, mixture, tracker.body))
-    scores = {}
-    for name, scorer in scorers.items():
-        summary = scorer.finish().scores.summary()
-        scores[name] = {
-            'mm': float(summary['heaviest_mm']),
-            'region': float(summary['joint_coverage_90']),
-        }
-    return scores
+    found = {name: scorer.finish().scores.summary() for name, scorer in scorers.items()}
+    # None: the truth has no such time.
+    scores = {
+        name: [np.nan if one[x] is None else one[x] for x in ('heaviest_mm', 'joint_coverage_90')]
+        for name, one in found.items()
+    }
+    return {name: dict(zip(('mm', 'region'), one, strict=True)) for name, one in scores.items()}
 
 
 def _estimate(stamp: int, mixture: GaussianMixture, body: Body) -> Estimate:
@@ -88,8 +87,10 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     Raises:
         ValueError: there are none, or one can not be read.
     """
-    folders = find_clips(clips, moving=False)[0]
-    folders = [x for x in folders if clips is not None or (x / 'keypoints_mediapipe.npz').exists()]
+    folders = find_clips(clips, quick=quick)[0]
+    folders = [
+        x for x in folders if quick or clips is not None or (x / 'keypoints_mediapipe.npz').exists()
+    ]
     inputs, limit = (IMAGES, BOTH), None
     if quick:
         folders, inputs, limit = folders[:1], (IMAGES,), QUICK + 6

@@ -23,7 +23,7 @@ from benchmarks.tracking_speed import PRICED, costs
 TABLE = Path(__file__).with_name('gate.json')
 # What is above the table by this factor is too much.
 MARGIN = 1.15
-RUNS, QUICK = 2, 20
+RUNS, QUICK = 2, 12
 
 
 def floors_of(
@@ -38,7 +38,7 @@ def floors_of(
     Raises:
         ValueError: no clip has a background.
     """
-    folders, source = find_clips(clips)
+    folders, source = find_clips(clips, quick=quick)
     priced = [x for x in folders if x.name in PRICED] or folders
     priced = [folder for folder in priced if (folder / 'background.png').is_file()]
     if not priced:
@@ -131,7 +131,7 @@ def read_table(path: Path) -> dict[str, Any]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; 1: a step costs too much, or nothing can be compared."""
-    parser = benchmark_parser('gate', __doc__, quick=f'one run over {QUICK} images a clip')
+    parser = benchmark_parser('gate', __doc__, quick=f'one run over {QUICK} images of one clip')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     parser.add_argument('--write', action='store_true', help='write the table')
     options = parser.parse_args(arguments)

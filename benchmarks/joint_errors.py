@@ -190,7 +190,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
 def main(arguments: list[str]) -> int:
     """Runs the command; returns its exit code."""
-    parser = benchmark_parser('joint_errors', __doc__, quick='a few images of two clips')
+    parser = benchmark_parser('joint_errors', __doc__, quick='a few images of one clip')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     options = parser.parse_args(arguments)
     return run_benchmark(

@@ -82,8 +82,10 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     Raises:
         ValueError: there are none, or one can not be read.
     """
-    folders = find_clips(clips, moving=True)[0]
-    folders = [x for x in folders if clips is not None or (x / 'keypoints_mediapipe.npz').exists()]
+    folders = find_clips(clips, moving=True, quick=quick)[0]
+    folders = [
+        x for x in folders if quick or clips is not None or (x / 'keypoints_mediapipe.npz').exists()
+    ]
     inputs, rates, limit = (IMAGES, BOTH), RATES, None
     if quick:
         folders, inputs, rates, limit = folders[:1], (IMAGES,), RATES[:1], QUICK

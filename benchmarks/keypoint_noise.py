@@ -300,7 +300,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
     Args:
         clips: folder of the clips; None: the development clips.
-        quick: a few images of two clips.
+        quick: a few images of one clip.
 
     Raises:
         FileNotFoundError: a clip is not there.
@@ -347,7 +347,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 def main(arguments: list[str]) -> int:
     """Runs the command; returns its exit code."""
-    parser = benchmark_parser('keypoint_noise', __doc__, quick='a few images of two clips')
+    parser = benchmark_parser('keypoint_noise', __doc__, quick='a few images of one clip')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     options = parser.parse_args(arguments)
     return run_benchmark(

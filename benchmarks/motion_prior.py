@@ -98,9 +98,9 @@ def measure(folder: Path | None = None, *, quick: bool = False) -> dict[str, Any
     folder = folder or SHARED / 'mocap' / 'dev'
     body: Body = load_body('human37')
     motions = []
-    for path in motion_files(folder)[: 2 if quick else None]:
+    for path in motion_files(folder)[: 1 if quick else None]:
         poses = recorded_sequence(path, body).poses
-        motions.append(poses[: CUT.get(path.stem)])
+        motions.append(poses[: 60 if quick else CUT.get(path.stem)])
     learned = motion_prior(body)
     models: dict[str, Callable[[Array, float], Surprises]] = {
         'random walk': walking(body.rates, 0.0),
@@ -133,7 +133,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = True) -> str:
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark; 1: there are no motions."""
-    parser = benchmark_parser('motion_prior', __doc__, quick='two motions')
+    parser = benchmark_parser('motion_prior', __doc__, quick='a few poses of one motion')
     parser.add_argument('--mocap', type=Path, help='folder of motions (the development motions)')
     options = parser.parse_args(argv)
     return run_benchmark(

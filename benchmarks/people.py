@@ -30,8 +30,9 @@ from hmt_ros.sessions.person_session import BODIES
 from msg_tools import BagReader
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
-SEEDS, QUICK = 10, 1
+SEEDS = 10
 DURATION, FPS, SIZE = 3.0, 10.0, '320x240'
+QUICK_DURATION = 1.0
 # Shares of the time, before and after the crossing, in which people are compared with their tracks.
 BEFORE, AFTER = 0.33, 0.75
 
@@ -41,28 +42,30 @@ Joints = dict[int, Array]
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the benchmark."""
-    parser = benchmark_parser('people', __doc__, quick='one seed')
+    parser = benchmark_parser('people', __doc__, quick=f'one seed, {QUICK_DURATION:g} s')
     parser.add_argument('--seeds', type=int, default=SEEDS, help=f'number of seeds ({SEEDS})')
     parser.add_argument('--keep', type=Path, help='folder in which the bags stay')
     arguments = parser.parse_args(argv)
-    seeds = QUICK if arguments.quick else arguments.seeds
-    return show(measure(seeds, arguments.keep), as_text, as_json=arguments.json)
+    amount = (1, QUICK_DURATION) if arguments.quick else (arguments.seeds, DURATION)
+    return show(measure(*amount, arguments.keep), as_text, as_json=arguments.json)
 
 
-def measure(seeds: int = SEEDS, keep: Path | None = None) -> dict[str, Any]:
+def measure(
+    seeds: int = SEEDS, duration: float = DURATION, keep: Path | None = None
+) -> dict[str, Any]:
     """Scores of the crossings of some seeds; the bags stay in a folder, if one is given."""
     with tempfile.TemporaryDirectory() as folder:
         place = keep or Path(folder)
-        rows = [one_crossing(seed, place) for seed in told('people', range(seeds))]
+        rows = [one_crossing(seed, place, duration) for seed in told('people', range(seeds))]
     return {'machine': description(), 'crossings': rows}
 
 
-def one_crossing(seed: int, folder: Path) -> dict[str, Any]:
+def one_crossing(seed: int, folder: Path, duration: float) -> dict[str, Any]:
     """Scores of one seed."""
     made, tracked = folder / f'crossing{seed}', folder / f'tracked{seed}'
     make_bag(
         ['crossing', '-o', str(made), '--seed', str(seed), '--size', SIZE, '--fps', str(FPS),
-         '--duration', str(DURATION), '--overwrite', '--quiet']
+         '--duration', str(duration), '--overwrite', '--quiet']
     )  # fmt: skip
     options = ReplayOptions(
         overwrite=True, quiet=True, people=True, background=made / 'background.png',

@@ -126,7 +126,7 @@ def measure(
     Raises:
         ValueError: there are no such clips, or one can not be read.
     """
-    folders, source = find_clips(clips, moving=True)
+    folders, source = find_clips(clips, moving=True, quick=quick)
     if names:
         folders = [x for x in folders if x.name in names]
     if not folders:

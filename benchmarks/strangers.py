@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import io
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -101,11 +102,11 @@ def heaviest_of(bag: Path, clip: Path, *, turned: bool = False) -> float:
     return float(scores.summary()['heaviest_mm'])
 
 
-def plain_of(cases: Path, folder: Path) -> dict[int, float]:
+def plain_of(chosen: Sequence[Case], cases: Path, folder: Path) -> dict[int, float]:
     """Errors of the plain commands on the clip, mm, by their number of images."""
     clip, found = cases.parent / 'video' / CLIP, {}
     keypoints = dict(np.load(clip / 'keypoints_mediapipe.npz'))
-    for images in sorted({case.images for case in CASES if case.images and case.program is lift}):
+    for images in sorted({case.images for case in chosen if case.images and case.program is lift}):
         made = folder / f'plain_{images}'
         made.mkdir()
         rows = {
@@ -132,7 +133,7 @@ def measure(*, quick: bool = False) -> dict[str, Any]:
         chosen = CASES[:1] if quick else CASES
         for i, case in enumerate(told('strangers', chosen, lambda x: x.name)):
             rows.append(run_case(case, cases, Path(made) / str(i)))
-        plain = plain_of(cases, Path(made))
+        plain = plain_of(chosen, cases, Path(made))
     return {'machine': description(), 'rows': rows, 'plain_mm': plain}
 
 

@@ -52,12 +52,12 @@ PARTS = ('accuracy', 'speed')
 SEEDS = (0, 1, 2)
 RATES = (USUAL_RATE,)
 TIMED = 'walk'  # if it is there
-QUICK = 20  # images a clip
+QUICK = 10  # images
 
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark; 1: there is nothing to run it on, or no such setting."""
-    parser = benchmark_parser('tracking', __doc__, quick=f'{QUICK} images a clip, one seed')
+    parser = benchmark_parser('tracking', __doc__, quick=f'{QUICK} images of one clip, one seed')
     parser.add_argument('--markdown', action='store_true', help='tables for a Markdown page')
     parser.add_argument(
         '--clips', type=Path, metavar='DIR', help='their folder (the development clips, or bags/)'
@@ -149,7 +149,7 @@ def measure(
         parts: some of `PARTS`.
         against: changed settings that the tracker is compared with; empty: no comparison.
         processes: number of processes; 0: one a core.
-        quick: 20 images a clip, one seed.
+        quick: a few images of one clip, one seed.
         start: what tracks start from, one of `runs.STARTS`; with images alone always the subject.
         rates: images a second at most; `USUAL_RATE` or more: all images.
         baseline: folder of the records of another checkout; None: no comparison.
@@ -158,8 +158,10 @@ def measure(
     Raises:
         ValueError: there is no such clip, or it can not be read.
     """
-    folders, source = find_clips(clips, moving=True)
-    limit, seeds = (QUICK, seeds[:1]) if quick else (None, seeds)
+    folders, source = find_clips(clips, moving=True, quick=quick)
+    limit = None
+    if quick:
+        limit, seeds, processes = QUICK, seeds[:1], 1
     if only:
         folders = [folder for folder in folders if folder.name in only]
     if not folders:

@@ -26,9 +26,9 @@ from hmt_ros.tracking.initialisation import start_from_keypoints
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Clips that the fits learn from, and how many with --quick.
+# Clips that the fits learn from, and how many, and images of each, with --quick.
 CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'follow')
-QUICK, QUICK_IMAGES = 2, 24
+QUICK, QUICK_IMAGES = 1, 24
 # Poses from which the best pose of the body is fitted.
 STARTS = 8
 SHOULDERS = ('left_shoulder', 'right_shoulder')

@@ -21,7 +21,6 @@ from benchmarks.tracking_speed import opencv_work
 from hmt_ros.image.vertical_lines import seen_vertical, straight_lines
 
 RATE = 1.0  # images a second
-QUICK = 3
 REPEATS = 3
 
 
@@ -72,7 +71,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     Raises:
         ValueError: one can not be read.
     """
-    folders = find_clips(clips, moving=True)[0][: QUICK if quick else None]
+    folders = find_clips(clips, moving=True, quick=quick)[0]
     found = [one for x in told('vertical', folders, lambda x: x.name) if (one := measured(x))]
     return {'machine': description(), 'clips': found}
 
@@ -121,7 +120,7 @@ def _all(clips: list[dict[str, Any]]) -> dict[str, Any]:
 
 def main(arguments: list[str]) -> int:
     """Runs the command; returns its exit code."""
-    parser = benchmark_parser('vertical', __doc__, quick=f'only {QUICK} clips')
+    parser = benchmark_parser('vertical', __doc__, quick='one clip')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     options = parser.parse_args(arguments)
     return run_benchmark(

@@ -47,7 +47,6 @@ LONGEST = (
     'image/test_scene_watch.py',
     'nodes/test_filter_node.py',
     'app/replay/test_transforms.py',
-    'nodes/test_robustness.py',
     'nodes/test_usage.py',
 )
 

@@ -19,7 +19,7 @@ from benchmarks.soak.outcome import MOST_GROWTH, Amount, Outcome
 MINUTES = 10.0
 
 # Each case: what does it, how often in full and with --quick, and its share of the time.
-CASES: dict[str, tuple[Callable[[Amount], Iterator[Outcome]], int, int, float]] = {
+CASES: dict[str, tuple[Callable[..., Iterator[Outcome]], int, int, float]] = {
     'messages': (messages, 100_000, 60, 0.45),
     'nodes': (nodes, 200, 2, 0.35),
     'files': (files, 3000, 30, 0.20),
@@ -28,7 +28,7 @@ CASES: dict[str, tuple[Callable[[Amount], Iterator[Outcome]], int, int, float]] 
 
 def main(argv: list[str]) -> int:
     """Runs the soak; 1 where something was lost or went wrong."""
-    parser = benchmark_parser('soak', __doc__, quick='each case a few times')
+    parser = benchmark_parser('soak', __doc__, quick='each case a few times, with one node')
     add_choice(parser, tuple(CASES), 'CASE')
     parser.add_argument(
         '--minutes', type=float, default=MINUTES, metavar='M',
@@ -50,7 +50,7 @@ def measure(
         case, often, seldom, share = CASES[name]
         amount = Amount(seldom if quick else often, 60.0 * minutes * share / shares)
         found = []
-        for outcome in case(amount):
+        for outcome in case(amount, quick=quick):
             found.append(_entry(outcome))
             tqdm.write(f'  {outcome.of}: {outcome.done}: {outcome.told()}', file=sys.stderr)
         return found
