@@ -92,8 +92,8 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
         """
 
     def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
-        session, thread = self._session, self._thread
-        if session is None or thread is None:
+        session, estimator = self._session, self._estimator
+        if session is None or estimator is None:
             response.success, response.message = False, 'the node is not active'
             return response
         try:
@@ -102,7 +102,7 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
             response.success, response.message = False, error_line(error)
             self.get_logger().warn(f'~/reset is refused: {response.message}')
             return response
-        thread.restart(lambda: session.restart(start))
+        estimator.restart(lambda: session.restart(start))
         response.success = True
         self.get_logger().info(f'~/reset: {response.message}')
         return response

@@ -56,7 +56,6 @@ from hmt_ros.tracking import PosePrediction, Status, Tracker
 from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
-from msg_tools.messages.cdr import serialise
 from msg_tools.messages.keep_out import KeepOutState
 from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_of
 
@@ -391,7 +390,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             if answered != self.answered:
                 return []
             made = robot_messages(self.robot, self.parameters, self._wanted, silence)
-            return [Output(topic, stamp, serialise(message)) for topic, stamp, message in made]
+            return [Output(topic, stamp, message) for topic, stamp, message in made]
 
     def _publish_nobody(self, tracker: Tracker, waiting: WaitingImage) -> None:
         """The end of a track whose person is no longer in view."""

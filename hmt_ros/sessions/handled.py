@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 from msg_tools import MessageFactory
 from msg_tools.files.error_line import one_line
+from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_message, time_ns
 from msg_tools.messages.message_error import MessageFault
 
@@ -65,18 +68,28 @@ class Fault(Enum):
     OTHER_CAMERA = 'other camera'
 
 
-class Output(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Output:
     """A message that is to be published.
 
     Attributes:
         topic: one of those that the node publishes.
         stamp_ns: of the image that it is about.
-        data: CDR bytes.
+        message: for whoever takes it as it is, and does not change it.
     """
 
     topic: str
     stamp_ns: int
-    data: bytes
+    message: Any
+
+    @cached_property
+    def data(self) -> bytes:
+        """CDR bytes."""
+        return serialise(self.message)
+
+    def __iter__(self) -> Iterator[Any]:
+        """Topic, stamp and bytes."""
+        return iter((self.topic, self.stamp_ns, self.data))
 
 
 @dataclass(frozen=True)

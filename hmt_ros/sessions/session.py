@@ -24,7 +24,6 @@ from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.declared_parameters import NodeParameters
 from hmt_ros.sessions.handled import Fault, Handled, HandlingLog, Output
 from msg_tools import RosbagsMessages
-from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image
 
@@ -328,7 +327,7 @@ class Session(ABC, Generic[Parameters, State]):
     def _publish(self, topic: str, stamp: int, message: Any) -> None:
         began = time.perf_counter()
         self._log.published(topic, stamp)
-        self._publish_output(Output(topic, stamp, serialise(message)))
+        self._publish_output(Output(topic, stamp, message))
         self.publishing += time.perf_counter() - began
 
 

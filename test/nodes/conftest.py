@@ -106,13 +106,21 @@ class World:
         return self.node._session
 
     @property
-    def thread(self):
-        """The thread that estimates."""
-        return self.node._thread
+    def estimator(self):
+        """What gives the session its messages; None while the node is not active."""
+        return self.node._estimator
+
+    def receive(self, source, data):
+        """Hands bytes to the node, as the middleware does."""
+        from hmt_ros.nodes.estimating_thread import received
+
+        wanted = {one.source: (name, one) for name, one in self.node._heard.items()}
+        name, one = wanted[source]
+        self.node._hand_on(name, received(data, one))
 
     def limit(self, source):
         """How many messages of a source may wait."""
-        return self.thread.queue._limits[source]
+        return self.estimator.queue._limits[source]
 
     def own_periods(self):
         """Stops the clock of the diagnostics; returns what ends a period."""

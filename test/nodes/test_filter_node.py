@@ -218,7 +218,7 @@ def test_bytes_that_are_no_message(running, small_camera):
     running.send('camera_info', small_camera.info())
     data = serialise(small_camera.image(0))
     count = len(running.handled)
-    running.thread.put('image', data[:60], time.monotonic())
+    running.receive('image', data[:60])
     running.spin_until(lambda: len(running.handled) > count)
     assert faults(running.handled[-1])[0].startswith('message of image can not be read: ')
     assert faults(running.send('image', small_camera.image(1))) == []
@@ -306,9 +306,9 @@ def test_reset_counts_though_the_node_is_deactivated(world, small_camera, held_e
     answers = [one.call(Reset, 'reset') for _ in range(3)]
     assert all(answer.success for answer in answers)
     # Several wait as one, the last.
-    assert len(one.thread.queue) == 1
+    assert len(one.estimator.queue) == 1
     one.publishers['image'].publish(serialise(small_camera.image(1)))
-    one.spin_until(lambda: len(one.thread.queue) == 2)
+    one.spin_until(lambda: len(one.estimator.queue) == 2)
     threading.Timer(0.3, go.set).start()
     assert one.change_state('deactivate')
     assert session.start is not before
@@ -363,7 +363,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     one = world(queue_size=2).start()
     end_period = one.own_periods()
     one.send('camera_info', small_camera.info())
-    queue = one.thread.queue
+    queue = one.estimator.queue
 
     def waiting_and_dropped():
         return len(queue), queue._dropped
@@ -412,7 +412,7 @@ def test_late_node_goes_on_with_the_newest_complete_image(
     begun, go = held_estimate
     one = world(use_keypoints=True).start()
     one.send('camera_info', small_camera.info())
-    queue = one.thread.queue
+    queue = one.estimator.queue
     sent = 0
 
     def publish(source, index):

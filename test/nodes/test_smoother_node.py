@@ -187,11 +187,10 @@ def test_lifecycle(world, likelihoods):
 
 def test_queue_holds_what_was_published(running, likelihoods):
     """Mixtures that come while one is smoothed wait."""
-    thread = running.thread
     data = serialise(likelihoods.message(0))
     count = len(running.handled)
-    thread.put('likelihood_mixture', data[:60], 0.0)
-    thread.put('likelihood_mixture', data, 0.0)
+    running.receive('likelihood_mixture', data[:60])
+    running.receive('likelihood_mixture', data)
     running.spin_until(lambda: len(running.handled) == count + 2)
     first, second = running.handled[-2:]
     assert 'message of likelihood_mixture can not be read' in first.faults[0]

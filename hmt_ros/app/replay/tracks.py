@@ -29,7 +29,6 @@ from hmt_ros.sessions.people_session import PeopleSession, published_topic
 from hmt_ros.sessions.session import FINISH
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
-from msg_tools.messages.cdr import deserialise
 
 PERSON = 'person_node'
 # Topics of the filter that the smoother takes, as sources of the same names.
@@ -93,20 +92,19 @@ class OfflineTrack(PlayedTrack):
     def _hand_to_filter(self, result: Handled) -> Handled:
         """Hands the predictions to the filter."""
         predicted, self._predicted = self._predicted, []
-        for topic, _, data in predicted:
-            read = deserialise(data, bme_session.TOPICS[topic].msgtype)
-            result = _together(result, self._filter.take(PREDICTION, read))
+        for output in predicted:
+            result = _together(result, self._filter.take(PREDICTION, output.message))
         return result
 
     def _hand_on(self, result: Handled) -> Handled:
         """Hands the messages of the filter to smoother and BME."""
         handed, self._handed = self._handed, []
-        for topic, _, data in handed:
-            read = deserialise(data, track_messages.TOPICS[topic].msgtype)
+        for output in handed:
+            topic, message = output.topic, output.message
             if self._smoother is not None and topic in HANDED_ON:
-                result = _together(result, self._smoother.take(topic, read))
+                result = _together(result, self._smoother.take(topic, message))
             if self._bme is not None and topic in self._heard:
-                result = _together(result, self._bme.take(topic, read))
+                result = _together(result, self._bme.take(topic, message))
         return result
 
     def _predict(self, output: Output) -> None:
