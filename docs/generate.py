@@ -24,7 +24,6 @@ NODES = (
     'bme_node',
     'keypoints_node',
     'hri_node',
-    'people_adapter_node',
     'people_node',
 )
 # When a new value of a parameter takes effect: mark of the parameter, and what the mark says.
@@ -95,7 +94,6 @@ def settings_of(node: str) -> Any:
     from hmt_ros.sessions.filter_parameters import FilterParameters
     from hmt_ros.sessions.hri_parameters import HriParameters
     from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-    from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
     from hmt_ros.sessions.people_parameters import PeopleParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
 
@@ -105,7 +103,6 @@ def settings_of(node: str) -> Any:
         'bme_node': BmeParameters,
         'keypoints_node': KeypointsParameters,
         'hri_node': HriParameters,
-        'people_adapter_node': PeopleAdapterParameters,
         'people_node': PeopleParameters,
     }
     return kinds[node]()

@@ -32,7 +32,7 @@ from msg_tools.messages.ground import GROUND, GroundState, ground_message
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.keep_out import KEEP_OUT, keep_out_markers, keep_out_message
 from msg_tools.messages.markers import ground_markers, removed_ground, skeleton_markers
-from msg_tools.messages.people import PERSON_POSE, person_pose, person_pose_message
+from msg_tools.messages.person_poses import PERSON_POSE, person_pose, person_pose_message
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
