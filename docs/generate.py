@@ -91,11 +91,10 @@ def results(name: str) -> str:
 def settings_of(node: str) -> Any:
     """The parameters of a node with their defaults."""
     from hmt_ros.sessions.bme_parameters import BmeParameters
-    from hmt_ros.sessions.filter_parameters import FilterParameters
     from hmt_ros.sessions.hri_parameters import HriParameters
     from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-    from hmt_ros.sessions.people_parameters import PeopleParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
+    from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 
     kinds = {
         'filter_node': FilterParameters,

@@ -18,7 +18,7 @@ THERE = 0.5  # m
 
 
 def people(mixture: Any, message: Any, person: Any) -> Any:
-    """The people_msgs/People of an hmt_msgs/PoseMixture, made with its classes People and Person."""
+    """The people_msgs/People of an hmt_msgs/PoseMixture, with its classes People, Person."""
     result = message(header=mixture.header)
     if mixture.state == mixture.STATE_TRACKING:
         pelvis, best = mixture.joint_names.index('pelvis'), mixture.components[0]

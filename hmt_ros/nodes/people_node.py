@@ -16,10 +16,10 @@ from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.subscribed_topic import published_with
 from hmt_ros.nodes.tracking_node import TrackingNode
 from hmt_ros.sessions.handled import Output
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession, published_topic
-from hmt_ros.sessions.person_session import person_of
+from hmt_ros.sessions.track import person_of
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
 
 # Periods of the diagnostics after which the topics of somebody who has left are closed: the last
 # messages are still on their way.

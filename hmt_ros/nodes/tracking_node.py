@@ -23,12 +23,12 @@ from hmt_ros.nodes.subscribed_topic import (
     input_topics,
     types_of_others,
 )
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.track_start import TrackStart
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.files.error_line import error_line
 
-AnySession = TypeVar('AnySession', bound=TrackingSession[Any, Any])
+AnySession = TypeVar('AnySession', bound=TrackingSession)
 Parameters = TypeVar('Parameters', bound=FilterParameters)
 
 # Period of the watchdog, s.

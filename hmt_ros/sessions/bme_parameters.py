@@ -16,7 +16,7 @@ from hmt_ros.sessions.declared_parameters import (
     nested_parameters,
     parameter_field,
 )
-from hmt_ros.sessions.filter_parameters import BACKGROUND
+from hmt_ros.sessions.tracking_parameters import BACKGROUND
 
 # Cues that a prediction is made from.
 FROM_SILHOUETTES, FROM_KEYPOINTS, FROM_BOTH = 'silhouettes', 'keypoints', 'both'

@@ -179,6 +179,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._cue = p.predict_from
         self._keypoints = KeypointReader(p.source, self._log)
         self._by_keypoints: KeypointPredictor | None = None
+        self._weights = np.empty(0)
         self.state = self._present_state()
 
     def prepare(self) -> None:
@@ -193,11 +194,14 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         for mask in shown.masks[:2]:
             previous = self._seen(mask, shown.camera, previous).mixture
 
-    def _forget(self) -> None:
+    def restart(self) -> None:
+        """See `Session`."""
         # The known background is kept.
         self._previous = None
         self._looked = self._tracked = None
         self._by_keypoints = None
+        self._weights = np.empty(0)
+        super().restart()
 
     @classmethod
     def inputs_of(cls, parameters: BmeParameters) -> tuple[ImageInput, ...]:
@@ -216,9 +220,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         own = NeededInput(tuple(self.rows[0].types))
         return [own, *(x for x in needed if x.sources == (CAMERA_INFO,))]
 
-    def _forget_inputs(self, stamp: int) -> None:
-        super()._forget_inputs(stamp)
+    def _jump_back(self, stamp: int) -> None:
         self._keypoints.forget()
+        super()._jump_back(stamp)
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name != KEYPOINTS:
@@ -245,8 +249,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if order is Order.SKIPPED:
             return
         if order is Order.JUMP:
-            self._forget_inputs(stamp)
-            self._start_anew()
+            self._jump_back(stamp)
         camera = self._camera
         if camera is None:
             self._log.skip(
@@ -483,7 +486,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     def _present_state(self) -> BmeState:
         return BmeState(
             *self._status_and_wants(),
-            **self._totals(),
+            **self._totals(self._weights),
             modes=len(self._weights),
             height=self._height,
             support=self._support,

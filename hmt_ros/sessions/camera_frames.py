@@ -54,7 +54,9 @@ class CameraFrames:
         pose: of the camera in `fixed_frame` at the image that was looked up last; None: unknown.
     """
 
-    def __init__(self, gravity_frame: str, fixed_frame: str, *, floor: bool) -> None:
+    def __init__(
+        self, gravity_frame: str = '', fixed_frame: str = '', *, floor: bool = False
+    ) -> None:
         self.gravity_frame = gravity_frame
         self.fixed_frame = fixed_frame
         self.gravity: SeenGravity | None = None

@@ -194,12 +194,14 @@ class HriSession(Session[HriParameters, HriState]):
             self._tell_tracked(self._now)
         return self._now
 
-    def _forget(self) -> None:
+    def restart(self) -> None:
+        """See `Session`."""
         # The numbers of their bodies are not given again.
         for person in self._people.values():
             person.end()
             person.newest = None
         self._images.clear()
+        super().restart()
 
     # Inputs.
 

@@ -143,6 +143,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._gaps, self._longest_gap = 0, 0.0
         self._first_identity = 1
         self.kept = KeptMixtures(None, ())
+        self._weights = np.empty(0)
         self.state = self._present_state()
 
     def prepare(self) -> None:
@@ -161,12 +162,15 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._end_window()
         return stamp
 
-    def _forget(self) -> None:
+    def restart(self) -> None:
+        """See `Session`."""
         self._window = None
+        self._weights = np.empty(0)
         self._open = {}
         self._newest = None
         self._nobody = False
         self.kept = KeptMixtures(self._of, ())
+        super().restart()
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
         try:
@@ -407,7 +411,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         return SmootherState(
             status,
             wants,
-            **self._totals(),
+            **self._totals(self._weights),
             window=0 if self._window is None else len(self._window.stamps_ns),
             trajectories=len(self._weights),
             gaps=self._gaps,

@@ -19,12 +19,12 @@ from hmt_ros.body.mirror import turned
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import WaitingImage
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.focal_length import depth_covariances
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.robot_outputs import RobotOutputs
 from hmt_ros.sessions.session import PublishedTopic
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.tracking import Status, Tracker
 from msg_tools import RosbagsMessages
 from msg_tools.messages.bodies import description_message, message_of_body
@@ -86,6 +86,7 @@ class TrackedImage:
         tracker: after the image.
         posterior, likelihood: mixtures over poses, heaviest first.
         parameters: of the node.
+        frame_prefix: of the names of the links.
         starts: whether the body is a new one, with other lengths than the image before.
         describe: whether the URDF is due: a new body, or other names of its frames.
         fixed: frame that mixtures, markers and the pose of the person are published in; None: the
@@ -97,6 +98,7 @@ class TrackedImage:
     posterior: GaussianMixture
     likelihood: GaussianMixture
     parameters: FilterParameters
+    frame_prefix: str
     starts: bool
     describe: bool
     fixed: FixedFrame | None = None
@@ -124,7 +126,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     if track.starts:
         yield 'body', message_of_body(MESSAGES, body, stamp, frame)
     if track.describe:
-        yield 'human_description', description_message(MESSAGES, body, frame, p.frame_prefix)
+        yield 'human_description', description_message(MESSAGES, body, frame, track.frame_prefix)
     for topic, mixture in mixtures.items():
         yield topic, pose_mixture_message(MESSAGES, mixture)
     if wanted('person_pose'):
@@ -313,7 +315,7 @@ def _in_range(probabilities: Mapping[str, float]) -> dict[str, float]:
 
 def _link_transforms(track: TrackedImage) -> Any:
     """Every link of the URDF in the point estimate, and frames with z up, from the camera."""
-    tracker, camera, prefix = track.tracker, track.waiting.frame_id, track.parameters.frame_prefix
+    tracker, camera, prefix = track.tracker, track.waiting.frame_id, track.frame_prefix
     names, rotations, origins = links_of(*_against_camera(tracker))
     parents = [camera] * len(names)
     children = [f'{prefix}{name}' for name in names]

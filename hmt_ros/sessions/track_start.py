@@ -13,8 +13,8 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import read_picture
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.keypoint_inputs import known_lifter
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.tracking import Subject, Tracker, read_subject
 from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line

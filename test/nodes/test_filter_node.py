@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.sessions.camera_session import MOST_INCOMPLETE
-from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools.messages.cdr import serialise
 from test.nodes.conftest import PATIENCE, only_line
 
@@ -516,7 +516,7 @@ def test_kernels_are_ready_before_the_node_listens(world, monkeypatch):
     def prepare(session):
         prepared.append((one.node.preparing, topics()))
 
-    monkeypatch.setattr('hmt_ros.sessions.filter_session.FilterSession.prepare', prepare)
+    monkeypatch.setattr('hmt_ros.sessions.tracking_session.TrackingSession.prepare', prepare)
     one = world()
     one.node.trigger_configure()
     assert prepared == [(True, set())]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
 from test.sessions.conftest import StubTracker
 from test.sessions.test_people_session import Follower, seen, somebody_at
 

@@ -20,9 +20,8 @@ from hmt_ros.sessions.declared_parameters import (
     values_of,
     with_values,
 )
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 
 ALL = (FilterParameters(), SmootherParameters(), BmeParameters())
 

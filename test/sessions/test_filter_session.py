@@ -9,11 +9,11 @@ import pytest
 from hmt_ros.body import Camera, load_body
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import COMPRESSED_MASK, KEYPOINTS, MASK, PREDICTION
 from hmt_ros.sessions.track_messages import TOPICS, TOPICS_OF_NODE
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.beginning import Source
 from msg_tools import RosbagsMessages
@@ -41,7 +41,7 @@ def session(stub_tracker, subject_file, outputs):
     def make(wanted=lambda topic: True, **values):
         values.setdefault('subject_file', str(subject_file))
         parameters = with_values(FilterParameters(), values)
-        return FilterSession(parameters, outputs.append, wanted)
+        return TrackingSession(parameters, outputs.append, wanted)
 
     return make
 

@@ -7,9 +7,9 @@ import pytest
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from test.sessions.conftest import JOINTS
 
 
@@ -19,7 +19,7 @@ def session(stub_tracker, subject_file, outputs, small_camera):
 
     def make(**values):
         values = {'subject_file': str(subject_file), 'use_keypoints': True, **values}
-        one = FilterSession(with_values(FilterParameters(), values), outputs.append)
+        one = TrackingSession(with_values(FilterParameters(), values), outputs.append)
         one.take(CAMERA_INFO, small_camera.info())
         return one
 

@@ -3,13 +3,13 @@
 import pytest
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 
 
 @pytest.fixture
 def one(stub_tracker, subject_file, outputs):
-    found = FilterSession(FilterParameters(subject_file=str(subject_file)), outputs.append)
+    found = TrackingSession(FilterParameters(subject_file=str(subject_file)), outputs.append)
     found.topic_names = {IMAGE: '/cam/image', CAMERA_INFO: '/cam/camera_info'}
     return found
 

@@ -4,8 +4,8 @@ import pytest
 import yaml
 
 from hmt_ros.sessions.declared_parameters import ParameterError, values_of, with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.parameter_file import parameter_file_text, read_parameter_file, yaml_scalar
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'

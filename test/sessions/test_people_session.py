@@ -12,8 +12,8 @@ from hmt_ros.sessions import track_start
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.image_inputs import DETECTIONS
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PEOPLE, PeopleSession, published_topic
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.beginning import Source
 from msg_tools.messages.cdr import deserialise
@@ -140,7 +140,7 @@ def test_two_people_have_topics_of_their_own(session, outputs, small_camera):
     }
     assert frames == {'body_p1', 'body_p2'}
     assert listed(outputs) == [['p1', 'p2']]
-    assert one.state.counts == {'received': 1, 'tracked': 1, 'skipped': 0}
+    assert one.state.counts == {'received': 1, 'tracked': 1}
     assert (one.state.people, one.state.status) == (('p1', 'p2'), 'tracking')
     # One image, decoded once, and one background.
     first, second = StubTracker.made

@@ -18,12 +18,12 @@ from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PeopleTrack, Play
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, KEYPOINTS
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
@@ -139,7 +139,7 @@ def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
     if isinstance(tracking, PeopleParameters):
         rows = PeopleSession.inputs_of(tracking)
     else:
-        rows = FilterSession.inputs_of(tracking)
+        rows = TrackingSession.inputs_of(tracking)
     used = [row for row in rows if row.is_used(tracking)]
     if bme is not None:
         used += [row for row in BmeSession.inputs_of(bme) if row.is_used(bme)]

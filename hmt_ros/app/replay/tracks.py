@@ -21,13 +21,13 @@ from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE, PREDICTION
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession, published_topic
 from hmt_ros.sessions.session import FINISH
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools.messages.cdr import deserialise
 
@@ -66,7 +66,7 @@ class OfflineTrack(PlayedTrack):
         if parameters.bme is not None:
             self._bme = BmeSession(parameters.bme, self._predict, bme_session.TOPICS.__contains__)
         self._seen, self._heard = _seen_by_bme(parameters), _heard_by_bme(parameters)
-        self._filter = FilterSession(
+        self._filter = TrackingSession(
             parameters.filter, self._filtered, track_messages.TOPICS.__contains__
         )
         if parameters.smoother is not None:
@@ -181,7 +181,7 @@ class LiveTrack(PlayedTrack):
             image = topic, COMPRESSED_TYPE if compressed else IMAGE_TYPE
             given = {
                 source: (source, msgtype)
-                for row in FilterSession.inputs_of(self._parameters.filter)
+                for row in TrackingSession.inputs_of(self._parameters.filter)
                 for source, msgtype in row.types.items()
                 if source != PREDICTION
             }
