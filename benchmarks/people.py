@@ -67,7 +67,6 @@ def one_crossing(seed: int, folder: Path) -> dict[str, Any]:
     )  # fmt: skip
     options = ReplayOptions(
         overwrite=True, quiet=True, people=True, background=made / 'background.png',
-        settings=['overlay_modes=0'],
     )  # fmt: skip
     replay_bag(made, tracked, options, lambda text: None)
     truths = [read_truth(made / f'truth_{name}.npz') for name in PEOPLE]

@@ -53,7 +53,8 @@ def main(argv: list[str]) -> int:
             page.write_text(
                 with_part(page.read_text('utf-8'), name, parameter_table(name)), 'utf-8'
             )
-            text = parameter_file_text(name, settings_of(name))
+            like = ('filter_node', settings_of('filter_node')) if name == 'people_node' else ()
+            text = parameter_file_text(name, settings_of(name), *like)
             (CONFIG / f'{name}.yaml').write_text(text, 'utf-8')
         else:
             (RESULTS / f'{name}.md').write_text(results(name), 'utf-8')

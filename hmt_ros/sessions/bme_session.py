@@ -15,7 +15,7 @@ The rules, besides those of `CameraSession`:
   subtraction, empty while the background is being learned. An image that is left to the track has
   one, too. With `use_mask` there is none besides the mask.
 - With `propagation` a prediction takes the one before into account, unless this is older than
-  `longest_interval`, comes from another calibration, or from before a jump in time.
+  `LONGEST_INTERVAL`, comes from another calibration, or from before a jump in time.
 - With `predict_from` 'keypoints' every message of keypoints gets one prediction, from them and
   those of the last second (`experts.lifter`), in place of the images; without components where
   fewer than five landmarks are seen. With 'both' an image waits for the keypoints of exactly its
@@ -47,7 +47,7 @@ from hmt_ros.experts.pose_predictor import (
     load_predictor,
 )
 from hmt_ros.experts.root_placement import SIZE_SPREAD
-from hmt_ros.image.background import BackgroundModel, one_person
+from hmt_ros.image.background import BackgroundModel, BackgroundSettings, one_person
 from hmt_ros.image.empty_scene import EmptyScene
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
@@ -94,6 +94,10 @@ TOPICS = {PREDICTION: PublishedTopic('hmt_msgs/msg/PoseMixture')}
 _TOPICS_OF_NODE = {**TOPICS, SILHOUETTE: PublishedTopic('sensor_msgs/msg/Image')}
 
 
+# Least height of a silhouette that counts as a person, px.
+LEAST_HEIGHT = 40
+# Longest interval without a person after which the image before still counts, s.
+LONGEST_INTERVAL = 0.5
 # Time without a message after which a track no longer counts.
 _SURE_NS = SECOND_NS
 # Relative standard deviation of the size of a person whose stature is known.
@@ -159,10 +163,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         super()._set_up()
         p = self.parameters
         self._predictor, self._size_spread = _predictor_of(p)
-        background = BackgroundModel(p.background)
+        background = BackgroundModel()
         if p.background_file:
-            given = read_picture(p.background_file)
-            background = BackgroundModel.from_image(given, p.background)
+            background = BackgroundModel.from_image(read_picture(p.background_file))
         self._scene = EmptyScene(background)
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
@@ -349,7 +352,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _mixture_of(self, waiting: WaitingImage, camera: Camera) -> GaussianMixture | None:
         """The prediction from an image; None if nobody is seen."""
-        p, given = self.parameters, waiting.mask
+        given = waiting.mask
         if self._cue == FROM_BOTH:
             lifted = self._lifted(waiting.stamp_ns, camera)
             if lifted is not None:
@@ -364,11 +367,11 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 self._reason = self._scene.wants
                 return None
         else:
-            mask = one_person(given, p.background)
+            mask = one_person(given, BackgroundSettings())
             with self._background_in_use:
                 self._scene.learn(waiting.image, waiting.stamp_ns, bool(given.any()))
         self._height = _height(mask)
-        if self._height < p.least_height:
+        if self._height < LEAST_HEIGHT:
             return None
         try:
             found = self._seen(mask, camera, *self._known_before(waiting.stamp_ns))
@@ -389,17 +392,17 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 if scene.known:
                     return scene.background.silhouette(waiting.image)
             if scene.is_of_somebody:
-                self._scene = scene = EmptyScene(BackgroundModel(self.parameters.background))
+                self._scene = scene = EmptyScene(BackgroundModel())
             scene.learn(waiting.image, stamp)
         return np.zeros(waiting.image.shape[:2], np.bool_)
 
     def _known_before(self, stamp_ns: int) -> tuple[GaussianMixture | None, float]:
         """The poses predicted before an image, if they still count, and the time since then, s."""
-        p, previous = self.parameters, self._previous
-        if p.propagation == ALONE or previous is None:
+        previous = self._previous
+        if self.parameters.propagation == ALONE or previous is None:
             return None, STEP
         interval = (stamp_ns - previous.stamp_ns) / SECOND_NS
-        return (None, STEP) if interval > p.longest_interval else (previous.mixture, interval)
+        return (None, STEP) if interval > LONGEST_INTERVAL else (previous.mixture, interval)
 
     def _seen(
         self,
@@ -469,16 +472,15 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         camera = self._camera
         if camera is None:
             raise ValueError('no calibrated camera_info has come yet')
-        p = self.parameters
         if not self._scene.known:
             raise ValueError(f'no silhouette: {self._scene.wants}')
         image = self.decode_image(message)
         check_size(image, camera)
         mask = self._silhouette(image)
-        if _height(mask) < p.least_height:
+        if _height(mask) < LEAST_HEIGHT:
             raise ValueError(
                 f'nobody is seen: the silhouette is {_height(mask)} px high, wanted at least '
-                f'{p.least_height}'
+                f'{LEAST_HEIGHT}'
             )
         mixture = self._seen(mask, camera).mixture
         return self._message(mixture, time_ns(message.header.stamp), str(message.header.frame_id))

@@ -141,18 +141,16 @@ class KeypointReader:
         parameters: CameraNodeParameters,
         body: Body,
         camera: Camera | None,
-        sigma_px: float = 0.0,
     ) -> Keypoints:
         """The keypoints in a message.
 
         Args:
             camera: that took the image; None: it is not known yet.
-            sigma_px: standard deviation of keypoints without one, px; 0: the learned one.
 
         Raises:
             ValueError: it can not be used; one line.
         """
-        found = self._found(message, stamp, parameters, camera, sigma_px)
+        found = self._found(message, stamp, parameters, camera)
         if found is None or not found.names:
             return NO_KEYPOINTS
         _, unknown = found.named_for(body, parameters.keypoint_scheme)
@@ -166,10 +164,9 @@ class KeypointReader:
         stamp: int,
         p: CameraNodeParameters,
         camera: Camera | None,
-        sigma_px: float,
     ) -> Keypoints | None:
         if self._source == OWN_KEYPOINTS:
-            return keypoints_of(message, sigma_px)
+            return keypoints_of(message)
         try:
             if self._source == 'skeleton2d':
                 if camera is None:

@@ -23,15 +23,25 @@ _WIDTH = 100
 _LARGEST_FILE = 1_000_000  # bytes
 
 
-def parameter_file_text(node: str, settings: Any) -> str:
-    """A parameter file with all parameters, each under a comment that describes it."""
+def parameter_file_text(node: str, settings: Any, like: str = '', others: Any = None) -> str:
+    """A parameter file with all parameters, each under a comment that describes it.
+
+    Args:
+        like: name of a node whose parameters this one has, too, and whose file lists those that
+            are the same; '': there is none.
+        others: settings of that node.
+    """
     declared = declared_parameters(settings)
+    if like:
+        known = declared_parameters(others)
+        declared = [parameter for parameter in declared if parameter not in known]
     used = {parameter.effect for parameter in declared}
     lines = [
         f'# Parameters of {node}, with their defaults. A file needs only those that it changes:',
         '#',
         f'#     ros2 run hmt_ros {node} --ros-args --params-file FILE',
         '#',
+        *([f'# All others are those of {like}: see {like}.yaml.', '#'] if like else []),
         '# In square brackets: lowest and highest value, and when a new value takes effect:',
         *(
             f'# "{name}": {text[0].lower()}{text[1:]}'

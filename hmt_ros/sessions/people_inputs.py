@@ -57,18 +57,15 @@ class PeopleReader:
         self._log = log
         self._unknown: set[frozenset[str]] = set()
 
-    def people(self, message: Any, stamp: int, sigma_px: float) -> list[DetectedPerson]:
+    def people(self, message: Any, stamp: int) -> list[DetectedPerson]:
         """The people in a message.
-
-        Args:
-            sigma_px: standard deviation of keypoints without covariances, px; 0: learned ones.
 
         Raises:
             MessageError: it can not be used.
         """
         try:
             if self._source == 'people':
-                people = people_of_message(message, sigma_px)
+                people = people_of_message(message)
             elif self._source == 'boxes':
                 people = people_of_boxes(message)
             elif self._source == 'yolo':

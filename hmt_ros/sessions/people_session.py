@@ -199,7 +199,7 @@ class PeopleSession(TrackingSession):
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name == DETECTIONS:
-            return self._reader.people(message, stamp, self.parameters.keypoint_sigma_px)
+            return self._reader.people(message, stamp)
         return super()._read_input(row, message, stamp)
 
     # Estimates.
@@ -219,7 +219,7 @@ class PeopleSession(TrackingSession):
             )
         own, left = self._matched(found, stamp)
         known = self._scene.scene.known
-        background = self._scene.background if known else BackgroundModel(p.background)
+        background = self._scene.background if known else BackgroundModel()
         self._start_tracks(left, own, camera, background, stamp)
         if detected is not None:
             self._detected = len(detected)
@@ -239,7 +239,7 @@ class PeopleSession(TrackingSession):
         except ValueError as error:
             self._log.note(Fault.BACKGROUND, f'{error}: silhouettes are not used')
             self.start = replace(self.start, background=None)
-            return BackgroundModel(self.parameters.background)
+            return BackgroundModel()
 
     def _matched(
         self, found: Sequence[Found], stamp: int

@@ -67,6 +67,8 @@ TOPICS_OF_NODE = {
 # Frame at the camera with x forward and z up, where gravity is known; a prefix stands before it.
 UPRIGHT = 'camera_upright'
 MESSAGES = RosbagsMessages()
+# Modes that are drawn on the image, the heaviest.
+OVERLAY_MODES = 3
 
 
 class Made(NamedTuple):
@@ -155,14 +157,14 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
         stands = forward(skeleton, point[None]).joints()[..., 0]
         array.markers += ground_markers(MESSAGES, ground, stands, names)
         yield 'markers', array
-    if p.overlay_modes and wanted('overlay/compressed'):
+    if wanted('overlay/compressed'):
         drawn = draw_modes(
             track.waiting.image,
             tracker.camera,
             joints,
             skeleton.bones,
             posterior.weights,
-            p.overlay_modes,
+            OVERLAY_MODES,
         )
         yield 'overlay/compressed', compressed_image_message(MESSAGES, drawn, stamp, frame)
 
@@ -200,7 +202,7 @@ def nobody_messages(
         )
         markers.markers += removed_ground(MESSAGES, stamp, frame)
         yield 'markers', markers
-    if p.overlay_modes and wanted('overlay/compressed'):
+    if wanted('overlay/compressed'):
         picture = compressed_image_message(MESSAGES, waiting.image, stamp, frame)
         yield 'overlay/compressed', picture
 

@@ -95,16 +95,15 @@ class TrackStart:
         Raises:
             ValueError: it was taken by another camera.
         """
-        p = self.parameters
-        background = BackgroundModel(p.background)
+        background, file = BackgroundModel(), self.parameters.background_file
         if self.background is not None:
             height, width = self.background.shape[:2]
             if (width, height) != (camera.width, camera.height):
                 raise ValueError(
-                    f'{p.background_file} has {width}x{height} pixels, but the camera gives '
+                    f'{file} has {width}x{height} pixels, but the camera gives '
                     f'{camera.width}x{camera.height}'
                 )
-            background = BackgroundModel.from_image(self.background, p.background)
+            background = BackgroundModel.from_image(self.background)
         return background
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from hmt_ros.body import Body, Camera
 from hmt_ros.sessions.camera_frames import CameraFrames
@@ -33,7 +33,7 @@ from hmt_ros.sessions.image_inputs import (
     ImageInput,
 )
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input
-from hmt_ros.sessions.session import SessionState
+from hmt_ros.sessions.session import PublishedTopic, SessionState
 from hmt_ros.sessions.track import Seen, Shared, Track
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
 from hmt_ros.sessions.track_reports import TrackCondition
@@ -114,10 +114,15 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         tracks: of the people; here there is always one.
     """
 
-    TOPICS = TOPICS_OF_NODE
+    TOPICS: ClassVar[Mapping[str, PublishedTopic]] = TOPICS_OF_NODE
     DONE = 'tracked'
     ESTIMATE = 'the track'
-    CHECKED: tuple[str, ...] = ('subject_file', 'background_file', 'body_model', 'lifter')
+    CHECKED: ClassVar[tuple[str, ...]] = (
+        'subject_file',
+        'background_file',
+        'body_model',
+        'lifter',
+    )
 
     tracks: Sequence[Track]
 
@@ -212,9 +217,8 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name == KEYPOINTS:
-            p = self.parameters
             return self._keypoints.read(
-                message, stamp, p, self.start.body, self._camera, p.keypoint_sigma_px
+                message, stamp, self.parameters, self.start.body, self._camera
             )
         if row is PREDICTION_INPUT:
             return self._prediction_in(message)

@@ -146,7 +146,6 @@ def test_parameters_are_those_of_the_file(running):
 def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
     running.assert_refused(
         ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
-        ({'background.method': 'guess'}, "saw 'guess'"),
         ({'subject_file': str(tmp_path / 'none.yaml')}, 'none.yaml: can not be read'),
         ({'background_file': str(tmp_path / 'two\nlines')}, 'two lines: can not be read'),
         ({'body_model': 'nobody'}, "no body 'nobody'"),
@@ -374,7 +373,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
         one.spin_until(lambda index=index: sum(waiting_and_dropped()) == index)
     assert waiting_and_dropped() == (2, 9)
     assert one.state == 'active'
-    assert one.set(overlay_modes=1) == (True, '')
+    assert one.set(publish_tf=False) == (True, '')
     go.set()
     one.spin_until(lambda: one.session.state.counts['tracked'] == 3)
     stamps = [stamp for stamp, _ in stub_tracker.made[0].seen]
@@ -528,7 +527,7 @@ def test_kernels_are_ready_before_the_node_listens(world, monkeypatch):
     ('arguments', 'message'),
     [
         (('-p', 'max_hypotheses:=99'), 'out of range'),
-        (('-p', 'background.method:=guess'), "saw 'guess'"),
+        (('-p', 'image_transport:=guess'), "saw 'guess'"),
     ],
 )
 def test_wrong_arguments_are_one_line(arguments, message, ended):

@@ -177,14 +177,12 @@ def test_docstrings_without_attributes_describe_nothing():
 
 def test_nodes_have_few_parameters():
     declared = [[p.name for p in declared_parameters(settings)] for settings in ALL]
-    assert len(declared[0]) <= 43
-    assert len({name for names in declared for name in names}) <= 60
+    assert len(declared[0]) <= 34
+    assert len({name for names in declared for name in names}) <= 55
     names = set(declared[0])
     assert {'max_hypotheses', 'evaluation_budget', 'random_seed', 'gravity'} < names
-    parameters = with_values(
-        FilterParameters(), {'likelihood.edges.weight': 7, 'max_hypotheses': 20}
-    )
-    assert parameters.tracker.likelihood.edges.weight == 7.0
+    parameters = with_values(FilterParameters(), {'camera_height': 7, 'max_hypotheses': 20})
+    assert parameters.camera_height == 7.0
     assert parameters.tracker.max_hypotheses == 20
 
 
@@ -220,10 +218,9 @@ def test_defaults_lie_between_limits(settings):
         ({'max_hypotheses': 0}, 'max_hypotheses must lie between 1 and 64, saw 0'),
         ({'evaluation_budget': 0}, 'evaluation_budget must lie between 1 and 100000, saw 0'),
         ({'proposals': 'css'}, 'proposals was removed: kinematic jumps; programs set it'),
-        ({'likelihood.edges.wieght': 2.0}, 'is likelihood.edges.weight meant'),
+        ({'camera_hieght': 2.0}, 'is camera_height meant'),
         ({'absence_time': 0.5}, 'absence_time was removed: existence is a probability with rates'),
         ({'surprise': 2.0}, 'there is no parameter surprise'),
-        ({'background.method': 'guess'}, "saw 'guess'"),
         ({'image_transport': 'theora'}, "image_transport must be one of .* saw 'theora'"),
         ({'body_model': ''}, 'body_model must be a name or a file'),
         ({'camera_height': -1.0}, 'camera_height must lie between 0 and 100'),

@@ -418,11 +418,11 @@ def test_a_moved_camera_is_told_once_for_all(session, small_camera, tmp_path):
 
 def test_parameters_that_change_reach_those_who_are_followed(session, outputs, small_camera):
     one = started(session(keep_out_probability=0.5), small_camera)
-    for index, values in enumerate(({}, {'keep_out_probability': 0.9, 'overlay_modes': 0})):
+    for index, values in enumerate(({}, {'keep_out_probability': 0.9, 'publish_tf': False})):
         one.parameters = with_values(one.parameters, values)
         outputs.clear()
         show(one, small_camera, index, somebody_at(15))
         topics = {output.topic: output.data for output in outputs}
-        assert ('humans/bodies/p1/overlay/compressed' in topics) == (index == 0)
+        assert ('/tf' in topics) == (index == 0)
         told = keep_out_of(deserialise(topics['humans/bodies/p1/keep_out'], KEEP_OUT))
         assert told.probability == (0.5, 0.9)[index]

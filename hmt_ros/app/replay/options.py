@@ -245,7 +245,7 @@ def _bme_parameters(
     }
     if options.bme:
         values['model_file'] = options.bme
-    return with_values(BmeParameters(background=tracking.background), values)
+    return with_values(BmeParameters(), values)
 
 
 def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:
