@@ -67,7 +67,6 @@ from hmt_ros.sessions.camera_session import (
     check_size,
     read_picture,
 )
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK_INPUT, PREDICTION, ImageInput
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input, known_lifter
 from hmt_ros.sessions.session import (
@@ -256,7 +255,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         camera = self._camera
         if camera is None:
             self._log.skip(
-                Fault.CAMERA_INFO,
+                'camera_info',
                 f'keypoints of {stamp} ns are left out: no calibrated camera_info has come',
             )
             return
@@ -264,7 +263,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         try:
             content = self._read_input(row, message, stamp)
         except ValueError as error:
-            self._log.skip(Fault.KEYPOINTS, error_line(error))
+            self._log.skip('keypoints', error_line(error))
             return
         self._inputs[KEYPOINTS].put(stamp, content)
         frame = self._frame_id or self._frame or FRAME_ID
@@ -272,7 +271,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             mixture = self._lifted(stamp, camera)
         except (ValueError, ArithmeticError) as error:
             text = f'no prediction from the keypoints of {stamp} ns: {error_line(error)}'
-            self._log.skip(Fault.KEYPOINTS, text)
+            self._log.skip('keypoints', text)
             return
         self._tell(mixture, stamp, frame)
 
@@ -334,7 +333,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             mixture = self._mixture_of(waiting, camera)
         except (ValueError, ArithmeticError) as error:
             text = f'no prediction from the image of {waiting.stamp_ns} ns: {error_line(error)}'
-            self._log.skip(Fault.ESTIMATE, text)
+            self._log.skip('estimate', text)
             self._previous = None
             return
         if mixture is not None:
@@ -379,7 +378,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             return None
         self._support = found.support
         for text in found.place.remarks:
-            self._log.note(Fault.SILHOUETTE, f'image of {waiting.stamp_ns} ns: {text}')
+            self._log.note('silhouette', f'image of {waiting.stamp_ns} ns: {text}')
         return found.mixture
 
     def _judged_silhouette(self, waiting: WaitingImage) -> Mask:

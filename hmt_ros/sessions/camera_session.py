@@ -29,7 +29,6 @@ from hmt_ros.image.background import BackgroundModel, SceneWatch
 from hmt_ros.inference.arrays import Image, Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.image_inputs import (
     DEPTH,
     DETECTIONS,
@@ -237,7 +236,7 @@ class CameraSession(Session[CameraParameters, State]):
         row = self._inputs.row(source)
         if source in TRANSFORMS and self.frames.wanted:
             for text in self.frames.take(message, static=source == TF_STATIC):
-                self._log.note(Fault.TRANSFORM, text)
+                self._log.note('transform', text)
         elif source == CAMERA_INFO:
             self._take_camera_info(message)
         elif source == IMAGE:
@@ -267,23 +266,23 @@ class CameraSession(Session[CameraParameters, State]):
         except CameraInfoError as error:
             text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
             self._uncalibrated = text if self._camera is None else ''
-            self._log.fault(Fault.CAMERA_INFO, text)
+            self._log.fault('camera_info', text)
             return
         self._uncalibrated = ''
         self._frame = str(message.header.frame_id)
         known, self._camera = self._camera, camera
         if camera != known:
             for text in neglected:
-                self._log.note(Fault.CAMERA_INFO, text, warn=True)
+                self._log.note('camera_info', text, warn=True)
         if known is not None and camera != known:
             text = f'camera_info changes: {self.ESTIMATE} starts anew'
-            self._log.note(Fault.CALIBRATION, text)
+            self._log.note('calibration', text)
             self.restart()
 
     def _see_frame(self, source: str, message: Any) -> None:
         """Warns of a camera whose messages do not agree on its frame, once for each frame."""
         for text in self._named_frames.see(source, str(message.header.frame_id), self._on_topic):
-            self._log.note(Fault.FRAME, text, warn=True)
+            self._log.note('frame_id', text, warn=True)
 
     def _take_image(self, message: Any, stamp: int) -> None:
         self._see_frame(IMAGE, message)
@@ -299,7 +298,7 @@ class CameraSession(Session[CameraParameters, State]):
         try:
             image = self.decode_image(message)
         except ImageError as error:
-            self._log.skip(Fault.IMAGE, str(error))
+            self._log.skip('image', str(error))
             return
         self._newest, self._fresh = stamp, self._fresh + 1
         self._waiting.append(WaitingImage(image, stamp, str(message.header.frame_id)))
@@ -318,7 +317,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._watch.look(waiting.image, background)
         if self._watch.moved and not before:
             text = camera_moved_fault(self._watch.shift, waiting.stamp_ns, remedy)
-            self._log.note(Fault.CAMERA_MOVED, text, warn=True)
+            self._log.note('camera moved', text, warn=True)
 
     def _use_what_has_come(self) -> None:
         late, self._fresh, self._left = self._left or self._fresh > 1, 0, False
@@ -350,17 +349,17 @@ class CameraSession(Session[CameraParameters, State]):
             if self._camera is None:
                 # An uncalibrated camera_info has been reported already.
                 self._log.give_up(
-                    Fault.CAMERA_INFO,
+                    'camera_info',
                     'a calibrated camera_info',
                     f'image of {stamp} ns is dropped: it waited for a calibrated camera_info',
                 )
             else:
                 row = self._missing(stamp)
-                kind = Fault.NO_TRANSFORM if row is None else row.none
+                name = 'transform' if row is None else row.name
                 self._log.give_up(
-                    kind,
-                    kind.value.removeprefix('no '),
-                    f'image of {stamp} ns is dropped: {kind.value} of its stamp has come, and '
+                    f'no {name}',
+                    name,
+                    f'image of {stamp} ns is dropped: no {name} of its stamp has come, and '
                     f'{most} newer images wait',
                 )
 
@@ -369,7 +368,7 @@ class CameraSession(Session[CameraParameters, State]):
         try:
             check_size(waiting.image, camera)
         except ValueError as error:
-            self._log.skip(Fault.IMAGE_SIZE, str(error))
+            self._log.skip('size of the image', str(error))
             return
         given = {
             row.name: self._inputs.take(row, waiting.stamp_ns, waiting.image, self._dropped)

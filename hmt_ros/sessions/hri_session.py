@@ -25,7 +25,6 @@ from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import Joint, ReferenceHuman, fit_reference_human
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, camera_info_fault
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.session import (
     NeededInput,
@@ -221,7 +220,7 @@ class HriSession(Session[HriParameters, HriState]):
             self._camera, self._frame = camera_from_info(message), str(message.header.frame_id)
         except CameraInfoError as error:
             text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
-            self._log.fault(Fault.CAMERA_INFO, text)
+            self._log.fault('camera_info', text)
         longest = self.parameters.longest_silence * SECOND_NS
         silent = [p for p in self._people.values() if p.identity and stamp - p.heard > longest]
         for person in silent:
@@ -237,7 +236,7 @@ class HriSession(Session[HriParameters, HriState]):
         try:
             content = pose_mixture_of(message)
         except MessageError as error:
-            self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
+            self._log.skip(error.fault.value, f'mixture of {stamp} ns: {error}')
             return
         if order is Order.JUMP:
             self.restart()
@@ -254,7 +253,7 @@ class HriSession(Session[HriParameters, HriState]):
                 self._show(person, content)
             except ValueError as error:
                 person.tracked = False
-                self._log.skip(Fault.HUMAN, f'mixture of {stamp} ns shows no body: {error}')
+                self._log.skip('reference model', f'mixture of {stamp} ns shows no body: {error}')
                 self._tell_tracked(stamp)
                 return
         if not person.tracked:
@@ -298,7 +297,7 @@ class HriSession(Session[HriParameters, HriState]):
             return
         if self._frame and content.frame_id not in ('', self._frame):
             self._log.note(
-                Fault.OTHER_CAMERA,
+                'other camera',
                 f'mixtures of {person.name} are in the frame {content.frame_id}, camera_info is '
                 f'that of {self._frame}: their places in the image are not published; remap '
                 'camera_info and image to the camera of the filter',
@@ -357,12 +356,12 @@ class HriSession(Session[HriParameters, HriState]):
         image = self._images.get(stamp)
         if image is None:
             text = f'no image of {stamp} ns has come, of which a mixture tells: it is not cropped'
-            self._log.note(Fault.NO_IMAGE, text)
+            self._log.note('no image', text)
             return
         try:
             message = cropped_message(self._messages, image, region)
         except ImageError as error:
-            self._log.note(Fault.IMAGE, str(error))
+            self._log.note('image', str(error))
             return
         self._publish(topic, stamp, message)
 

@@ -18,7 +18,6 @@ import numpy as np
 from hmt_ros.detectors.blazepose import BlazePose
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D, MASK
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState
@@ -91,7 +90,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
             image = self.decode_image(message)
             found = self._detector.detect(image, stamp)
         except ImageError as error:
-            self._log.skip(Fault.IMAGE, str(error))
+            self._log.skip('image', str(error))
             return
         self._newest = stamp
         self._landmarks = 0 if found is None else len(found.names)

@@ -10,7 +10,7 @@ import numpy as np
 
 from hmt_ros.body import Body
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions.handled import Fault, HandlingLog
+from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.tracking_parameters import PeopleParameters
 from hmt_ros.tracking.association import Sighting
 from hmt_ros.tracking.keypoint_evidence import FEWEST_KEYPOINTS
@@ -78,7 +78,7 @@ class PeopleReader:
         for i, person in enumerate(people):
             if person.name and person.name in names:
                 self._log.fault(
-                    Fault.DETECTIONS,
+                    'detections',
                     f'detections of {stamp} ns have the id {person.name!r} twice, wanted each id '
                     'once: the second is taken to have none',
                 )
@@ -112,7 +112,7 @@ class PeopleReader:
             return
         self._unknown.add(unknown)
         self._log.note(
-            Fault.KEYPOINT_NAMES,
+            'names of keypoints',
             f'keypoints {sorted(unknown)} are not used: wanted names of joints of the body or of '
             'a known scheme',
         )

@@ -27,7 +27,6 @@ from hmt_ros.image.background import BackgroundModel, SceneWatch
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.sessions.camera_session import CAMERA_MOVED, WaitingImage
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.image_inputs import (
     DEPTH_INPUT,
     DETECTIONS,
@@ -237,7 +236,7 @@ class PeopleSession(TrackingSession):
         try:
             return self.start.background_model(camera)
         except ValueError as error:
-            self._log.note(Fault.BACKGROUND, f'{error}: silhouettes are not used')
+            self._log.note('background', f'{error}: silhouettes are not used')
             self.start = replace(self.start, background=None)
             return BackgroundModel()
 
@@ -282,7 +281,7 @@ class PeopleSession(TrackingSession):
                 continue  # a second detection of the same person
             if len(self.tracks) >= p.max_people:
                 self._log.note(
-                    Fault.PEOPLE,
+                    'too many people',
                     f'{len(own) + len(left)} people are detected in the image of {stamp} ns, but '
                     f'max_people is {p.max_people}: the others are not followed',
                 )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.declared_parameters import NodeParameters
-from hmt_ros.sessions.handled import Fault, Handled, HandlingLog, Output
+from hmt_ros.sessions.handled import Handled, HandlingLog, Output
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
@@ -232,7 +232,7 @@ class Session(ABC, Generic[Parameters, State]):
     def refuse(self, source: str, text: str, *, more: bool = False) -> Handled:
         """Counts a message that could not be read; `more` as for `take`."""
         self._log.begin()
-        self._log.fault(Fault.MESSAGE, f'message of {source} can not be read: {text}')
+        self._log.fault('message', f'message of {source} can not be read: {text}')
         if not more:
             self._use_what_has_come()
         return self._handled(source, 0)
@@ -246,7 +246,7 @@ class Session(ABC, Generic[Parameters, State]):
 
     def break_off(self, source: str, text: str) -> Handled:
         """Counts an error of the session itself, and restarts the estimate."""
-        self._log.fault(Fault.NODE, text)
+        self._log.fault('node itself', text)
         self.restart()
         # The traceback is in the log of the node already.
         return replace(self._log.handled(source, 0), warnings=())
@@ -304,15 +304,15 @@ class Session(ABC, Generic[Parameters, State]):
             return Order.NEXT
         text = f'{self.UNIT} of {stamp} ns comes after one of {newest} ns'
         if stamp == newest:
-            self._log.skip(Fault.SAME_TIME, f'{text}, wanted stamps that increase')
+            self._log.skip('time stands still', f'{text}, wanted stamps that increase')
             return Order.SKIPPED
         if not self.parameters.reset_on_time_jump:
             self._log.skip(
-                Fault.TIME_JUMP,
+                'time jumps back',
                 f'{text}: skipped; with reset_on_time_jump {self.ESTIMATE} would start anew',
             )
             return Order.SKIPPED
-        self._log.note(Fault.TIME_JUMP, f'{text}: {self.ESTIMATE} starts anew')
+        self._log.note('time jumps back', f'{text}: {self.ESTIMATE} starts anew')
         return Order.JUMP
 
     def _publish(self, topic: str, stamp: int, message: Any) -> None:

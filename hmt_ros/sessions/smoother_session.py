@@ -39,7 +39,6 @@ from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.body.mirror import clear_level, free_limits, relevelled, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.image_evidence import Evidence, KeptMixtures, evidence_of
 from hmt_ros.sessions.session import Order, Session, SessionState
 from hmt_ros.sessions.smoothed_messages import (
@@ -181,11 +180,11 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             evidence, of = evidence_of(content), self._whose(content)
             of = self._clear(of, evidence.mixture)
         except MessageError as error:
-            self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
+            self._log.skip(error.fault.value, f'mixture of {stamp} ns: {error}')
             return
         if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
             self._log.note(
-                Fault.MIXTURE_KIND,
+                'kind of mixture',
                 f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
                 'say counts more than once',
             )
@@ -205,7 +204,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 self._gaps += 1
                 self._longest_gap = max(self._longest_gap, interval)
                 self._log.note(
-                    Fault.GAP,
+                    'gap',
                     f'no mixture for {interval:.2f} s before {stamp} ns: the dynamics bridge it',
                 )
         if self._window is None:
@@ -216,7 +215,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             )
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
-            self._log.skip(Fault.ESTIMATE, f'mixture of {stamp} ns can not be smoothed: {text}')
+            self._log.skip('estimate', f'mixture of {stamp} ns can not be smoothed: {text}')
             self._end_window()
             return
         self._newest, self._nobody = stamp, False
@@ -308,7 +307,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             return
         if self._newest is not None:
             text = 'mixtures are about another body or another track: a new window begins'
-            self._log.note(Fault.NEW_BODY, text)
+            self._log.note('new body', text)
         self._end_window()
         self._of, self._first_identity = of, 1
         self.kept = KeptMixtures(of, ())

@@ -25,7 +25,7 @@ from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.focal_length import with_depth_error
-from hmt_ros.sessions.handled import Fault, HandlingLog
+from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
 from hmt_ros.sessions.track_messages import (
     TOPICS_OF_NODE,
@@ -188,7 +188,7 @@ class Track:
             report_change(log, before, tracker, self.start.initial, stamp)
             if waiting.depth is not None and not tracker.validity.believes('depth'):
                 log.note(
-                    Fault.DEPTH_ELSEWHERE,
+                    'depth of something else',
                     f'depth of {stamp} ns does not show the person where the image does: depth '
                     'images are not used until they do; wanted depth of the same time, registered '
                     'to the colour camera',
@@ -209,10 +209,10 @@ class Track:
             if not answered:
                 self._answer_robot(waiting)
             if not starts:
-                log.fault(Fault.ESTIMATE, f'image of {stamp} ns can not be tracked: {text}')
+                log.fault('estimate', f'image of {stamp} ns can not be tracked: {text}')
                 return False
             # The next image would fail in the same way, and take the same time.
-            log.fault(Fault.START, f'no track starts at the image of {stamp} ns: {text}')
+            log.fault('start', f'no track starts at the image of {stamp} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None, box=None))
             return False
         return published
@@ -275,7 +275,7 @@ class Track:
             self._turn = fixed.turn_of(tracker.body, posterior.means[0])
         elif p.publish_in_fixed_frame:
             self._shared.log.fault(
-                Fault.NO_CAMERA_POSE,
+                'no pose of the camera',
                 f'the image of {waiting.stamp_ns} ns is tracked, but not published: its place '
                 f'in fixed_frame {p.fixed_frame!r} is unknown',
             )

@@ -22,7 +22,7 @@ from hmt_ros.sessions.camera_session import (
     CameraSession,
     WaitingImage,
 )
-from hmt_ros.sessions.handled import Fault, Output
+from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.image_inputs import (
     INPUTS,
     KEYPOINTS,
@@ -157,7 +157,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
                 start = prepare_start(self.parameters)
             except ValueError as error:
                 text = f'{error}; {self.ESTIMATE} starts as the time before'
-                self._log.fault(Fault.START, text)
+                self._log.fault('start', text)
                 start = self.start
         self.start = start
         for track in self.tracks:

@@ -10,7 +10,7 @@ from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.sessions import image_inputs, tracking_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import AT_ONCE, parameter_field
-from hmt_ros.sessions.handled import Fault, HandlingLog
+from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.image_inputs import (
     DEPTH_INPUT,
     DETECTIONS_INPUT,
@@ -34,7 +34,7 @@ def _read_distance(message, stamp):
 
 # A radio that tells how far away the person is. What another input takes: this row ...
 UWB = ImageInput(
-    'uwb', {'uwb': RANGE}, 'use_uwb', Fault.DEPTH, Fault.NO_DEPTH, _read_distance,
+    'uwb', {'uwb': RANGE}, 'use_uwb', _read_distance,
 )  # fmt: skip
 
 
