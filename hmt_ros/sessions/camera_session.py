@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from itertools import takewhile
 from types import MappingProxyType
@@ -93,47 +93,6 @@ class WaitingImage(NamedTuple):
         return depth
 
 
-class NamedFrames:
-    """The frames that the messages of a camera name: they are to be one.
-
-    Two publishers on one topic, or the camera_info of another camera, else go unnoticed.
-
-    Args:
-        image, info: names of the sources of images and of camera_info.
-    """
-
-    def __init__(self, image: str, info: str) -> None:
-        self._image, self._info = image, info
-        self._seen: dict[str, list[str]] = {image: [], info: []}
-
-    def see(self, source: str, frame_id: str, naming: Callable[[str], str]) -> list[str]:
-        """Takes the frame of a message; returns warnings, once for each frame.
-
-        Args:
-            frame_id: may be empty.
-            naming: names a source for the user.
-        """
-        seen, other = self._seen[source], self._info if source == self._image else self._image
-        if not frame_id or frame_id in seen or len(seen) == _MOST_FRAMES:
-            return []
-        texts = []
-        if seen:
-            texts.append(
-                f'{naming(source)} has messages of the frames {seen[-1]!r} and {frame_id!r}: '
-                'wanted those of one camera; stop or remap one of the publishers'
-            )
-        elif self._seen[other] and frame_id not in self._seen[other]:
-            frames = {source: frame_id, other: self._seen[other][-1]}
-            texts.append(
-                f'{naming(self._image)} has frame_id {frames[self._image]!r}, '
-                f'{naming(self._info)} has {frames[self._info]!r}: results are in that of the '
-                'image; if both are of one camera, set one frame_id in its driver, else remap '
-                'camera_info'
-            )
-        seen.append(frame_id)
-        return texts
-
-
 class CameraSession(Session[CameraParameters, State]):
     """A session that estimates from images; see `Session` for arguments and attributes.
 
@@ -148,7 +107,7 @@ class CameraSession(Session[CameraParameters, State]):
     def _set_up(self) -> None:
         self._camera: Camera | None = None
         self._frame = ''
-        self._named_frames = NamedFrames(IMAGE, CAMERA_INFO)
+        self._named_frames: dict[str, list[str]] = {IMAGE: [], CAMERA_INFO: []}
         self.frames = CameraFrames()
         self._uncalibrated = ''
         self._watch = SceneWatch()
@@ -280,8 +239,29 @@ class CameraSession(Session[CameraParameters, State]):
             self.restart()
 
     def _see_frame(self, source: str, message: Any) -> None:
-        """Warns of a camera whose messages do not agree on its frame, once for each frame."""
-        for text in self._named_frames.see(source, str(message.header.frame_id), self._on_topic):
+        """Warns where the messages of a camera name several frames, once for each frame.
+
+        Two publishers on one topic, or the camera_info of another camera, else go unnoticed.
+        """
+        frame, seen = str(message.header.frame_id), self._named_frames[source]
+        if not frame or frame in seen or len(seen) == _MOST_FRAMES:
+            return
+        seen.append(frame)
+        images, infos = self._named_frames[IMAGE], self._named_frames[CAMERA_INFO]
+        text = ''
+        if len(seen) > 1:
+            text = (
+                f'{self._on_topic(source)} has messages of the frames {seen[-2]!r} and {frame!r}: '
+                'wanted those of one camera; stop or remap one of the publishers'
+            )
+        elif images and infos and frame not in (images if source == CAMERA_INFO else infos):
+            text = (
+                f'{self._on_topic(IMAGE)} has frame_id {images[-1]!r}, '
+                f'{self._on_topic(CAMERA_INFO)} has {infos[-1]!r}: results are in that of the '
+                'image; if both are of one camera, set one frame_id in its driver, else remap '
+                'camera_info'
+            )
+        if text:
             self._log.note('frame_id', text, warn=True)
 
     def _take_image(self, message: Any, stamp: int) -> None:

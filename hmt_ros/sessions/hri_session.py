@@ -236,7 +236,7 @@ class HriSession(Session[HriParameters, HriState]):
         try:
             content = pose_mixture_of(message)
         except MessageError as error:
-            self._log.skip(error.fault.value, f'mixture of {stamp} ns: {error}')
+            self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
         if order is Order.JUMP:
             self.restart()

@@ -75,6 +75,11 @@ def published_topic(topic: str) -> PublishedTopic:
     return TOPICS_OF_NODE[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
 
 
+def session_of(parameters: FilterParameters) -> type[TrackingSession]:
+    """The class of the session that tracks with these parameters."""
+    return PeopleSession if isinstance(parameters, PeopleParameters) else TrackingSession
+
+
 # Least size in the image, px, of a person who is tracked.
 SMALLEST = 4
 # Time, s, after which a person who is no longer detected and has no track yet is forgotten.

@@ -59,7 +59,6 @@ from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import SECOND_NS
-from msg_tools.messages.message_error import MessageFault
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
@@ -180,7 +179,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             evidence, of = evidence_of(content), self._whose(content)
             of = self._clear(of, evidence.mixture)
         except MessageError as error:
-            self._log.skip(error.fault.value, f'mixture of {stamp} ns: {error}')
+            self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
         if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
             self._log.note(
@@ -281,7 +280,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             # A message must not cause files to be read: its body has to ship with the package.
             model = known_body(chosen) if chosen else known_body(content.body_model, named_body)
         except ValueError as error:
-            raise MessageError(str(error), MessageFault.BODY) from error
+            raise MessageError(str(error), 'body') from error
         body = body_of(content, model, any_name=bool(chosen))
         of = SmoothedBody(body, content.frame_id, content.track_id)
         self._resolved = about, of
