@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,11 +142,6 @@ class BmeState(SessionState):
         ]
 
 
-class _Previous(NamedTuple):
-    mixture: GaussianMixture
-    stamp_ns: int
-
-
 class BmeSession(CameraSession[BmeParameters, BmeState]):
     """Predicts the poses in the images of one camera; see `Session` for arguments and attributes.
 
@@ -168,10 +163,6 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._scene = EmptyScene(background)
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
-        self._previous: _Previous | None = None
-        # Stamps of the last image that was looked at, and of the last one with a track.
-        self._looked: int | None = None
-        self._tracked: int | None = None
         self._height, self._support, self._reason = 0, math.nan, ''
         # Whether the last prediction needed no background.
         self._without_background = p.predict_from == FROM_KEYPOINTS
@@ -180,9 +171,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._lifter = known_lifter(p.lifter)
         self._cue = p.predict_from
         self._keypoints = KeypointReader(p.source, self._log)
-        self._by_keypoints: KeypointPredictor | None = None
-        self._weights = np.empty(0)
-        self.state = self._present_state()
+        self.restart()
 
     def prepare(self) -> None:
         """See `Session`."""
@@ -198,10 +187,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def restart(self) -> None:
         """See `Session`."""
-        # The known background is kept.
-        self._previous = None
-        self._looked = self._tracked = None
-        self._by_keypoints = None
+        # The known background is kept. The last prediction, with its stamp:
+        self._previous: tuple[GaussianMixture, int] | None = None
+        # Stamps of the last image that was looked at, and of the last one with a track.
+        self._looked: int | None = None
+        self._tracked: int | None = None
+        self._by_keypoints: KeypointPredictor | None = None
         self._weights = np.empty(0)
         super().restart()
 
@@ -261,19 +252,13 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             return
         self._newest = stamp
         try:
-            content = self._read_input(row, message, stamp)
-        except ValueError as error:
-            self._log.skip('keypoints', error_line(error))
-            return
-        self._inputs[KEYPOINTS].put(stamp, content)
-        frame = self._frame_id or self._frame or FRAME_ID
-        try:
+            self._inputs[KEYPOINTS].put(stamp, self._read_input(row, message, stamp))
             mixture = self._lifted(stamp, camera)
         except (ValueError, ArithmeticError) as error:
             text = f'no prediction from the keypoints of {stamp} ns: {error_line(error)}'
             self._log.skip('keypoints', text)
             return
-        self._tell(mixture, stamp, frame)
+        self._tell(mixture, stamp, self._frame_id or self._frame or FRAME_ID)
 
     def _lifted(self, stamp: int, camera: Camera) -> GaussianMixture | None:
         """The prediction from the keypoints that have come; None: they show nobody at a stamp."""
@@ -325,7 +310,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
         if self._is_left_to_track(waiting.stamp_ns):
-            self._show_silhouette(waiting)
+            self._publish_silhouette(waiting)
             self._leave_to_track(waiting.stamp_ns, waiting.frame_id)
             return
         self._looked, self._reason = waiting.stamp_ns, ''
@@ -337,7 +322,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._previous = None
             return
         if mixture is not None:
-            self._previous = _Previous(mixture, waiting.stamp_ns)
+            self._previous = mixture, waiting.stamp_ns
         self._tell(mixture, waiting.stamp_ns, waiting.frame_id)
 
     def _tell(self, mixture: GaussianMixture | None, stamp: int, frame_id: str) -> None:
@@ -356,12 +341,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             lifted = self._lifted(waiting.stamp_ns, camera)
             if lifted is not None:
                 self._without_background = True
-                self._show_silhouette(waiting)
+                self._publish_silhouette(waiting)
                 return lifted
         self._without_background = given is not None
         if given is None:
             mask = self._judged_silhouette(waiting)
-            self._publish_silhouette(mask, waiting)
+            self._publish_silhouette(waiting, mask)
             if not self._scene.known:
                 self._reason = self._scene.wants
                 return None
@@ -400,8 +385,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         previous = self._previous
         if self.parameters.propagation == ALONE or previous is None:
             return None, STEP
-        interval = (stamp_ns - previous.stamp_ns) / SECOND_NS
-        return (None, STEP) if interval > LONGEST_INTERVAL else (previous.mixture, interval)
+        interval = (stamp_ns - previous[1]) / SECOND_NS
+        return (None, STEP) if interval > LONGEST_INTERVAL else (previous[0], interval)
 
     def _seen(
         self,
@@ -420,16 +405,15 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             size_spread=self._size_spread,
         )
 
-    def _show_silhouette(self, waiting: WaitingImage) -> None:
-        """Publishes the silhouette of an image that is not predicted from."""
-        if waiting.mask is None and self._scene.known and self._wanted(SILHOUETTE):
-            self._publish_silhouette(self._silhouette(waiting.image), waiting)
-
-    def _publish_silhouette(self, mask: Mask, of: WaitingImage) -> None:
-        if self._wanted(SILHOUETTE):
-            picture = np.where(mask, np.uint8(255), np.uint8(0))
-            made = image_message(self._messages, picture, of.stamp_ns, of.frame_id)
-            self._publish(SILHOUETTE, of.stamp_ns, made)
+    def _publish_silhouette(self, of: WaitingImage, mask: Mask | None = None) -> None:
+        """Publishes the silhouette of an image; None: it is not predicted from."""
+        known = mask is not None or (of.mask is None and self._scene.known)
+        if not known or not self._wanted(SILHOUETTE):
+            return
+        shown = self._silhouette(of.image) if mask is None else mask
+        picture = np.where(shown, np.uint8(255), np.uint8(0))
+        made = image_message(self._messages, picture, of.stamp_ns, of.frame_id)
+        self._publish(SILHOUETTE, of.stamp_ns, made)
 
     def _silhouette(self, image: NDArray[np.uint8]) -> Mask:
         with self._background_in_use:

@@ -173,8 +173,7 @@ class HriSession(Session[HriParameters, HriState]):
         self._frame = ''
         self._now = 0
         self._people: dict[str, _Person] = {}
-        self._images: dict[int, Any] = {}
-        self.state = self._present_state()
+        self.restart()
 
     @property
     def identities(self) -> set[str]:
@@ -199,7 +198,7 @@ class HriSession(Session[HriParameters, HriState]):
         for person in self._people.values():
             person.end()
             person.newest = None
-        self._images.clear()
+        self._images: dict[int, Any] = {}
         super().restart()
 
     # Inputs.

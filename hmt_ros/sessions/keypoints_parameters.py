@@ -1,13 +1,7 @@
-"""Parameters of the keypoints node.
-
-`hmt_ros/config/keypoints_node.yaml` lists them with their defaults; it is written by
-
-    python -m hmt_ros.sessions.keypoints_parameters > hmt_ros/config/keypoints_node.yaml
-"""
+"""Parameters of the keypoints node."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 
 from hmt_ros.sessions.declared_parameters import (
@@ -15,7 +9,6 @@ from hmt_ros.sessions.declared_parameters import (
     ImageNodeParameters,
     parameter_field,
 )
-from hmt_ros.sessions.parameter_file import parameter_file_text
 
 
 @dataclass(frozen=True)
@@ -27,7 +20,3 @@ class KeypointsParameters(ImageNodeParameters):
     """
 
     publish_mask: bool = parameter_field(False, NEXT_CONFIGURE)
-
-
-if __name__ == '__main__':
-    sys.stdout.write(parameter_file_text('keypoints_node', KeypointsParameters()))

@@ -69,14 +69,12 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
 
     def _set_up(self) -> None:
         self._detector = BlazePose(with_mask=self.parameters.publish_mask)
-        self._newest: int | None = None
-        self._landmarks = 0
-        self.state = self._present_state()
+        self.restart()
 
     def restart(self) -> None:
         """See `Session`."""
         # The detector sees by the stamps that a new sequence begins.
-        self._newest = None
+        self._newest: int | None = None
         self._landmarks = 0
         super().restart()
 

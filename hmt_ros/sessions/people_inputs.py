@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from hmt_ros.body import Body
+from hmt_ros.image.keypoint_schemes import Scheme
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.tracking_parameters import PeopleParameters
@@ -23,6 +24,14 @@ from msg_tools.messages.detections import (
     people_of_message,
     people_of_yolo,
 )
+
+# The people in a message, by the parameter `source`, where keypoints without names have an order.
+_READERS: dict[str, Callable[[Any, Scheme], list[DetectedPerson]]] = {
+    'people': lambda message, _: people_of_message(message),
+    'boxes': lambda message, _: people_of_boxes(message),
+    'yolo': people_of_yolo,
+    'floats': people_of_floats,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,14 +73,7 @@ class PeopleReader:
             MessageError: it can not be used.
         """
         try:
-            if self._source == 'people':
-                people = people_of_message(message)
-            elif self._source == 'boxes':
-                people = people_of_boxes(message)
-            elif self._source == 'yolo':
-                people = people_of_yolo(message, self._scheme)
-            else:
-                people = people_of_floats(message, self._scheme)
+            people = _READERS[self._source](message, self._scheme)
         except MessageError as error:
             raise MessageError(f'detections of {stamp} ns: {error}') from error
         names: set[str] = set()

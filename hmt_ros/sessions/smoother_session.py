@@ -133,16 +133,9 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             known_body(self.parameters.body_model)
         self._of: SmoothedBody | None = None
         self._resolved: tuple[Any, SmoothedBody] | None = None
-        self._window: SlidingWindow | None = None
-        # By stamp, of the poses of the window that have not been published.
-        self._open: dict[int, OpenPose] = {}
-        self._newest: int | None = None
-        self._nobody = False
         self._gaps, self._longest_gap = 0, 0.0
         self._first_identity = 1
-        self.kept = KeptMixtures(None, ())
-        self._weights = np.empty(0)
-        self.state = self._present_state()
+        self.restart()
 
     def prepare(self) -> None:
         """See `Session`."""
@@ -162,10 +155,11 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
     def restart(self) -> None:
         """See `Session`."""
-        self._window = None
+        self._window: SlidingWindow | None = None
         self._weights = np.empty(0)
-        self._open = {}
-        self._newest = None
+        # By stamp, of the poses of the window that have not been published.
+        self._open: dict[int, OpenPose] = {}
+        self._newest: int | None = None
         self._nobody = False
         self.kept = KeptMixtures(self._of, ())
         super().restart()
