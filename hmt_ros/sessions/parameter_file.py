@@ -19,7 +19,7 @@ from hmt_ros.sessions.declared_parameters import (
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 _KEY = 'ros__parameters'
-_WIDTH = 100
+_WIDTH, _INDENT = 100, '    '
 _LARGEST_FILE = 1_000_000  # bytes
 
 
@@ -51,26 +51,18 @@ def parameter_file_text(node: str, settings: Any, like: str = '', others: Any = 
         f'/**/{node}:',
         f'  {_KEY}:',
     ]
-    open_groups: list[str] = []
     for parameter in declared:
-        *groups, name = parameter.name.split('.')
-        same = 0
-        while open_groups[same : same + 1] == groups[same : same + 1] != []:
-            same += 1
-        lines.extend(f'{_indent(depth)}{groups[depth]}:' for depth in range(same, len(groups)))
-        open_groups = groups
-        indent = _indent(len(groups))
         lines.extend(
             textwrap.wrap(
                 f'{parameter.description} [{_bounds(parameter)}{parameter.effect}]',
                 _WIDTH,
-                initial_indent=f'{indent}# ',
-                subsequent_indent=f'{indent}# ',
+                initial_indent=f'{_INDENT}# ',
+                subsequent_indent=f'{_INDENT}# ',
                 break_long_words=False,
                 break_on_hyphens=False,
             )
         )
-        lines.append(f'{indent}{name}: {yaml_scalar(parameter.default)}')
+        lines.append(f'{_INDENT}{parameter.name}: {yaml_scalar(parameter.default)}')
     return '\n'.join(lines) + '\n'
 
 
@@ -133,10 +125,6 @@ def _flattened(values: Any, prefix: str, path: Path) -> Iterator[tuple[str, Any]
             yield from _flattened(value, f'{name}.', path)
         else:
             yield name, value
-
-
-def _indent(depth: int) -> str:
-    return '  ' * (depth + 2)
 
 
 def _bounds(parameter: DeclaredParameter) -> str:

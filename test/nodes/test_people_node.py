@@ -74,7 +74,7 @@ def test_topics_come_and_go_with_the_people(world, small_camera):
     _, text, values = one.diagnosis()
     assert text == 'tracking, 1 of 1 people'
     assert (values['people'], values['people detected']) == ('anna', '1')
-    one.assert_described(PeopleParameters())
+    one.assert_described(PeopleParameters(), 'filter_node')
 
 
 def test_reset_drops_all_tracks(world, small_camera):
