@@ -19,7 +19,7 @@ from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER
 from hmt_ros.app.replay.player import LiveNodeError, Player, environment
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.image_inputs import KEYPOINTS
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.keypoints_session import KeypointsParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 

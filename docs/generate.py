@@ -93,7 +93,7 @@ def settings_of(node: str) -> Any:
     """The parameters of a node with their defaults."""
     from hmt_ros.sessions.bme_parameters import BmeParameters
     from hmt_ros.sessions.hri_parameters import HriParameters
-    from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+    from hmt_ros.sessions.keypoints_session import KeypointsParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
     from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 

@@ -30,7 +30,7 @@ from hmt_ros.sessions import (
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import declared_parameters
 from hmt_ros.sessions.hri_parameters import HriParameters
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.keypoints_session import KeypointsParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from hmt_ros.tracking.subject import parse_subject

@@ -118,20 +118,6 @@ def check_choices(settings: Any, **choices: tuple[str, ...]) -> None:
             raise ValueError(f'{name} must be one of {values}, saw {value!r}')
 
 
-def namespaces_in(text: str) -> tuple[str, ...]:
-    """The namespaces in a text, which blanks separate, each once.
-
-    Raises:
-        ValueError: a name that no namespace can have.
-    """
-    for namespace in text.split():
-        if not re.fullmatch(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+', namespace):
-            raise ValueError(
-                f'namespaces: wanted names such as /humans/bodies/anna, saw {namespace!r}'
-            )
-    return tuple(dict.fromkeys(text.split()))
-
-
 @dataclass(frozen=True)
 class NodeParameters:
     """Parameters that all nodes have.

@@ -18,8 +18,12 @@ import numpy as np
 from hmt_ros.detectors.blazepose import BlazePose
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE
+from hmt_ros.sessions.declared_parameters import (
+    NEXT_CONFIGURE,
+    ImageNodeParameters,
+    parameter_field,
+)
 from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D, MASK
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState
 from msg_tools.messages import keypoints
 from msg_tools.messages.detections import NO_KEYPOINTS
@@ -31,6 +35,17 @@ TOPICS = {
     KEYPOINTS_3D: PublishedTopic(keypoints.KEYPOINTS_3D),
     MASK: PublishedTopic('sensor_msgs/msg/Image'),
 }
+
+
+@dataclass(frozen=True)
+class KeypointsParameters(ImageNodeParameters):
+    """All parameters of the keypoints node.
+
+    Attributes:
+        publish_mask: If true, the node also publishes the mask of the person.
+    """
+
+    publish_mask: bool = parameter_field(False, NEXT_CONFIGURE)
 
 
 @dataclass(frozen=True)
