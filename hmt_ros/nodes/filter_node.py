@@ -36,19 +36,10 @@ class FilterNode(TrackingNode[TrackingSession, FilterParameters]):
         yield from super()._offered_services()
         yield ForecastPose, '~/forecast_pose', self._on_forecast_pose
 
-    def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
+    def _start_asked_for(self, request: Reset.Request) -> TrackStart:
         assert self._session is not None
-        state = self._session.state
-        start = prepare_start(self._settings, request.initial, state.body, request.box)
-        sources = start.parameters.sources
-        if start.box is not None or start.initial is not None:
-            return start, 'the next image starts a new track'
-        if sources:
-            return start, f'the next image with {" or ".join(sources)} starts a new track'
-        return start, (
-            'the track is dropped; nothing starts a new one without subject_file, use_keypoints, '
-            'use_mask or use_predictions'
-        )
+        present = self._session.state.body
+        return prepare_start(self._settings, request.initial, present, request.box)
 
     def _on_forecast_pose(
         self, request: ForecastPose.Request, response: ForecastPose.Response

@@ -46,10 +46,10 @@ class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
         self._close_topics({name for topic in self._outputs if (name := person_of(topic))})
         return result
 
-    def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
+    def _start_asked_for(self, request: Reset.Request) -> TrackStart:
         if len(request.initial.components) or request.box.width:
             raise ValueError('a mixture or a box is of one person: wanted an empty request')
-        return prepare_start(self._settings), 'the next detections start new tracks'
+        return prepare_start(self._settings)
 
     # Called by the thread that estimates.
 

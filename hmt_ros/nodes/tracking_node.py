@@ -84,8 +84,8 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
         yield image_topic(self._settings.image_transport)
 
     @abstractmethod
-    def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
-        """The start of the tracks that a request asks for, and its description in words.
+    def _start_asked_for(self, request: Reset.Request) -> TrackStart:
+        """The start of the tracks that a request asks for.
 
         Raises:
             ValueError: a request that can not be used.
@@ -97,13 +97,14 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
             response.success, response.message = False, 'the node is not active'
             return response
         try:
-            start, response.message = self._start_asked_for(request)
+            start = self._start_asked_for(request)
         except ValueError as error:
             response.success, response.message = False, error_line(error)
             self.get_logger().warn(f'~/reset is refused: {response.message}')
             return response
         thread.restart(lambda: session.restart(start))
-        response.success = True
+        wants = start.wants(start.parameters.sources)
+        response.success, response.message = True, f'a new track waits for {wants}'
         self.get_logger().info(f'~/reset: {response.message}')
         return response
 

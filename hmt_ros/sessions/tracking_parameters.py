@@ -180,3 +180,8 @@ class PeopleParameters(FilterParameters):
                     f'{name} is {getattr(self, name)!r}, but people_node takes no input of one '
                     f'person: wanted {unused!r}, or filter_node'
                 )
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """See `FilterParameters`."""
+        return ('detections of people',)

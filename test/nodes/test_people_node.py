@@ -86,7 +86,7 @@ def test_reset_drops_all_tracks(world, small_camera):
     answer = one.call(Reset, 'reset', box=RegionOfInterest(width=5, height=5))
     assert (answer.success, answer.message[:26]) == (False, 'a mixture or a box is of o')
     answer = one.call(Reset, 'reset')
-    assert (answer.success, answer.message) == (True, 'the next detections start new tracks')
+    assert (answer.success, answer.message) == (True, 'a new track waits for detections of people')
     show(one, small_camera, 1, somebody_at(15, 'anna'))
     assert len(StubTracker.made) == 2
 
