@@ -237,7 +237,6 @@ setup(
             'subject = hmt_ros.app.subject:main',
             'keypoints_node = hmt_ros.nodes.keypoints_node:main',
             'hri_node = hmt_ros.nodes.hri_node:main',
-            'people_adapter_node = hmt_ros.nodes.people_adapter_node:main',
             'replay = hmt_ros.app.replay.command:main',
             'recover = hmt_ros.app.recover:main',
             'make-bag = hmt_ros.app.make_bag:main',

@@ -22,8 +22,8 @@ from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment
 from hmt_ros.sessions import bme_session, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.session import PublishedTopic
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns

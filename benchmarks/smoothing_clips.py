@@ -321,7 +321,7 @@ def smoothed(
             raise ValueError(handled.faults[0])
     result = {}
     for way, most in ((OFFLINE, parameters.max_trajectories), (RTS, 1)):
-        session.parameters = with_values(parameters, {'max_trajectories': most})
+        session.parameters = replace(parameters, max_trajectories=most)
         whole, of = session.smoothed_span()
         assert whole.stamps_ns is not None
         result[way] = {

@@ -20,10 +20,7 @@ from hmt_ros.experts.model_file import read_arrays, write_arrays
 from msg_tools import BagReader
 
 MODEL = ROOT / 'hmt_ros' / 'experts' / 'models' / 'silhouettes.npz'
-_CHEAP = (
-    '--set', 'max_hypotheses=1', '--set', 'evaluation_budget=20',
-    '--set', 'overlay_modes=0',
-)  # fmt: skip
+_CHEAP = ('--set', 'max_hypotheses=1', '--set', 'evaluation_budget=20')
 
 
 def disk(amount: Amount) -> Iterator[Outcome]:

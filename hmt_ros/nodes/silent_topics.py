@@ -23,9 +23,8 @@ SILENCE, REPEAT = 3.0, 30.0
 # Number of topics that are suggested instead, and least likeness of their names.
 _MOST_NAMED, _ALIKE = 3, 0.6
 _IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
-_SUFFIX = '/compressed'
-_IMAGES = ('image', f'image{_SUFFIX}')
-_OTHER = {_IMAGE: _COMPRESSED, _COMPRESSED: _IMAGE}
+# The value of image_transport for images of a type, and the topic that is then subscribed to.
+_TRANSPORTS = {_IMAGE: ('raw', 'image'), _COMPRESSED: ('compressed', 'image/compressed')}
 
 
 class Publication(NamedTuple):
@@ -112,21 +111,17 @@ class SilentTopics:
         The silhouettes and overlays of our own nodes are no images of a camera.
         """
         own = self._node.get_fully_qualified_name()
-        topics = self._node.get_topic_names_and_types()
-        ours = {
-            topic.removesuffix('/handled')
-            for topic, kinds in topics
-            if HANDLED in kinds and any(one.topic in _IMAGES for one in wanted)
-        }
-        types = {one.msgtype for one in wanted}
-        types |= {_OTHER[each] for each in types & _OTHER.keys()}
+        topics = dict(self._node.get_topic_names_and_types())
+        ours = {topic.removesuffix('/handled') for topic in topics if HANDLED in topics[topic]}
+        images = any(_is_image(one) for one in wanted)
+        types = {one.msgtype for one in wanted} | (_TRANSPORTS.keys() if images else set())
         found = []
-        for topic, kinds in topics:
+        for topic, kinds in topics.items():
             if not types & set(kinds) and all(_likeness(topic, x) < _ALIKE for x in names):
                 continue
             for info in self._node.get_publishers_info_by_topic(topic):
                 by = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                if by != own and (by not in ours or topic in names):
+                if by != own and (topic in names or not (images and by in ours)):
                     found.append(Publication(topic, info.topic_type, by))
         return found
 
@@ -156,48 +151,31 @@ def why_silent(
 def _instead(wanted: SubscribedTopic, name: str, published: list[Publication]) -> str:
     """Similar topics in place of a topic, in words; '' if nothing is like it."""
     kinds = {each.topic: each.msgtype for each in published}
-    transport = _other_transport(wanted, name, kinds)
-    if transport:
-        return transport
-    same = [topic for topic, kind in kinds.items() if kind == wanted.msgtype and topic != name]
-    alike = [
-        topic
-        for topic, kind in kinds.items()
-        if kind != wanted.msgtype and topic != name and _likeness(topic, name) >= _ALIKE
-    ]
-    other = [topic for topic in kinds if kinds[topic] == _OTHER.get(wanted.msgtype)]
-    near = [*_nearest(same, name), *_nearest(alike if same else [*alike, *other], name)]
-    found = list(dict.fromkeys(near))[:_MOST_NAMED]
-    if not found:
+    nearest = sorted(
+        (topic for topic, kind in kinds.items() if (topic, kind) != (name, wanted.msgtype)),
+        key=lambda topic: (
+            kinds[topic] != wanted.msgtype,
+            not (_is_image(wanted) and kinds[topic] in _TRANSPORTS),
+            -_likeness(topic, name),
+            topic,
+        ),
+    )[:_MOST_NAMED]
+    if not nearest:
         return ''
-    verb = 'is' if len(found) == 1 else 'are'
-    named = ', '.join(f'{topic} ({_short(kinds[topic])})' for topic in found)
-    return f'there {verb} {named}{_remedy(wanted, found[0], kinds[found[0]])}'
-
-
-def _other_transport(wanted: SubscribedTopic, name: str, kinds: Mapping[str, str]) -> str:
-    """Whether the images of a topic are published in the other transport."""
-    if wanted.topic == 'image' and kinds.get(f'{name}{_SUFFIX}') == _COMPRESSED:
-        return f'{name}{_SUFFIX} is published: set image_transport to compressed'
-    raw = name.removesuffix(_SUFFIX)
-    if wanted.topic == f'image{_SUFFIX}' and kinds.get(raw) == _IMAGE:
-        return f'{raw} is published: set image_transport to raw'
-    return ''
-
-
-def _remedy(wanted: SubscribedTopic, found: str, kind: str) -> str:
-    """How the node gets the messages of another topic; '' if it can not."""
+    verb = 'is' if len(nearest) == 1 else 'are'
+    named = ', '.join(f'{topic} ({_short(kinds[topic])})' for topic in nearest)
+    kind, remap = kinds[nearest[0]], f'remap with -r {{}}:={nearest[0]}'
+    remedy = ''
     if kind == wanted.msgtype:
-        return f': remap with -r {wanted.topic}:={found}'
-    if wanted.topic in _IMAGES and kind == _OTHER[wanted.msgtype]:
-        transport, topic = ('raw', 'image') if kind == _IMAGE else ('compressed', f'image{_SUFFIX}')
-        return f': set image_transport to {transport} and remap with -r {topic}:={found}'
-    return ''
+        remedy = f': {remap.format(wanted.topic)}'
+    elif _is_image(wanted) and kind in _TRANSPORTS:
+        transport, topic = _TRANSPORTS[kind]
+        remedy = f': set image_transport to {transport} and {remap.format(topic)}'
+    return f'there {verb} {named}{remedy}'
 
 
-def _nearest(topics: Iterable[str], name: str) -> list[str]:
-    """Topics, those with the most similar names first."""
-    return sorted(topics, key=lambda topic: (-_likeness(topic, name), topic))
+def _is_image(wanted: SubscribedTopic) -> bool:
+    return (wanted.msgtype, wanted.topic) in {(x, topic) for x, (_, topic) in _TRANSPORTS.items()}
 
 
 @lru_cache(maxsize=4096)

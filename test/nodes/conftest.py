@@ -228,11 +228,15 @@ class World:
         ).result
         return result.successful, result.reason
 
-    def assert_described(self, defaults):
-        """Parameters are those of the file, with their descriptions; all of them by name."""
-        file = ROOT / 'hmt_ros' / 'config' / f'{self.name}.yaml'
+    def assert_described(self, defaults, *others):
+        """Parameters are those of the files, with their descriptions; all of them by name.
+
+        `others` are nodes whose parameters this one has, too.
+        """
+        folder = ROOT / 'hmt_ros' / 'config'
+        listed = [read_parameter_file(folder / f'{x}.yaml', x) for x in (self.name, *others)]
         declared = {p.name: p for p in declared_parameters(defaults)}
-        assert sorted(read_parameter_file(file, self.name)) == sorted(declared)
+        assert {name for one in listed for name in one} == declared.keys()
         for name, parameter in declared.items():
             description = self.node.describe_parameter(name).description
             assert description == f'{parameter.description} {EFFECTS[parameter.effect]}'

@@ -27,7 +27,7 @@ def world(world_of):
     inputs = {'likelihood_mixture': PoseMixture}
 
     def make(**values):
-        values = {'fixed_lag': 0.1, 'max_trajectories': 4, **values}
+        values = {'fixed_lag': 0.1, **values}
         return world_of(SmootherNode, 'smoother_node', inputs, **values)
 
     return make

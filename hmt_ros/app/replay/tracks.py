@@ -21,13 +21,12 @@ from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE, PREDICTION
-from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.people_session import PeopleSession, published_topic
+from hmt_ros.sessions.people_session import session_of
 from hmt_ros.sessions.session import FINISH
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 
 PERSON = 'person_node'
@@ -65,9 +64,8 @@ class OfflineTrack(PlayedTrack):
         if parameters.bme is not None:
             self._bme = BmeSession(parameters.bme, self._predict, bme_session.TOPICS.__contains__)
         self._seen, self._heard = _seen_by_bme(parameters), _heard_by_bme(parameters)
-        self._filter = FilterSession(
-            parameters.filter, self._filtered, track_messages.TOPICS.__contains__
-        )
+        kind = session_of(parameters.filter)
+        self._filter = kind(parameters.filter, self._filtered, _is_recorded)
         if parameters.smoother is not None:
             self._smoother = SmootherSession(parameters.smoother, lambda output: write(*output))
 
@@ -117,44 +115,6 @@ class OfflineTrack(PlayedTrack):
             self._handed.append(output)
 
 
-class PeopleTrack(PlayedTrack):
-    """Several people, without ROS.
-
-    Args:
-        parameters: parameters of the nodes; those of the filter are those of the people node.
-        add_topic: takes name, type and `latched` of a topic of a person before its first message.
-
-    Raises:
-        ValueError: the parameters name a file that can not be used.
-    """
-
-    def __init__(
-        self, parameters: NodeParameters, write: Write, add_topic: Callable[[str, str, bool], None]
-    ) -> None:
-        assert isinstance(parameters.filter, PeopleParameters)
-        self._write, self._add_topic = write, add_topic
-        self._known: set[str] = set()
-        self._session = PeopleSession(parameters.filter, self._take_output, _is_recorded)
-
-    def __exit__(self, *_: object) -> None:
-        """See `PlayedTrack`; nothing is open."""
-
-    def take(self, source: str, message: Any) -> Handled:
-        """See `PlayedTrack`."""
-        return self._session.take(source, message)
-
-    def finish(self) -> Handled:
-        """See `PlayedTrack`."""
-        return self._session.finish()
-
-    def _take_output(self, output: Output) -> None:
-        if output.topic not in self._known:
-            self._known.add(output.topic)
-            published = published_topic(output.topic)
-            self._add_topic(output.topic, published.msgtype, published.latched)
-        self._write(*output)
-
-
 class LiveTrack(PlayedTrack):
     """The real nodes, over DDS in lock step.
 
@@ -179,7 +139,7 @@ class LiveTrack(PlayedTrack):
             image = topic, COMPRESSED_TYPE if compressed else IMAGE_TYPE
             given = {
                 source: (source, msgtype)
-                for row in FilterSession.inputs_of(self._parameters.filter)
+                for row in TrackingSession.inputs_of(self._parameters.filter)
                 for source, msgtype in row.types.items()
                 if source != PREDICTION
             }
@@ -275,7 +235,7 @@ class LiveTrack(PlayedTrack):
 
 
 def _is_recorded(topic: str) -> bool:
-    """Whether bags have a topic of `PeopleSession`."""
+    """Whether bags have a topic of a session that tracks."""
     return topic.rpartition('/')[2] not in track_messages.TOPICS_OF_NODE.keys() - (
         track_messages.TOPICS.keys()
     )

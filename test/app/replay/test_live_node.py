@@ -22,9 +22,9 @@ from hmt_ros.app.replay.player import (
 from hmt_ros.app.replay.tracks import LiveTrack
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.image_inputs import KEYPOINTS
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
