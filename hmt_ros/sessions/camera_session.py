@@ -314,12 +314,7 @@ class CameraSession(Session[CameraParameters, State]):
         """Drops all but the newest of the images that need not wait."""
         ready = sum(1 for _ in takewhile(self._is_ready, self._waiting))
         for _ in range(ready - self.parameters.queue_size):
-            stamp = self._waiting.popleft().stamp_ns
-            self._drop(stamp)
-            self._leave_out(stamp)
-
-    def _leave_out(self, stamp: int) -> None:
-        """Takes the inputs of an image that is dropped although they have come."""
+            self._drop(self._waiting.popleft().stamp_ns)
 
     def _drop_incomplete_images(self) -> None:
         most = max(self.parameters.queue_size, MOST_INCOMPLETE)

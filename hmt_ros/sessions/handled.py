@@ -42,6 +42,12 @@ class Output:
         """Topic, stamp and bytes."""
         return iter((self.topic, self.stamp_ns, self.data))
 
+    def __eq__(self, other: object) -> bool:
+        """Whether topic, stamp and bytes are those of another."""
+        return isinstance(other, Output) and tuple(self) == tuple(other)
+
+    __hash__ = None  # type: ignore[assignment]
+
 
 @dataclass(frozen=True)
 class Handled:

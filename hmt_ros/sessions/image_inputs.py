@@ -60,7 +60,7 @@ class ImageInput:
         remembered: maximum number kept of stamps whose image has not come.
         largest: size of the largest message that is taken, bytes.
         reliable: whether none may be lost on its way.
-        together: whether those of images that were left out stay, to be used with the next.
+        together: whether those of images before stay, to be used with the next.
     """
 
     name: str
@@ -136,6 +136,7 @@ PREDICTION_INPUT = ImageInput(
     {PREDICTION: POSE_MIXTURE},
     'use_predictions',
     reliable=True,
+    together=True,
 )
 # Its type depends on the parameter `source`.
 DETECTIONS_INPUT = ImageInput(

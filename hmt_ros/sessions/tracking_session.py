@@ -205,8 +205,6 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
     def _begin(self) -> None:
         """Nothing has been tracked."""
         self.tracks = (Track('', self.parameters, self.start, self._shared),)
-        # From an image that was left out since the last estimate.
-        self._late_prediction: PosePrediction | None = None
 
     @classmethod
     def inputs_of(cls, parameters: FilterParameters) -> tuple[ImageInput, ...]:
@@ -239,13 +237,6 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         except ValueError as error:
             raise ValueError(f'pose_prediction: {error}') from error
 
-    def _leave_out(self, stamp: int) -> None:
-        # A person moves little until the next image: the prediction is a hypothesis there, too.
-        if self.parameters.use_predictions:
-            found = self._inputs[PREDICTION].take(stamp)
-            if isinstance(found, PosePrediction):
-                self._late_prediction = found
-
     def _people_in(self, waiting: WaitingImage, camera: Camera) -> Iterator[tuple[Track, Seen]]:
         """The tracks, and what an image shows of each; a track follows it before the next one."""
         keypoints = self._keypoints.at_joints(
@@ -255,10 +246,10 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             self.parameters.keypoint_scheme,
             waiting.stamp_ns,
         )
-        prediction = waiting.content(PREDICTION)
-        if prediction is None and self.parameters.use_predictions:
-            prediction = self._late_prediction
-        self._late_prediction = None
+        # A person moves little until the next image: a prediction is a hypothesis there, too.
+        taken = self._inputs[PREDICTION].take_all(waiting.stamp_ns).values()
+        known = [one for one in taken if one is not None and self.parameters.use_predictions]
+        prediction = known[-1] if known else None
         yield self.tracks[0], Seen(keypoints, prediction)
 
     def _present_state(self) -> SessionState:

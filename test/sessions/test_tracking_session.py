@@ -769,6 +769,25 @@ def test_late_filter_leaves_images_out_but_not_what_was_predicted(
     assert stub_tracker.made[0].nobody_predicted == [False, True]
 
 
+def test_a_prediction_behind_the_pose_is_a_hypothesis_for_the_next_image(
+    session, small_camera, likelihoods, stub_tracker
+):
+    """Experts that leave an image to the track look at it once its pose is out."""
+    one = session(use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index, behind in enumerate([likelihoods.message(0), likelihoods.nobody(1), None]):
+        left = likelihoods.nobody(index)
+        left.state = int(TrackState.TRACKING)
+        one.take(PREDICTION, left)
+        assert one.take(IMAGE, small_camera.image(index)).published
+        if behind is not None:
+            assert one.take(PREDICTION, behind).published == ()
+    _, used, none = stub_tracker.made[0].predictions
+    assert np.array_equal(used.mixture.means, likelihoods.mixture(0).means)
+    assert none is None
+    assert stub_tracker.made[0].nobody_predicted == [False, False, True]
+
+
 def test_images_that_are_complete_at_once_are_all_used_in_lock_step(
     session, small_camera, likelihoods, outputs
 ):

@@ -102,7 +102,7 @@ class OfflineTrack(PlayedTrack):
             if self._smoother is not None and topic in HANDED_ON:
                 result = _together(result, self._smoother.take(topic, message))
             if self._bme is not None and topic in self._heard:
-                result = _together(result, self._bme.take(topic, message))
+                result = _together(result, self._hand_to_filter(self._bme.take(topic, message)))
         return result
 
     def _predict(self, output: Output) -> None:
@@ -230,7 +230,8 @@ class LiveTrack(PlayedTrack):
             if self._smoother is not None and topic in HANDED_ON:
                 result = _together(result, self._smoother.answer(topic))
             if self._bme is not None and topic in self._heard:
-                result = _together(result, self._bme.answer(topic))
+                predicted = self._answers_to_predictions(self._bme.answer(topic))
+                result = _together(result, predicted)
         return result
 
 
