@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import time
 from collections.abc import Callable, Iterable, Mapping
-from functools import lru_cache
 from typing import NamedTuple
 
 from rclpy.node import Node
@@ -20,8 +19,8 @@ from hmt_ros.sessions.session import NeededInput, kind_of
 
 # Time without a message after which a topic is silent, and between two warnings of one text, s.
 SILENCE, REPEAT = 3.0, 30.0
-# Number of topics that are suggested instead, and least likeness of their names.
-_MOST_NAMED, _ALIKE = 3, 0.6
+# Number of topics that are suggested instead.
+_MOST_NAMED = 3
 _IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 # The value of image_transport for images of a type, and the topic that is then subscribed to.
 _TRANSPORTS = {_IMAGE: ('raw', 'image'), _COMPRESSED: ('compressed', 'image/compressed')}
@@ -106,7 +105,7 @@ class SilentTopics:
         return now - last >= SILENCE
 
     def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
-        """Publications of others on topics that are like some, by type or by name.
+        """Publications of others on some topics, or of the types that these may have.
 
         The silhouettes and overlays of our own nodes are no images of a camera.
         """
@@ -117,7 +116,7 @@ class SilentTopics:
         types = {one.msgtype for one in wanted} | (_TRANSPORTS.keys() if images else set())
         found = []
         for topic, kinds in topics.items():
-            if not types & set(kinds) and all(_likeness(topic, x) < _ALIKE for x in names):
+            if topic not in names and not types & set(kinds):
                 continue
             for info in self._node.get_publishers_info_by_topic(topic):
                 by = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
@@ -149,40 +148,23 @@ def why_silent(
 
 
 def _instead(wanted: SubscribedTopic, name: str, published: list[Publication]) -> str:
-    """Similar topics in place of a topic, in words; '' if nothing is like it."""
-    kinds = {each.topic: each.msgtype for each in published}
-    nearest = sorted(
-        (topic for topic, kind in kinds.items() if (topic, kind) != (name, wanted.msgtype)),
-        key=lambda topic: (
-            kinds[topic] != wanted.msgtype,
-            not (_is_image(wanted) and kinds[topic] in _TRANSPORTS),
-            -_likeness(topic, name),
-            topic,
-        ),
-    )[:_MOST_NAMED]
-    if not nearest:
-        return ''
-    verb = 'is' if len(nearest) == 1 else 'are'
-    named = ', '.join(f'{topic} ({_short(kinds[topic])})' for topic in nearest)
-    kind, remap = kinds[nearest[0]], f'remap with -r {{}}:={nearest[0]}'
-    remedy = ''
-    if kind == wanted.msgtype:
-        remedy = f': {remap.format(wanted.topic)}'
-    elif _is_image(wanted) and kind in _TRANSPORTS:
-        transport, topic = _TRANSPORTS[kind]
-        remedy = f': set image_transport to {transport} and {remap.format(topic)}'
-    return f'there {verb} {named}{remedy}'
+    """Topics in place of a topic, those with the most similar names first; '' if there is none."""
+    kinds = _TRANSPORTS if _is_image(wanted) else {wanted.msgtype: ('', wanted.topic)}
+    # Those of the type that is wanted before those of the other transport.
+    for kind in sorted(kinds, key=lambda each: each != wanted.msgtype):
+        transport, topic = kinds[kind]
+        there = sorted({x.topic for x in published if x.msgtype == kind})
+        nearest = difflib.get_close_matches(name, there, _MOST_NAMED, 0.0)
+        if nearest:
+            verb = 'is' if len(nearest) == 1 else 'are'
+            named = ', '.join(f'{each} ({_short(kind)})' for each in nearest)
+            choice = f'set image_transport to {transport} and ' if kind != wanted.msgtype else ''
+            return f'there {verb} {named}: {choice}remap with -r {topic}:={nearest[0]}'
+    return ''
 
 
 def _is_image(wanted: SubscribedTopic) -> bool:
     return (wanted.msgtype, wanted.topic) in {(x, topic) for x, (_, topic) in _TRANSPORTS.items()}
-
-
-@lru_cache(maxsize=4096)
-def _likeness(topic: str, name: str) -> float:
-    """How alike two names are, 0 to 1: as a whole, or in their last parts."""
-    pairs = ((topic, name), (topic.rpartition('/')[2], name.rpartition('/')[2]))
-    return max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
 
 
 def _short(msgtype: str) -> str:

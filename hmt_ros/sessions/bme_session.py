@@ -181,7 +181,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if self._lifter is not None:
             self._inputs[KEYPOINTS].put(0, shown.keypoints(0))
             self._lifted(0, shown.camera)
-            self._by_keypoints = None
+            self.restart()
         if self._cue == FROM_KEYPOINTS:
             return
         for mask in shown.masks[:2]:
