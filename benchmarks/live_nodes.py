@@ -18,11 +18,10 @@ from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
 from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER
 from hmt_ros.app.replay.player import LiveNodeError, Player, environment
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.image_inputs import KEYPOINTS
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.keypoints_session import KeypointsParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 
 GLANCE = 5.0  # s, between two looks at the memory
 PERSON, PEOPLE_NODE, DETECTOR = 'person_node', 'people_node', 'keypoints_node'

@@ -26,7 +26,7 @@ from hmt_ros.app.truth import read_truth
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.person_session import BODIES
+from hmt_ros.sessions.track import BODIES
 from msg_tools import BagReader
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
@@ -69,7 +69,6 @@ def one_crossing(seed: int, folder: Path, duration: float) -> dict[str, Any]:
     )  # fmt: skip
     options = ReplayOptions(
         overwrite=True, quiet=True, people=True, background=made / 'background.png',
-        settings=['overlay_modes=0'],
     )  # fmt: skip
     replay_bag(made, tracked, options, lambda text: None)
     truths = [read_truth(made / f'truth_{name}.npz') for name in PEOPLE]

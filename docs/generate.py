@@ -23,7 +23,6 @@ NODES = (
     'bme_node',
     'keypoints_node',
     'hri_node',
-    'people_adapter_node',
     'people_node',
 )
 # When a new value of a parameter takes effect: mark of the parameter, and what the mark says.
@@ -53,7 +52,8 @@ def main(argv: list[str]) -> int:
             page.write_text(
                 with_part(page.read_text('utf-8'), name, parameter_table(name)), 'utf-8'
             )
-            text = parameter_file_text(name, settings_of(name))
+            like = ('filter_node', settings_of('filter_node')) if name == 'people_node' else ()
+            text = parameter_file_text(name, settings_of(name), *like)
             (CONFIG / f'{name}.yaml').write_text(text, 'utf-8')
         else:
             (RESULTS / f'{name}.md').write_text(results(name), 'utf-8')
@@ -91,12 +91,10 @@ def results(name: str) -> str:
 def settings_of(node: str) -> Any:
     """The parameters of a node with their defaults."""
     from hmt_ros.sessions.bme_parameters import BmeParameters
-    from hmt_ros.sessions.filter_parameters import FilterParameters
     from hmt_ros.sessions.hri_parameters import HriParameters
-    from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-    from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
-    from hmt_ros.sessions.people_parameters import PeopleParameters
+    from hmt_ros.sessions.keypoints_session import KeypointsParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
+    from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 
     kinds = {
         'filter_node': FilterParameters,
@@ -104,7 +102,6 @@ def settings_of(node: str) -> Any:
         'bme_node': BmeParameters,
         'keypoints_node': KeypointsParameters,
         'hri_node': HriParameters,
-        'people_adapter_node': PeopleAdapterParameters,
         'people_node': PeopleParameters,
     }
     return kinds[node]()

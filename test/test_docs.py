@@ -23,19 +23,16 @@ from hmt_ros.sessions import (
     bme_session,
     hri_session,
     keypoints_session,
-    people_adapter_session,
     people_session,
     smoothed_messages,
     track_messages,
 )
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import declared_parameters
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.hri_parameters import HriParameters
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
-from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.keypoints_session import KeypointsParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from msg_tools import typestore
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,7 +51,6 @@ NODES = {
     'smoother_node': (SmootherParameters(), smoothed_messages.TOPICS),
     'bme_node': (BmeParameters(), bme_session.BmeSession.TOPICS),
     'keypoints_node': (KeypointsParameters(), keypoints_session.TOPICS),
-    'people_adapter_node': (PeopleAdapterParameters(), people_adapter_session.TOPICS),
     'people_node': (PeopleParameters(), people_session.PeopleSession.TOPICS),
     'hri_node': (
         HriParameters(),

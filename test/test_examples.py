@@ -48,7 +48,7 @@ def test_the_readme_names_every_example():
     programs = [
         path.name for path in EXAMPLES.iterdir() if path.suffix in ('.py', '.cpp', '.ipynb')
     ]
-    assert len(programs) == 7
+    assert len(programs) == 8
     assert all(f'`{name}`' in text for name in programs)
 
 
@@ -141,6 +141,43 @@ def test_a_raised_hand_is_as_probable_as_its_modes():
     nobody = mixture(0.5, 0.5)
     nobody.state = 3
     assert math.isnan(told(nobody))
+
+
+class StandIn(SimpleNamespace):
+    """A message of people_msgs, which no distribution of ROS 2 has."""
+
+    def __init__(self, **fields):
+        super().__init__(people=[], velocity=SimpleNamespace(x=0.0, y=0.0, z=0.0), **fields)
+
+
+def test_a_costmap_learns_where_the_person_is():
+    body = load_body('human37')
+    means = np.tile(body.prior_mean, (2, 1))
+    means[:, 0] = [0.0, 1.0]
+    velocities = np.zeros_like(means)
+    velocities[:, 2] = -1.5
+    modes = GaussianMixture([0.6, 0.4], means, [1e-3 * np.eye(body.dimension)] * 2)
+    told = example('people_for_costmaps')['people']
+    for state, moving in (
+        (TrackState.TRACKING, velocities),
+        (TrackState.TRACKING, None),
+        (TrackState.LOST, velocities),
+    ):
+        content = PoseMixture.of_body(
+            body, modes, MixtureKind.POSTERIOR, 10**9, 'eye', state=state, track_id=2,
+            velocities=moving,
+        )  # fmt: skip
+        made = told(pose_mixture_message(MESSAGES, content), StandIn, StandIn)
+        assert made.header.frame_id == 'eye'
+        if state is TrackState.LOST:
+            assert made.people == []
+            continue
+        (person,) = made.people
+        here = content.joint_positions[0, body.joint_names.index('pelvis')]
+        assert (person.name, person.reliability) == ('person_2', pytest.approx(0.6))
+        assert [getattr(person.position, axis) for axis in 'xyz'] == pytest.approx(list(here))
+        wanted = 0.0 if moving is None else -1.5
+        assert vars(person.velocity) == pytest.approx({'x': 0.0, 'y': 0.0, 'z': wanted})
 
 
 def hands(state, *deviations):

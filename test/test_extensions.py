@@ -22,8 +22,7 @@ from hmt_ros.image.pixel_backgrounds import FOREGROUND
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-from hmt_ros.sessions.keypoints_session import KeypointsSession
+from hmt_ros.sessions.keypoints_session import KeypointsParameters, KeypointsSession
 from msg_tools import BagReader
 from test.sessions.conftest import Somebody
 

@@ -28,12 +28,11 @@ from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.sessions import bme_session, keypoints_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import values_of, with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.hri_parameters import HriParameters
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.keypoints_session import KeypointsParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from msg_tools import BagReader
 
 ROOT = Path(__file__).resolve().parents[1]

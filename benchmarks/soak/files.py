@@ -21,8 +21,8 @@ from hmt_ros.body import load_body
 from hmt_ros.experts import load_predictor
 from hmt_ros.sessions.camera_session import read_picture
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.tracking import read_subject
 
 # What breaks a value of a file of text.

@@ -13,11 +13,11 @@ from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.mutations import damaged
 from benchmarks.soak.outcome import Amount, Outcome, place, warnings_as_errors
 from benchmarks.soak.scenes import Scene, scenes
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import PREDICTION
 from hmt_ros.sessions.session import Session
 from hmt_ros.sessions.smoother_session import SmootherSession
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import deserialise, serialise
 
@@ -151,7 +151,7 @@ def ask(session: Any, message: Any) -> None:
     Raises:
         ValueError, ArithmeticError: a clean refusal.
     """
-    if isinstance(session, FilterSession):
+    if isinstance(session, TrackingSession):
         prepare_start(session.parameters, message, session.state.body)
     elif isinstance(session, SmootherSession):
         stamp = message.header.stamp

@@ -16,12 +16,12 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import KEYPOINTS, PREDICTION
 from hmt_ros.sessions.session import Session
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
@@ -132,7 +132,7 @@ def _filter() -> Scene:
             floor_in_gravity_frame=True,
             tracker=_SMALL,
         ),
-        FilterSession,
+        TrackingSession,
         {
             **_CAMERA,
             KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),

@@ -14,10 +14,10 @@ from hmt_ros.app.progress import show_progress
 from hmt_ros.compiled_code import compiled_functions, folder_in_use
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import SmootherSession
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -35,7 +35,7 @@ def _compile(arguments: argparse.Namespace) -> int:
     compiled, start = compiled_functions(), time.monotonic()
     before = compiled.count
     with show_progress('kernels', quiet=arguments.quiet):
-        FilterSession(FilterParameters(), lambda output: None).prepare()
+        TrackingSession(FilterParameters(), lambda output: None).prepare()
         SmootherSession(SmootherParameters(), lambda output: None).prepare()
         BmeSession(BmeParameters(), lambda output: None).prepare()
     if not arguments.quiet:

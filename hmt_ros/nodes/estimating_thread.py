@@ -1,26 +1,39 @@
-"""The thread that estimates: it gives a session its messages in the order of their arrival.
+"""The threads that estimate: they give the sessions of a process their messages.
 
-Messages wait in a bounded queue. After each estimate the session takes in all that has come
-meanwhile before it estimates again, so that a node that is late goes on with the newest image for
-which all other inputs are there. Older images are dropped; nothing else is.
+Messages wait in a bounded queue of each session, in the order of their arrival. A session takes in
+all that has come before it estimates again, so that a node that is late goes on with the newest
+image for which all other inputs are there. Older images are dropped; nothing else is.
+
+The sessions that lead to a pose share one thread and take turns, in the order in which they use
+each other's results. What can wait for the pose has a thread of its own, which begins with a
+message when the other one has nothing to do, or once the message has waited for `LONGEST_WAIT`. The
+messages of a session keep their order, so its results do not depend on turns.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from functools import cache, partial
+from typing import Any, NamedTuple, NoReturn
 
-from hmt_ros.nodes.subscribed_topic import SubscribedTopic
+from hmt_ros.inference.arrays import Image
+from hmt_ros.nodes.subscribed_topic import SubscribedTopic, opens_with_header
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.session import Session, kind_of
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import stamp_in
+from msg_tools.messages.images import decode_image
 
+# Time after which a message that can wait is handled although others wait, s.
+LONGEST_WAIT = 0.1
+# Pictures that the sessions of a process share, the newest.
+SHARED = 4
 _RESTART = 'restart'
 # Number of dropped images, the newest, that are reported one by one; the others are only counted.
 _ANSWERED = 100
@@ -33,15 +46,30 @@ class Waiting(NamedTuple):
 
     Attributes:
         source: its origin.
-        content: the message, or the action.
+        content: reads the message, and raises an Exception of any kind where it can not be read; or
+            does what is asked for.
         arrival: when it came, in seconds of a clock that does not jump.
         stamp_ns: of its header; 0 where it has none.
     """
 
     source: str
-    content: Any
+    content: Callable[[], Any]
     arrival: float
     stamp_ns: int = 0
+
+
+def received(data: bytes, of: SubscribedTopic) -> Waiting:
+    """A message that has come now; whoever wants it, it is read once."""
+    read: Callable[[], Any] = cache(partial(deserialise, data, of.msgtype))
+    if len(data) > of.largest:
+        # It is not kept.
+        read = partial(_refuse, f'it has {len(data)} bytes, the limit is {of.largest}')
+    stamp = stamp_in(data) if opens_with_header(of.msgtype) else 0
+    return Waiting(of.source, read, time.monotonic(), stamp)
+
+
+def _refuse(why: str) -> NoReturn:
+    raise ValueError(why)
 
 
 class Duration(NamedTuple):
@@ -71,14 +99,17 @@ class Arrived(NamedTuple):
 
 
 class InputQueue:
-    """First in, first out, between two threads.
+    """First in, first out, between threads.
 
     Args:
         limits: most that may wait, by source or by kind of source; others have no limit.
         counted: the kind of source whose dropped members are counted.
+        changed: is notified when something comes; its lock guards the queue.
     """
 
-    def __init__(self, limits: Mapping[str, int], counted: str) -> None:
+    def __init__(
+        self, limits: Mapping[str, int], counted: str, changed: threading.Condition | None = None
+    ) -> None:
         self._limits = dict(limits)
         self._counted = counted
         self._waiting: deque[Waiting] = deque()
@@ -86,7 +117,7 @@ class InputQueue:
         self._dropped = 0
         self._dropped_stamps: deque[int] = deque(maxlen=_ANSWERED)
         self._closed = False
-        self._changed = threading.Condition()
+        self._changed = changed or threading.Condition()
 
     def limit(self, source: str, most: int) -> None:
         """Changes how many of a source, or of each of a kind, may wait."""
@@ -110,29 +141,30 @@ class InputQueue:
                     self._dropped_stamps.append(self._waiting[index].stamp_ns)
                 del self._waiting[index]
                 self._sizes[source] -= 1
-            self._changed.notify()
+            self._changed.notify_all()
 
-    def get(self) -> Arrived | None:
-        """Waits for something and takes all out that is there; None: the queue is closed."""
+    def take(self, most: int | None = None) -> Arrived:
+        """Takes out what is there, or the first of it."""
         with self._changed:
-            while not self._waiting and not self._closed:
-                self._changed.wait()
-            return None if self._closed else self._take_out()
+            count = len(self._waiting) if most is None else min(most, len(self._waiting))
+            taken = tuple(self._waiting.popleft() for _ in range(count))
+            self._sizes.subtract(one.source for one in taken)
+            result = Arrived(taken, self._dropped, tuple(self._dropped_stamps))
+            self._dropped = 0
+            self._dropped_stamps.clear()
+            return result
 
     def close(self) -> Arrived:
-        """Ends every `get`; returns the waiting messages."""
+        """Takes nothing in any more; returns what waits."""
         with self._changed:
             self._closed = True
-            self._changed.notify_all()
-            return self._take_out()
+            return self.take()
 
-    def _take_out(self) -> Arrived:
-        result = Arrived(tuple(self._waiting), self._dropped, tuple(self._dropped_stamps))
-        self._waiting.clear()
-        self._sizes.clear()
-        self._dropped = 0
-        self._dropped_stamps.clear()
-        return result
+    @property
+    def since(self) -> float:
+        """When the oldest that waits came; infinity where nothing waits."""
+        with self._changed:
+            return self._waiting[0].arrival if self._waiting else math.inf
 
     def __len__(self) -> int:
         with self._changed:
@@ -157,25 +189,103 @@ class InnerFaults:
         self.last = f'{type(error).__name__}: {error_line(error)}'
 
 
-class _TooLarge(NamedTuple):
-    """Stands for a message that is not kept."""
-
-    size: int
-    limit: int
-
-
 class EstimatingThread:
-    """Handles messages from their bytes to the report on them.
+    """Gives sessions their turns, while it serves some.
 
-    All methods may be called by any thread.
+    All methods may be called by any thread but this one.
 
     Args:
-        session: used by this thread alone, until `stop` has returned True.
+        changed: of all threads of the process, and of the queues of those whom they serve.
+        after: a thread that has work to do before this one.
+    """
+
+    def __init__(self, changed: threading.Condition, after: EstimatingThread | None = None) -> None:
+        self.changed, self._after = changed, after
+        self._served: list[Estimator] = []
+        # Whose turn it is.
+        self._busy: Estimator | None = None
+        self._thread: threading.Thread | None = None
+
+    def serve(self, estimator: Estimator) -> None:
+        """Begins to give turns to somebody."""
+        with self.changed:
+            self._served.append(estimator)
+            self._served.sort(key=lambda one: one.place)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._work, name='estimate', daemon=True)
+                self._thread.start()
+
+    def leave(self, estimator: Estimator, timeout: float | None) -> bool:
+        """Gives somebody no more turns; returns whether the present one ends within `timeout` s."""
+        with self.changed:
+            if estimator in self._served:
+                self._served.remove(estimator)
+            self.changed.notify_all()
+            return self.changed.wait_for(lambda: self._busy is not estimator, timeout)
+
+    def _work(self) -> None:
+        last = -1
+        while (estimator := self._next(last)) is not None:
+            last = estimator.place
+            estimator.handle(estimator.queue.take(None if self._after is None else 1))
+
+    def _next(self, last: int) -> Estimator | None:
+        """Whose turn it is after that of a place, once something waits; None: nobody is served."""
+        with self.changed:
+            self._busy = None
+            self.changed.notify_all()
+            while self._served:
+                ready = [one for one in self._served if len(one.queue) and self._may_begin(one)]
+                if ready:
+                    self._busy = next((one for one in ready if one.place > last), ready[0])
+                    return self._busy
+                self.changed.wait(None if self._after is None else LONGEST_WAIT / 2)
+            self._thread = None
+            return None
+
+    def _may_begin(self, estimator: Estimator) -> bool:
+        if self._after is None or time.monotonic() - estimator.queue.since > LONGEST_WAIT:
+            return True
+        return self._after._busy is None and not any(len(x.queue) for x in self._after._served)
+
+
+class EstimatingThreads:
+    """The threads of a process.
+
+    Attributes:
+        poses: for what leads to the pose.
+        later: for what can wait for it.
+    """
+
+    def __init__(self) -> None:
+        changed = threading.Condition()
+        self.poses = EstimatingThread(changed)
+        self.later = EstimatingThread(changed, after=self.poses)
+        self._pictures: deque[tuple[Any, Image]] = deque(maxlen=SHARED)
+
+    def decode(self, message: Any) -> Image:
+        """The picture of an image, as `decode_image`; decoded once for all sessions."""
+        for known, picture in tuple(self._pictures):
+            if known is message:
+                return picture
+        picture = decode_image(message)
+        self._pictures.append((message, picture))
+        return picture
+
+
+class Estimator:
+    """Handles the messages of a session, up to the report on each.
+
+    All methods but `handle` may be called by any thread.
+
+    Args:
+        session: used by the thread alone, until `stop` has returned True.
+        thread: that gives it its turns.
+        place: of its turns among those of others.
         tell: takes the report on each message.
         tell_change: called when status or kinds of faults of the session have changed.
         inner_faults: counts errors that the session should not have raised.
         log_error: takes the traceback of such an error.
-        read: the message of a type in bytes.
 
     Attributes:
         queue: messages and requests that wait.
@@ -184,45 +294,31 @@ class EstimatingThread:
     def __init__(
         self,
         session: Session[Any, Any],
-        inputs: Iterable[SubscribedTopic],
+        thread: EstimatingThread,
         *,
+        place: int,
         tell: Callable[[Handled], None],
         tell_change: Callable[[], None],
         inner_faults: InnerFaults,
         log_error: Callable[[str], None],
-        read: Callable[[bytes, str], Any] = deserialise,
     ) -> None:
-        self._session, self._read = session, read
-        session.interrupted = self._is_interrupted
-        self._inputs: dict[str, SubscribedTopic] = {}
-        self._stamped: set[str] = set()
+        self._session, self._thread = session, thread
+        self.place = place
         # The last of several requests to start anew counts.
         limits = {_RESTART: 1, session.COUNTED: session.most_waiting}
-        self.queue = InputQueue(limits, counted=session.COUNTED)
-        for one in inputs:
-            self.listen(one)
+        self.queue = InputQueue(limits, session.COUNTED, thread.changed)
+        session.interrupted = lambda: bool(len(self.queue))
         self._tell, self._tell_change = tell, tell_change
         self._inner_faults, self._log_error = inner_faults, log_error
         self._latencies: deque[float] = deque(maxlen=1000)
         self._durations: deque[Duration] = deque(maxlen=1000)
         self._arrivals: dict[int, float] = {}
-        self._thread = threading.Thread(target=self._work, name='estimate', daemon=True)
-        self._thread.start()
+        thread.serve(self)
 
     def listen(self, one: SubscribedTopic) -> None:
         """Adds a topic that messages come from."""
         if kind_of(one.source) != self._session.COUNTED:
             self.queue.limit(one.source, one.waiting)
-        self._inputs[one.source] = one
-        if one.opens_with_header:
-            self._stamped.add(one.source)
-
-    def put(self, source: str, data: bytes, arrival: float) -> None:
-        """Adds a message."""
-        largest = self._inputs[source].largest
-        content = data if len(data) <= largest else _TooLarge(len(data), largest)
-        stamp = stamp_in(data) if source in self._stamped else 0
-        self.queue.put(Waiting(source, content, arrival, stamp))
 
     def restart(self, action: Callable[[], None]) -> None:
         """Restarts the session by an action, after the messages that have come before."""
@@ -241,14 +337,13 @@ class EstimatingThread:
         return [self._durations.popleft() for _ in range(len(self._durations))]
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Ends the thread after the present message; drops waiting ones, except a restart.
+        """Ends after the present turn; drops waiting messages, but does a restart.
 
         Returns:
-            Whether the thread has ended within `timeout` s.
+            Whether it has ended within `timeout` s.
         """
         left = self.queue.close()
-        self._thread.join(timeout)
-        if self._thread.is_alive():
+        if not self._thread.leave(self, timeout):
             return False
         counted = sum(kind_of(waiting.source) == self._session.COUNTED for waiting in left.waiting)
         self._session.count_dropped(left.dropped + counted)
@@ -257,18 +352,15 @@ class EstimatingThread:
                 waiting.content()
         return True
 
-    def _is_interrupted(self) -> bool:
-        return bool(len(self.queue))
-
-    def _work(self) -> None:
+    def handle(self, arrived: Arrived) -> None:
+        """Handles what has come; for the thread."""
         session = self._session
-        while (arrived := self.queue.get()) is not None:
-            session.count_dropped(arrived.dropped - len(arrived.stamps_ns))
-            for stamp in arrived.stamps_ns:
-                self._tell(session.drop(stamp))
-            following = [waiting.source for waiting in arrived.waiting[1:]]
-            for waiting, after in zip(arrived.waiting, [*following, _RESTART], strict=True):
-                self._try_to_handle(waiting, more=after != _RESTART)
+        session.count_dropped(arrived.dropped - len(arrived.stamps_ns))
+        for stamp in arrived.stamps_ns:
+            self._tell(session.drop(stamp))
+        following = [waiting.source for waiting in arrived.waiting[1:]]
+        for waiting, after in zip(arrived.waiting, [*following, _RESTART], strict=True):
+            self._try_to_handle(waiting, more=after != _RESTART)
 
     def _try_to_handle(self, waiting: Waiting, *, more: bool) -> None:
         session = self._session
@@ -296,11 +388,7 @@ class EstimatingThread:
             if len(self._arrivals) > _REMEMBERED:
                 del self._arrivals[next(iter(self._arrivals))]
         try:
-            if isinstance(waiting.content, _TooLarge):
-                raise ValueError(
-                    f'it has {waiting.content.size} bytes, the limit is {waiting.content.limit}'
-                )
-            message = self._read(waiting.content, self._inputs[waiting.source].msgtype)
+            message = waiting.content()
         except Exception as error:  # noqa: BLE001
             # Bytes from outside meet generated code here, which does not say what it may raise.
             handled = session.refuse(waiting.source, error_line(error), more=more)

@@ -1,4 +1,4 @@
-"""filter_node: images in, mixtures over poses out; a lifecycle node around a `FilterSession`."""
+"""filter_node: images in, mixtures over poses out; a lifecycle node around a `TrackingSession`."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from hmt_msgs.srv import ForecastPose, Reset
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.tracking_node import TrackingNode
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools import RosbagsMessages
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.pose_mixtures import pose_mixture_message
 
 
-class FilterNode(TrackingNode[FilterSession, FilterParameters]):
+class FilterNode(TrackingNode[TrackingSession, FilterParameters]):
     """The node; its parameters are the fields of `FilterParameters`."""
 
     NAME = 'filter_node'
     SUBJECT = 'track'
-    SESSION = FilterSession
+    SESSION = TrackingSession
     DEFAULTS = FilterParameters()
 
     def _in_namespace(self, defaults: FilterParameters) -> FilterParameters:
@@ -36,25 +36,16 @@ class FilterNode(TrackingNode[FilterSession, FilterParameters]):
         yield from super()._offered_services()
         yield ForecastPose, '~/forecast_pose', self._on_forecast_pose
 
-    def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
+    def _start_asked_for(self, request: Reset.Request) -> TrackStart:
         assert self._session is not None
-        state = self._session.state
-        start = prepare_start(self._settings, request.initial, state.body, request.box)
-        sources = start.parameters.sources
-        if start.box is not None or start.initial is not None:
-            return start, 'the next image starts a new track'
-        if sources:
-            return start, f'the next image with {" or ".join(sources)} starts a new track'
-        return start, (
-            'the track is dropped; nothing starts a new one without subject_file, use_keypoints, '
-            'use_mask or use_predictions'
-        )
+        present = self._session.state.body
+        return prepare_start(self._settings, request.initial, present, request.box)
 
     def _on_forecast_pose(
         self, request: ForecastPose.Request, response: ForecastPose.Response
     ) -> Any:
-        def forecast(session: FilterSession) -> Any:
-            content = session.robot.forecast(time_ns(request.stamp))
+        def forecast(session: TrackingSession) -> Any:
+            content = session.forecast(time_ns(request.stamp))
             return pose_mixture_message(RosbagsMessages(), content)
 
         return self._answer(response, 'mixture', forecast)

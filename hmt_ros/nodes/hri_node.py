@@ -95,29 +95,24 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         return sorted(found)
 
     def _look_for_people(self) -> None:
-        thread = self._thread
-        if thread is None or self._settings.named or not self._listeners:
+        if self._estimator is None or self._settings.named or not self._heard:
             return
         end = f'/{self._settings.mixture_topic}'
-        for listener in list(self._listeners):
-            one = listener.subscription
-            if listener.topic.endswith(end) and one is not None and not one.get_publisher_count():
-                self._leave(listener)
-        known = {listener.topic for listener in self._listeners}
+        for name, subscription in list(self._connected.items()):
+            if name.endswith(end) and not subscription.get_publisher_count():
+                self._leave(name)
         for namespace in self._found():
             one = self._mixtures_in(namespace)
-            if self._local_name(one.topic) in known:
+            if self._local_name(one.topic) in self._heard:
                 continue
-            if len(known) >= _MOST_TOPICS:
+            if len(self._heard) >= _MOST_TOPICS:
                 self.get_logger().warn(
                     f'{_MOST_TOPICS} topics are subscribed to, which is the limit: mixtures in '
                     f'{namespace} are left out; name those that count in the parameter namespaces',
                     once=True,
                 )
                 return
-            thread.listen(one)
             self._subscribe(one)
-            known.add(self._local_name(one.topic))
             self.get_logger().info(f'mixtures from {one.topic}')
 
     # Bodies come and go; called by the thread that estimates.

@@ -10,8 +10,7 @@ from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic, image_topic
 from hmt_ros.sessions.image_inputs import MASK
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-from hmt_ros.sessions.keypoints_session import KeypointsSession
+from hmt_ros.sessions.keypoints_session import KeypointsParameters, KeypointsSession
 
 
 class KeypointsNode(SessionNode[KeypointsSession, KeypointsParameters]):

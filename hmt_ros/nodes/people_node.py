@@ -16,10 +16,10 @@ from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.subscribed_topic import published_with
 from hmt_ros.nodes.tracking_node import TrackingNode
 from hmt_ros.sessions.handled import Output
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession, published_topic
-from hmt_ros.sessions.person_session import person_of
+from hmt_ros.sessions.track import person_of
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
 
 # Periods of the diagnostics after which the topics of somebody who has left are closed: the last
 # messages are still on their way.
@@ -46,10 +46,10 @@ class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
         self._close_topics({name for topic in self._outputs if (name := person_of(topic))})
         return result
 
-    def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
+    def _start_asked_for(self, request: Reset.Request) -> TrackStart:
         if len(request.initial.components) or request.box.width:
             raise ValueError('a mixture or a box is of one person: wanted an empty request')
-        return prepare_start(self._settings), 'the next detections start new tracks'
+        return prepare_start(self._settings)
 
     # Called by the thread that estimates.
 

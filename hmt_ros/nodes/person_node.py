@@ -1,9 +1,10 @@
 """person_node: filter, smoother, experts and a detector in one process.
 
 The nodes are the same as in processes of their own: names, parameters, topics, services and bytes.
-Messages go from one to another without the middleware (`hmt_ros.nodes.local_topics`), images come
-in once, and the libraries are in memory once. Names on the command line select the nodes; by the
-defaults of their parameters they use each other's results.
+One thread calls the sessions in the order in which they use each other's results, detector, experts
+and filter, and one the smoother, when no image waits (`hmt_ros.nodes.estimating_thread`). Images
+come in once, and the libraries are in memory once. Names on the command line select the nodes; by
+the defaults of their parameters they use each other's results.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from typing import Any
 from hmt_ros.nodes.bme_node import BmeNode
 from hmt_ros.nodes.filter_node import FilterNode
 from hmt_ros.nodes.keypoints_node import KeypointsNode
-from hmt_ros.nodes.local_topics import LocalTopics
 from hmt_ros.nodes.run_node import run_together, wants_help
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.smoother_node import SmootherNode
@@ -25,6 +25,8 @@ NAME = 'person_node'
 NODES: Mapping[str, type[SessionNode[Any, Any]]] = {
     node.NAME: node for node in (FilterNode, SmootherNode, BmeNode, KeypointsNode)
 }
+# In the order of their turns.
+_ORDER = (KeypointsNode.NAME, BmeNode.NAME, FilterNode.NAME, SmootherNode.NAME)
 USUAL = (FilterNode.NAME, SmootherNode.NAME, BmeNode.NAME)
 # Interval between two predictions while the filter tracks the person, s.
 TRACKED_INTERVAL = 0.2
@@ -57,16 +59,16 @@ def used_of_each_other(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def nodes_together(names: Sequence[str], **options: Any) -> list[SessionNode[Any, Any]]:
-    """Nodes that hand their messages to each other.
+    """Nodes that share a thread and their messages, in the order of their turns.
 
     Args:
         options: of all of them, see `SessionNode`.
     """
-    local, values = LocalTopics(), used_of_each_other(names)
-    return [
-        NODES[name](replace(NODES[name].DEFAULTS, **values[name]), local, **options)
-        for name in names
-    ]
+    values, nodes = used_of_each_other(names), []
+    for name in sorted(names, key=_ORDER.index):
+        defaults = replace(NODES[name].DEFAULTS, **values[name])
+        nodes.append(NODES[name](defaults, nodes[0] if nodes else None, **options))
+    return nodes
 
 
 def main(args: list[str] | None = None) -> int:

@@ -34,6 +34,9 @@ OWNER = 'HMT_ROS_OWNER'
 
 # Parameter of mallopt(3): the largest number of heaps.
 _ARENA_MAX = -8
+# Time after which Python's lock passes to a thread that waits for it, s. By default it is 5 ms: a
+# step would wait so long at each call of compiled code beside a thread that is busy.
+_SWITCH_INTERVAL = 0.0005
 # Time for a last estimate at the end, s.
 _LAST_ESTIMATE = 5.0
 _WIDTH = 100
@@ -61,6 +64,7 @@ def run_together(
     _use_one_heap()
     # OpenCV's own threads wait actively: on images of a camera they cost more than they save.
     cv2.setNumThreads(1)
+    sys.setswitchinterval(_SWITCH_INTERVAL)
     # The handlers of rclpy end the context in the middle of the work; ours let the work finish.
     stopped = threading.Event()
     nodes: Sequence[SessionNode[Any, Any]] = ()

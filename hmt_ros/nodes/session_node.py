@@ -1,8 +1,11 @@
 """A lifecycle node around a session: messages in, messages out, one thread that estimates.
 
 The executor's thread only puts messages into a queue and answers services; one other thread
-estimates. Messages pass as bytes in both directions: the same code as offline reads and writes the
+estimates. Messages pass the middleware as bytes: the same code as offline reads and writes the
 bytes of a bag or a wire.
+
+Nodes of one process share their threads. A message of one goes to the others as it is, and a topic
+of other processes is subscribed to once, by the first node that listens.
 
 `~/handled` (hmt_msgs/Handled) reports on every message that was received, after all that it led to
 has been published. A player that waits for it feeds the node in lock step.
@@ -29,8 +32,13 @@ from rclpy.serialization import deserialize_message
 
 from hmt_ros.compiled_code import prepare
 from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, trouble_of_period
-from hmt_ros.nodes.estimating_thread import EstimatingThread, InnerFaults
-from hmt_ros.nodes.local_topics import Listener, LocalTopics, OwnMessages
+from hmt_ros.nodes.estimating_thread import (
+    EstimatingThreads,
+    Estimator,
+    InnerFaults,
+    Waiting,
+    received,
+)
 from hmt_ros.nodes.node_parameters import (
     QOS_OVERRIDES,
     as_in_ros,
@@ -39,6 +47,7 @@ from hmt_ros.nodes.node_parameters import (
     unknown_parameters,
     with_empty_lists,
 )
+from hmt_ros.nodes.own_messages import OwnMessages
 from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.nodes.subscribed_topic import (
     ANSWERS,
@@ -70,7 +79,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     Args:
         defaults: of the parameters; None: those of the class.
-        local: topics between the nodes of this process; None: it has no other nodes.
+        beside: another node of this process; None: it has none yet.
         options: of `rclpy.lifecycle.LifecycleNode`.
 
     Attributes:
@@ -78,6 +87,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         SUBJECT: subject of the diagnostics.
         SESSION: class of the session.
         DEFAULTS: parameters with their default values.
+        CAN_WAIT: whether its results can wait for those of other nodes of the process.
         preparing: whether kernels are being compiled or loaded, which may take a minute.
     """
 
@@ -86,9 +96,13 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     # Of the types of the class, which a class variable can not name.
     SESSION: ClassVar[Any]
     DEFAULTS: ClassVar[Any]
+    CAN_WAIT: ClassVar[bool] = False
 
     def __init__(
-        self, defaults: Any = None, local: LocalTopics | None = None, **options: Any
+        self,
+        defaults: Any = None,
+        beside: SessionNode[Any, Any] | None = None,
+        **options: Any,
     ) -> None:
         super().__init__(self.NAME, **options)
         defaults = self._in_namespace(self.DEFAULTS if defaults is None else defaults)
@@ -111,18 +125,22 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._refuse_impossible_transitions()
         self.preparing = False
         self._session: AnySession | None = None
-        self._thread: EstimatingThread | None = None
+        self._estimator: Estimator | None = None
         self._outputs: dict[str, Any] = {}
         self._handled: Any = None
         self._offered: list[Any] = []
-        self._local = LocalTopics() if local is None else local
+        self._threads = EstimatingThreads() if beside is None else beside._threads
+        # The nodes of this process, in the order of their turns.
+        self._nodes: list[SessionNode[Any, Any]] = [] if beside is None else beside._nodes
         self._local_names: dict[str, str] = {}
-        self._listeners: list[Listener] = []
-        for topic in self._offered_topics():
-            if not topic.startswith('/'):
-                self._local.offer(self._local_name(topic))
+        offered = (topic for topic in self._offered_topics() if not topic.startswith('/'))
+        self._offered_names = {self._local_name(topic) for topic in offered}
+        # Topics that are listened to, by their names in this process, and own subscriptions.
+        self._heard: dict[str, SubscribedTopic] = {}
+        self._connected: dict[str, Any] = {}
+        self._nodes.append(self)
         # Topics that the node both publishes and subscribes to, and its own messages there.
-        self._heard: set[str] = set()
+        self._returning: set[str] = set()
         self._own = OwnMessages()
         self._failure = ''
         self._inner_faults = InnerFaults()
@@ -183,9 +201,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         Returns:
             Whether it has ended within `timeout` s.
         """
-        if self._thread is not None and not self._thread.stop(timeout):
+        if self._estimator is not None and not self._estimator.stop(timeout):
             return False
-        self._thread = None
+        self._estimator = None
         return True
 
     def _new_session(self, settings: Parameters, *functions: Callable[..., Any]) -> AnySession:
@@ -197,7 +215,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         for msgtype, needed_by in self._messages_of_others(settings).items():
             read_installed_messages(msgtype, needed_by)
         session: AnySession = self.SESSION(settings, *functions)
-        session.decode_image = self._local.decode
+        session.decode_image = self._threads.decode
         return session
 
     def _answer(self, response: Any, field: str, make: Callable[[AnySession], Any]) -> Any:
@@ -252,16 +270,16 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         assert self._session is not None
         session, inputs = self._session, list(self._wanted_inputs())
         result = super().on_activate(state)
-        self._thread = EstimatingThread(
+        self._estimator = Estimator(
             session,
-            inputs,
+            self._threads.later if self.CAN_WAIT else self._threads.poses,
+            place=self._nodes.index(self),
             tell=self._tell,
             tell_change=self._diagnose,
             inner_faults=self._inner_faults,
             log_error=self.get_logger().error,
-            read=self._local.read,
         )
-        self._heard = {one.topic for one in inputs} & self._outputs.keys()
+        self._returning = {one.topic for one in inputs} & self._outputs.keys()
         session.topic_names = {one.source: self.resolve_topic_name(one.topic) for one in inputs}
         self._silent.listen(inputs, self.SESSION.COUNTED)
         for one in inputs:
@@ -296,46 +314,59 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return super().on_error(state)
 
     def _subscribe(self, wanted: SubscribedTopic) -> None:
-        thread = self._thread
-        assert thread is not None
+        assert self._estimator is not None
+        self._estimator.listen(wanted)
+        name = self._local_name(wanted.topic)
+        self._heard[name] = wanted
+        self._connect(name)
+
+    def _connect(self, name: str) -> None:
+        """Subscribes to a topic, unless it is one of this process or has come into it already."""
+        if any(name in one._offered_names or name in one._connected for one in self._nodes):
+            return
+        wanted = self._heard[name]
 
         def receive(data: bytes) -> None:
-            if wanted.topic in self._heard and self._own.is_own(data):
-                return
-            now = time.monotonic()
-            self._silent.arrived(wanted.source, now)
-            thread.put(wanted.source, data, now)
+            if wanted.topic not in self._returning or not self._own.is_own(data):
+                self._hand_on(name, received(data, wanted))
 
-        topic = self.resolve_topic_name(wanted.topic)
-        name = self._local_name(wanted.topic)
+        self._connected[name] = self.create_subscription(
+            message_class(wanted.msgtype),
+            wanted.topic,
+            receive,
+            wanted.qos,
+            raw=True,
+            event_callbacks=self._events.of_subscription(self.resolve_topic_name(wanted.topic)),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
 
-        def connect() -> Any:
-            return self.create_subscription(
-                message_class(wanted.msgtype),
-                wanted.topic,
-                lambda data: self._local.deliver(name, data),
-                wanted.qos,
-                raw=True,
-                event_callbacks=self._events.of_subscription(topic),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
+    def _leave(self, name: str) -> None:
+        """Listens to a topic no more; another node of the process takes the subscription over."""
+        del self._heard[name]
+        if (subscription := self._connected.pop(name, None)) is None:
+            return
+        self.destroy_subscription(subscription)
+        for one in self._listeners(name):
+            one._connect(name)
 
-        self._listeners.append(listener := Listener(name, receive, connect))
-        self._local.listen(listener)
+    def _listeners(self, name: str) -> list[SessionNode[Any, Any]]:
+        """The nodes of this process that listen to a topic."""
+        return [one for one in self._nodes if name in one._heard]
 
-    def _leave(self, listener: Listener) -> None:
-        self._listeners.remove(listener)
-        if (subscription := self._local.leave(listener)) is not None:
-            self.destroy_subscription(subscription)
+    def _hand_on(self, name: str, waiting: Waiting) -> None:
+        """Gives a message to the nodes of this process; for any thread."""
+        for one in self._nodes:
+            one._hear(name, waiting)
 
-    @property
-    def _connected(self) -> list[Any]:
-        """The subscriptions that this node has by itself."""
-        return [one.subscription for one in self._listeners if one.subscription is not None]
+    def _hear(self, name: str, waiting: Waiting) -> None:
+        wanted, estimator = self._heard.get(name), self._estimator
+        if wanted is not None and estimator is not None:
+            self._silent.arrived(wanted.source, waiting.arrival)
+            estimator.queue.put(waiting._replace(source=wanted.source))
 
     def _unsubscribe(self) -> None:
-        for listener in list(self._listeners):
-            self._leave(listener)
+        for name in list(self._heard):
+            self._leave(name)
         self._events.forget()
         self._silent.listen(())
 
@@ -393,8 +424,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._settings = settings
         if self._session is not None:
             self._session.parameters = settings
-        if self._thread is not None:
-            self._thread.take_limit()
+        if self._estimator is not None:
+            self._estimator.take_limit()
         return SetParametersResult(successful=True)
 
     # Called by the thread that estimates.
@@ -408,11 +439,15 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self._handled.publish(serialise(handled_message(RosbagsMessages(), handled)))
 
     def _publish(self, output: Output) -> None:
-        if output.topic in self._heard:
+        if output.topic in self._returning:
             self._own.sent(output.data)
-        self._outputs[output.topic].publish(output.data)
-        if not output.topic.startswith('/'):
-            self._local.deliver(self._local_name(output.topic), output.data)
+        publisher, name = self._outputs[output.topic], self._local_name(output.topic)
+        inside = self._inside(output.topic)
+        # What only nodes of this process want is not even made into bytes.
+        if not inside or publisher.get_subscription_count():
+            publisher.publish(output.data)
+        for one in inside:
+            one._hear(name, Waiting('', lambda: output.message, time.monotonic(), output.stamp_ns))
 
     def _is_wanted(self, topic: str) -> bool:
         return bool(self._subscribers(topic))
@@ -420,7 +455,11 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     def _subscribers(self, topic: str) -> int:
         """How many subscribe to a topic of this node, in this process and in others."""
         others = self._outputs[topic].get_subscription_count()
-        return int(others) + self._local.listeners(self._local_name(topic))
+        return int(others) + len(self._inside(topic))
+
+    def _inside(self, topic: str) -> list[SessionNode[Any, Any]]:
+        """The nodes of this process that get a topic of this node as it is."""
+        return [] if topic.startswith('/') else self._listeners(self._local_name(topic))
 
     def _local_name(self, topic: str) -> str:
         """Name of a topic among nodes of this process; shared ones, as /tf, go over ROS."""
@@ -439,11 +478,12 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             counts = Counter(state.counts)
             counts['faults'] = state.faults.total()
         counts['lost'] = self._events.lost
-        latencies = [] if self._thread is None else self._thread.take_latencies()
-        durations = [] if self._thread is None else self._thread.take_durations()
-        waiting = 0 if self._thread is None else len(self._thread.queue)
+        estimator = self._estimator
+        latencies = [] if estimator is None else estimator.take_latencies()
+        durations = [] if estimator is None else estimator.take_durations()
+        waiting = 0 if estimator is None else len(estimator.queue)
         self._rates.next_period(counts, latencies, durations, waiting)
-        if self._session is not None and self._listeners:
+        if self._session is not None and self._heard:
             self._silent.look(self._session.needed_inputs())
         self._diagnose()
         self._log_status(counts)
@@ -469,7 +509,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return DiagnosticStatus.OK, label
         trouble = (
             state.trouble()
-            or self._events.deaf_topic(self._connected)
+            or self._events.deaf_topic(self._connected.values())
             or trouble_of_period(state, self._rates, self._silent)
         )
         if trouble:
@@ -481,7 +521,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if state is not None and state.frame_id:
             return state.frame_id
         # Before its name, a topic that is not shared in this process has that of the node.
-        return self._listeners[-1].topic.rpartition(' ')[2] if self._listeners else ''
+        return next(reversed(self._heard), '').rpartition(' ')[2]
 
     def _diagnose(self) -> None:
         label = self._state_machine.current_state[1]

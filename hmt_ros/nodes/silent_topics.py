@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import time
 from collections.abc import Callable, Iterable, Mapping
-from functools import lru_cache
 from typing import NamedTuple
 
 from rclpy.node import Node
@@ -20,12 +19,11 @@ from hmt_ros.sessions.session import NeededInput, kind_of
 
 # Time without a message after which a topic is silent, and between two warnings of one text, s.
 SILENCE, REPEAT = 3.0, 30.0
-# Number of topics that are suggested instead, and least likeness of their names.
-_MOST_NAMED, _ALIKE = 3, 0.6
+# Number of topics that are suggested instead.
+_MOST_NAMED = 3
 _IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
-_SUFFIX = '/compressed'
-_IMAGES = ('image', f'image{_SUFFIX}')
-_OTHER = {_IMAGE: _COMPRESSED, _COMPRESSED: _IMAGE}
+# The value of image_transport for images of a type, and the topic that is then subscribed to.
+_TRANSPORTS = {_IMAGE: ('raw', 'image'), _COMPRESSED: ('compressed', 'image/compressed')}
 
 
 class Publication(NamedTuple):
@@ -107,26 +105,22 @@ class SilentTopics:
         return now - last >= SILENCE
 
     def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
-        """Publications of others on topics that are like some, by type or by name.
+        """Publications of others on some topics, or of the types that these may have.
 
         The silhouettes and overlays of our own nodes are no images of a camera.
         """
         own = self._node.get_fully_qualified_name()
-        topics = self._node.get_topic_names_and_types()
-        ours = {
-            topic.removesuffix('/handled')
-            for topic, kinds in topics
-            if HANDLED in kinds and any(one.topic in _IMAGES for one in wanted)
-        }
-        types = {one.msgtype for one in wanted}
-        types |= {_OTHER[each] for each in types & _OTHER.keys()}
+        topics = dict(self._node.get_topic_names_and_types())
+        ours = {topic.removesuffix('/handled') for topic in topics if HANDLED in topics[topic]}
+        images = any(_is_image(one) for one in wanted)
+        types = {one.msgtype for one in wanted} | (_TRANSPORTS.keys() if images else set())
         found = []
-        for topic, kinds in topics:
-            if not types & set(kinds) and all(_likeness(topic, x) < _ALIKE for x in names):
+        for topic, kinds in topics.items():
+            if topic not in names and not types & set(kinds):
                 continue
             for info in self._node.get_publishers_info_by_topic(topic):
                 by = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                if by != own and (by not in ours or topic in names):
+                if by != own and (topic in names or not (images and by in ours)):
                     found.append(Publication(topic, info.topic_type, by))
         return found
 
@@ -154,57 +148,23 @@ def why_silent(
 
 
 def _instead(wanted: SubscribedTopic, name: str, published: list[Publication]) -> str:
-    """Similar topics in place of a topic, in words; '' if nothing is like it."""
-    kinds = {each.topic: each.msgtype for each in published}
-    transport = _other_transport(wanted, name, kinds)
-    if transport:
-        return transport
-    same = [topic for topic, kind in kinds.items() if kind == wanted.msgtype and topic != name]
-    alike = [
-        topic
-        for topic, kind in kinds.items()
-        if kind != wanted.msgtype and topic != name and _likeness(topic, name) >= _ALIKE
-    ]
-    other = [topic for topic in kinds if kinds[topic] == _OTHER.get(wanted.msgtype)]
-    near = [*_nearest(same, name), *_nearest(alike if same else [*alike, *other], name)]
-    found = list(dict.fromkeys(near))[:_MOST_NAMED]
-    if not found:
-        return ''
-    verb = 'is' if len(found) == 1 else 'are'
-    named = ', '.join(f'{topic} ({_short(kinds[topic])})' for topic in found)
-    return f'there {verb} {named}{_remedy(wanted, found[0], kinds[found[0]])}'
-
-
-def _other_transport(wanted: SubscribedTopic, name: str, kinds: Mapping[str, str]) -> str:
-    """Whether the images of a topic are published in the other transport."""
-    if wanted.topic == 'image' and kinds.get(f'{name}{_SUFFIX}') == _COMPRESSED:
-        return f'{name}{_SUFFIX} is published: set image_transport to compressed'
-    raw = name.removesuffix(_SUFFIX)
-    if wanted.topic == f'image{_SUFFIX}' and kinds.get(raw) == _IMAGE:
-        return f'{raw} is published: set image_transport to raw'
+    """Topics in place of a topic, those with the most similar names first; '' if there is none."""
+    kinds = _TRANSPORTS if _is_image(wanted) else {wanted.msgtype: ('', wanted.topic)}
+    # Those of the type that is wanted before those of the other transport.
+    for kind in sorted(kinds, key=lambda each: each != wanted.msgtype):
+        transport, topic = kinds[kind]
+        there = sorted({x.topic for x in published if x.msgtype == kind})
+        nearest = difflib.get_close_matches(name, there, _MOST_NAMED, 0.0)
+        if nearest:
+            verb = 'is' if len(nearest) == 1 else 'are'
+            named = ', '.join(f'{each} ({_short(kind)})' for each in nearest)
+            choice = f'set image_transport to {transport} and ' if kind != wanted.msgtype else ''
+            return f'there {verb} {named}: {choice}remap with -r {topic}:={nearest[0]}'
     return ''
 
 
-def _remedy(wanted: SubscribedTopic, found: str, kind: str) -> str:
-    """How the node gets the messages of another topic; '' if it can not."""
-    if kind == wanted.msgtype:
-        return f': remap with -r {wanted.topic}:={found}'
-    if wanted.topic in _IMAGES and kind == _OTHER[wanted.msgtype]:
-        transport, topic = ('raw', 'image') if kind == _IMAGE else ('compressed', f'image{_SUFFIX}')
-        return f': set image_transport to {transport} and remap with -r {topic}:={found}'
-    return ''
-
-
-def _nearest(topics: Iterable[str], name: str) -> list[str]:
-    """Topics, those with the most similar names first."""
-    return sorted(topics, key=lambda topic: (-_likeness(topic, name), topic))
-
-
-@lru_cache(maxsize=4096)
-def _likeness(topic: str, name: str) -> float:
-    """How alike two names are, 0 to 1: as a whole, or in their last parts."""
-    pairs = ((topic, name), (topic.rpartition('/')[2], name.rpartition('/')[2]))
-    return max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+def _is_image(wanted: SubscribedTopic) -> bool:
+    return (wanted.msgtype, wanted.topic) in {(x, topic) for x, (_, topic) in _TRANSPORTS.items()}
 
 
 def _short(msgtype: str) -> str:

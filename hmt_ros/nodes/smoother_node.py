@@ -27,6 +27,7 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
     SUBJECT = 'smoothing'
     SESSION = SmootherSession
     DEFAULTS = SmootherParameters()
+    CAN_WAIT = True
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield SmoothWindow, '~/smooth_window', self._on_smooth_window

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,12 +54,6 @@ class SubscribedTopic(NamedTuple):
     qos: QoSProfile = qos_profile_sensor_data
     largest: int = LARGEST
     waiting: int = SMALL_QUEUE
-
-    @property
-    def opens_with_header(self) -> bool:
-        """Whether messages of the type begin with a std_msgs/Header."""
-        first = next(iter(message_class(self.msgtype).get_fields_and_field_types().values()), '')
-        return bool(first == 'std_msgs/Header')
 
 
 # As the listener of tf2 has them.
@@ -118,6 +113,13 @@ def message_class(msgtype: str) -> Any:
     """The generated class of a message type."""
     package, _, name = msgtype.split('/')
     return getattr(import_module(f'{package}.msg'), name)
+
+
+@cache
+def opens_with_header(msgtype: str) -> bool:
+    """Whether messages of a type begin with a std_msgs/Header."""
+    first = next(iter(message_class(msgtype).get_fields_and_field_types().values()), '')
+    return bool(first == 'std_msgs/Header')
 
 
 def read_installed_messages(msgtype: str, needed_by: str) -> None:

@@ -23,12 +23,12 @@ from hmt_ros.nodes.subscribed_topic import (
     input_topics,
     types_of_others,
 )
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.track_start import TrackStart
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.files.error_line import error_line
 
-AnySession = TypeVar('AnySession', bound=TrackingSession[Any, Any])
+AnySession = TypeVar('AnySession', bound=TrackingSession)
 Parameters = TypeVar('Parameters', bound=FilterParameters)
 
 # Period of the watchdog, s.
@@ -84,26 +84,27 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
         yield image_topic(self._settings.image_transport)
 
     @abstractmethod
-    def _start_asked_for(self, request: Reset.Request) -> tuple[TrackStart, str]:
-        """The start of the tracks that a request asks for, and its description in words.
+    def _start_asked_for(self, request: Reset.Request) -> TrackStart:
+        """The start of the tracks that a request asks for.
 
         Raises:
             ValueError: a request that can not be used.
         """
 
     def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
-        session, thread = self._session, self._thread
-        if session is None or thread is None:
+        session, estimator = self._session, self._estimator
+        if session is None or estimator is None:
             response.success, response.message = False, 'the node is not active'
             return response
         try:
-            start, response.message = self._start_asked_for(request)
+            start = self._start_asked_for(request)
         except ValueError as error:
             response.success, response.message = False, error_line(error)
             self.get_logger().warn(f'~/reset is refused: {response.message}')
             return response
-        thread.restart(lambda: session.restart(start))
-        response.success = True
+        estimator.restart(lambda: session.restart(start))
+        wants = start.wants(start.parameters.sources)
+        response.success, response.message = True, f'a new track waits for {wants}'
         self.get_logger().info(f'~/reset: {response.message}')
         return response
 

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from hmt_ros.experts.lifter import SHIPPED as LIFTER
 from hmt_ros.experts.pose_predictor import ALONE, PROPAGATIONS
-from hmt_ros.image.background import BackgroundSettings
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_CONFIGURE,
     CameraNodeParameters,
     check_choices,
-    nested_parameters,
     parameter_field,
 )
-from hmt_ros.sessions.filter_parameters import BACKGROUND
 
 # Cues that a prediction is made from.
 FROM_SILHOUETTES, FROM_KEYPOINTS, FROM_BOTH = 'silhouettes', 'keypoints', 'both'
@@ -36,7 +33,6 @@ class BmeParameters(CameraNodeParameters):
         gravity: Direction of gravity in the camera optical frame, three numbers of any length.
             Images and keypoints of a camera on its side are turned upright by it. Empty: it is
             upright.
-        least_height: Minimum height of a silhouette that counts as a person, px.
         predict_from: Cue of the predictions: 'silhouettes', 'keypoints' of a detector (no image is
             needed), or 'both'. With 'both' an image waits for its keypoints; silhouettes serve
             where these show nobody.
@@ -45,29 +41,20 @@ class BmeParameters(CameraNodeParameters):
         propagation: How a prediction depends on the one before: 'none', 'dynamics' or 'experts'.
             Dynamics are rule (9) of the paper with the motion prior; experts are rule (1), trained
             with --dynamics.
-        longest_interval: Maximum interval without a person after which the images before are still
-            taken into account, s.
         max_hypotheses: Maximum number of components of a prediction.
         tracked_interval: Interval between two predictions while pose_mixture says that the filter
             tracks the person, by the stamps of the images, s; 0 predicts from every image.
-        background: settings of the background subtraction.
     """
 
     model_file: str = parameter_field('', NEXT_CONFIGURE)
     background_file: str = parameter_field('', NEXT_CONFIGURE)
     stature: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3.0))
     gravity: tuple[float, ...] = parameter_field((), NEXT_CONFIGURE)
-    least_height: int = parameter_field(40, AT_ONCE, (1, 10_000))
     predict_from: str = parameter_field(FROM_SILHOUETTES, NEXT_CONFIGURE)
     lifter: str = parameter_field(LIFTER, NEXT_CONFIGURE)
     propagation: str = parameter_field(ALONE, NEXT_CONFIGURE)
-    longest_interval: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
     max_hypotheses: int = parameter_field(5, AT_ONCE, (1, 64))
     tracked_interval: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3600.0))
-    background: BackgroundSettings = field(
-        default_factory=BackgroundSettings,
-        metadata=nested_parameters(NEXT_CONFIGURE, BACKGROUND, 'background.'),
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -8,14 +8,16 @@ The rules, besides those of `CameraSession`:
 - With `use_mask` the mask of an image is its silhouette; an image whose mask shows somebody teaches
   no background.
 - With `tracked_interval` the track of the filter (`pose_mixture`) is heard. While it says that the
-  person is tracked, images within `tracked_interval` after the last prediction are not looked at.
-  Their messages have no components but the state of the track, so that a subscriber that waits for
-  a prediction goes on: the image was not looked at, which does not say that nobody was seen.
+  person is tracked, images are left to it: their messages have no components but the state of the
+  track, so that a subscriber that waits for a prediction goes on: the image was not looked at,
+  which does not say that nobody was seen. The first image that is `tracked_interval` younger than
+  the last one that was looked at is looked at once the track has come as far: its prediction goes
+  out behind the pose, as a second message of its stamp.
 - The silhouette of every image is published if somebody subscribes to it: that of the background
   subtraction, empty while the background is being learned. An image that is left to the track has
   one, too. With `use_mask` there is none besides the mask.
 - With `propagation` a prediction takes the one before into account, unless this is older than
-  `longest_interval`, comes from another calibration, or from before a jump in time.
+  `LONGEST_INTERVAL`, comes from another calibration, or from before a jump in time.
 - With `predict_from` 'keypoints' every message of keypoints gets one prediction, from them and
   those of the last second (`experts.lifter`), in place of the images; without components where
   fewer than five landmarks are seen. With 'both' an image waits for the keypoints of exactly its
@@ -28,7 +30,7 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +49,7 @@ from hmt_ros.experts.pose_predictor import (
     load_predictor,
 )
 from hmt_ros.experts.root_placement import SIZE_SPREAD
-from hmt_ros.image.background import BackgroundModel, one_person
+from hmt_ros.image.background import BackgroundModel, BackgroundSettings, one_person
 from hmt_ros.image.empty_scene import EmptyScene
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
@@ -67,7 +69,6 @@ from hmt_ros.sessions.camera_session import (
     check_size,
     read_picture,
 )
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK_INPUT, PREDICTION, ImageInput
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input, known_lifter
 from hmt_ros.sessions.session import (
@@ -94,6 +95,10 @@ TOPICS = {PREDICTION: PublishedTopic('hmt_msgs/msg/PoseMixture')}
 _TOPICS_OF_NODE = {**TOPICS, SILHOUETTE: PublishedTopic('sensor_msgs/msg/Image')}
 
 
+# Least height of a silhouette that counts as a person, px.
+LEAST_HEIGHT = 40
+# Longest interval without a person after which the image before still counts, s.
+LONGEST_INTERVAL = 0.5
 # Time without a message after which a track no longer counts.
 _SURE_NS = SECOND_NS
 # Relative standard deviation of the size of a person whose stature is known.
@@ -139,11 +144,6 @@ class BmeState(SessionState):
         ]
 
 
-class _Previous(NamedTuple):
-    mixture: GaussianMixture
-    stamp_ns: int
-
-
 class BmeSession(CameraSession[BmeParameters, BmeState]):
     """Predicts the poses in the images of one camera; see `Session` for arguments and attributes.
 
@@ -159,17 +159,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         super()._set_up()
         p = self.parameters
         self._predictor, self._size_spread = _predictor_of(p)
-        background = BackgroundModel(p.background)
+        background = BackgroundModel()
         if p.background_file:
-            given = read_picture(p.background_file)
-            background = BackgroundModel.from_image(given, p.background)
+            background = BackgroundModel.from_image(read_picture(p.background_file))
         self._scene = EmptyScene(background)
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
-        self._previous: _Previous | None = None
-        # Stamps of the last image that was looked at, and of the last one with a track.
-        self._looked: int | None = None
-        self._tracked: int | None = None
         self._height, self._support, self._reason = 0, math.nan, ''
         # Whether the last prediction needed no background.
         self._without_background = p.predict_from == FROM_KEYPOINTS
@@ -178,8 +173,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._lifter = known_lifter(p.lifter)
         self._cue = p.predict_from
         self._keypoints = KeypointReader(p.source, self._log)
-        self._by_keypoints: KeypointPredictor | None = None
-        self.state = self._present_state()
+        self.restart()
 
     def prepare(self) -> None:
         """See `Session`."""
@@ -187,17 +181,24 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if self._lifter is not None:
             self._inputs[KEYPOINTS].put(0, shown.keypoints(0))
             self._lifted(0, shown.camera)
-            self._by_keypoints = None
+            self.restart()
         if self._cue == FROM_KEYPOINTS:
             return
         for mask in shown.masks[:2]:
             previous = self._seen(mask, shown.camera, previous).mixture
 
-    def _forget(self) -> None:
-        # The known background is kept.
-        self._previous = None
-        self._looked = self._tracked = None
-        self._by_keypoints = None
+    def restart(self) -> None:
+        """See `Session`."""
+        # The known background is kept. The last prediction, with its stamp:
+        self._previous: tuple[GaussianMixture, int] | None = None
+        # Stamps of the last image that was looked at, and of the last one with a track.
+        self._looked: int | None = None
+        self._tracked: int | None = None
+        # An image that is to be looked at once its pose is out.
+        self._due: WaitingImage | None = None
+        self._by_keypoints: KeypointPredictor | None = None
+        self._weights = np.empty(0)
+        super().restart()
 
     @classmethod
     def inputs_of(cls, parameters: BmeParameters) -> tuple[ImageInput, ...]:
@@ -216,9 +217,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         own = NeededInput(tuple(self.rows[0].types))
         return [own, *(x for x in needed if x.sources == (CAMERA_INFO,))]
 
-    def _forget_inputs(self, stamp: int) -> None:
-        super()._forget_inputs(stamp)
+    def _jump_back(self, stamp: int) -> None:
         self._keypoints.forget()
+        super()._jump_back(stamp)
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name != KEYPOINTS:
@@ -236,6 +237,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         elif self._tracked is None or stamp > self._tracked:
             tracked = message.state == TrackState.TRACKING and len(message.components)
             self._tracked = stamp if tracked else None
+            due, camera = self._due, self._camera
+            if due is not None and camera is not None and stamp >= due.stamp_ns:
+                self._look(due, camera)
 
     def _take_keypoints(self, row: ImageInput, message: Any, stamp: int) -> None:
         """Predicts from keypoints and those of the last second, without an image."""
@@ -245,30 +249,23 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if order is Order.SKIPPED:
             return
         if order is Order.JUMP:
-            self._forget_inputs(stamp)
-            self._start_anew()
+            self._jump_back(stamp)
         camera = self._camera
         if camera is None:
             self._log.skip(
-                Fault.CAMERA_INFO,
+                'camera_info',
                 f'keypoints of {stamp} ns are left out: no calibrated camera_info has come',
             )
             return
         self._newest = stamp
         try:
-            content = self._read_input(row, message, stamp)
-        except ValueError as error:
-            self._log.skip(Fault.KEYPOINTS, error_line(error))
-            return
-        self._inputs[KEYPOINTS].put(stamp, content)
-        frame = self._frame_id or self._frame or FRAME_ID
-        try:
+            self._inputs[KEYPOINTS].put(stamp, self._read_input(row, message, stamp))
             mixture = self._lifted(stamp, camera)
         except (ValueError, ArithmeticError) as error:
             text = f'no prediction from the keypoints of {stamp} ns: {error_line(error)}'
-            self._log.skip(Fault.KEYPOINTS, text)
+            self._log.skip('keypoints', text)
             return
-        self._tell(mixture, stamp, frame)
+        self._tell(mixture, stamp, self._frame_id or self._frame or FRAME_ID)
 
     def _lifted(self, stamp: int, camera: Camera) -> GaussianMixture | None:
         """The prediction from the keypoints that have come; None: they show nobody at a stamp."""
@@ -298,7 +295,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if self._cue == FROM_KEYPOINTS:
             return
         in_turn = not self._waiting and self._newest is not None and stamp > self._newest
-        if not in_turn or not self._is_left_to_track(stamp) or self._wanted(SILHOUETTE):
+        left = self._is_left_to_track(stamp) and not self._is_due(stamp)
+        if not in_turn or not left or self._wanted(SILHOUETTE):
             super()._take_image(message, stamp)
             return
         # Not even decoded.
@@ -306,11 +304,16 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._leave_to_track(stamp, str(message.header.frame_id) or self._frame or FRAME_ID)
 
     def _is_left_to_track(self, stamp: int) -> bool:
-        """Whether an image need not be predicted from."""
-        interval = self.parameters.tracked_interval * SECOND_NS
+        """Whether nobody need wait for the prediction from an image."""
         if self._looked is None or self._tracked is None:
             return False
-        return stamp < self._looked + interval and stamp - self._tracked <= _SURE_NS
+        return stamp - self._tracked <= _SURE_NS
+
+    def _is_due(self, stamp: int) -> bool:
+        """Whether an image is to be looked at although it is left to the track."""
+        assert self._looked is not None
+        interval = self.parameters.tracked_interval * SECOND_NS
+        return self._due is None and stamp >= self._looked + interval
 
     def _leave_to_track(self, stamp: int, frame_id: str) -> None:
         self._log.counts['left'] += 1
@@ -320,19 +323,24 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
         if self._is_left_to_track(waiting.stamp_ns):
-            self._show_silhouette(waiting)
+            self._publish_silhouette(waiting)
             self._leave_to_track(waiting.stamp_ns, waiting.frame_id)
+            if self._is_due(waiting.stamp_ns):
+                self._due = waiting
             return
-        self._looked, self._reason = waiting.stamp_ns, ''
+        self._look(waiting, camera)
+
+    def _look(self, waiting: WaitingImage, camera: Camera) -> None:
+        self._looked, self._due, self._reason = waiting.stamp_ns, None, ''
         try:
             mixture = self._mixture_of(waiting, camera)
         except (ValueError, ArithmeticError) as error:
             text = f'no prediction from the image of {waiting.stamp_ns} ns: {error_line(error)}'
-            self._log.skip(Fault.ESTIMATE, text)
+            self._log.skip('estimate', text)
             self._previous = None
             return
         if mixture is not None:
-            self._previous = _Previous(mixture, waiting.stamp_ns)
+            self._previous = mixture, waiting.stamp_ns
         self._tell(mixture, waiting.stamp_ns, waiting.frame_id)
 
     def _tell(self, mixture: GaussianMixture | None, stamp: int, frame_id: str) -> None:
@@ -346,26 +354,26 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _mixture_of(self, waiting: WaitingImage, camera: Camera) -> GaussianMixture | None:
         """The prediction from an image; None if nobody is seen."""
-        p, given = self.parameters, waiting.mask
+        given = waiting.mask
         if self._cue == FROM_BOTH:
             lifted = self._lifted(waiting.stamp_ns, camera)
             if lifted is not None:
                 self._without_background = True
-                self._show_silhouette(waiting)
+                self._publish_silhouette(waiting)
                 return lifted
         self._without_background = given is not None
         if given is None:
             mask = self._judged_silhouette(waiting)
-            self._publish_silhouette(mask, waiting)
+            self._publish_silhouette(waiting, mask)
             if not self._scene.known:
                 self._reason = self._scene.wants
                 return None
         else:
-            mask = one_person(given, p.background)
+            mask = one_person(given, BackgroundSettings())
             with self._background_in_use:
                 self._scene.learn(waiting.image, waiting.stamp_ns, bool(given.any()))
         self._height = _height(mask)
-        if self._height < p.least_height:
+        if self._height < LEAST_HEIGHT:
             return None
         try:
             found = self._seen(mask, camera, *self._known_before(waiting.stamp_ns))
@@ -373,7 +381,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             return None
         self._support = found.support
         for text in found.place.remarks:
-            self._log.note(Fault.SILHOUETTE, f'image of {waiting.stamp_ns} ns: {text}')
+            self._log.note('silhouette', f'image of {waiting.stamp_ns} ns: {text}')
         return found.mixture
 
     def _judged_silhouette(self, waiting: WaitingImage) -> Mask:
@@ -386,17 +394,17 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 if scene.known:
                     return scene.background.silhouette(waiting.image)
             if scene.is_of_somebody:
-                self._scene = scene = EmptyScene(BackgroundModel(self.parameters.background))
+                self._scene = scene = EmptyScene(BackgroundModel())
             scene.learn(waiting.image, stamp)
         return np.zeros(waiting.image.shape[:2], np.bool_)
 
     def _known_before(self, stamp_ns: int) -> tuple[GaussianMixture | None, float]:
         """The poses predicted before an image, if they still count, and the time since then, s."""
-        p, previous = self.parameters, self._previous
-        if p.propagation == ALONE or previous is None:
+        previous = self._previous
+        if self.parameters.propagation == ALONE or previous is None:
             return None, STEP
-        interval = (stamp_ns - previous.stamp_ns) / SECOND_NS
-        return (None, STEP) if interval > p.longest_interval else (previous.mixture, interval)
+        interval = (stamp_ns - previous[1]) / SECOND_NS
+        return (None, STEP) if interval > LONGEST_INTERVAL else (previous[0], interval)
 
     def _seen(
         self,
@@ -415,16 +423,15 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             size_spread=self._size_spread,
         )
 
-    def _show_silhouette(self, waiting: WaitingImage) -> None:
-        """Publishes the silhouette of an image that is not predicted from."""
-        if waiting.mask is None and self._scene.known and self._wanted(SILHOUETTE):
-            self._publish_silhouette(self._silhouette(waiting.image), waiting)
-
-    def _publish_silhouette(self, mask: Mask, of: WaitingImage) -> None:
-        if self._wanted(SILHOUETTE):
-            picture = np.where(mask, np.uint8(255), np.uint8(0))
-            made = image_message(self._messages, picture, of.stamp_ns, of.frame_id)
-            self._publish(SILHOUETTE, of.stamp_ns, made)
+    def _publish_silhouette(self, of: WaitingImage, mask: Mask | None = None) -> None:
+        """Publishes the silhouette of an image; None: it is not predicted from."""
+        known = mask is not None or (of.mask is None and self._scene.known)
+        if not known or not self._wanted(SILHOUETTE):
+            return
+        shown = self._silhouette(of.image) if mask is None else mask
+        picture = np.where(shown, np.uint8(255), np.uint8(0))
+        made = image_message(self._messages, picture, of.stamp_ns, of.frame_id)
+        self._publish(SILHOUETTE, of.stamp_ns, made)
 
     def _silhouette(self, image: NDArray[np.uint8]) -> Mask:
         with self._background_in_use:
@@ -466,16 +473,15 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         camera = self._camera
         if camera is None:
             raise ValueError('no calibrated camera_info has come yet')
-        p = self.parameters
         if not self._scene.known:
             raise ValueError(f'no silhouette: {self._scene.wants}')
         image = self.decode_image(message)
         check_size(image, camera)
         mask = self._silhouette(image)
-        if _height(mask) < p.least_height:
+        if _height(mask) < LEAST_HEIGHT:
             raise ValueError(
                 f'nobody is seen: the silhouette is {_height(mask)} px high, wanted at least '
-                f'{p.least_height}'
+                f'{LEAST_HEIGHT}'
             )
         mixture = self._seen(mask, camera).mixture
         return self._message(mixture, time_ns(message.header.stamp), str(message.header.frame_id))
@@ -483,7 +489,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     def _present_state(self) -> BmeState:
         return BmeState(
             *self._status_and_wants(),
-            **self._totals(),
+            **self._totals(self._weights),
             modes=len(self._weights),
             height=self._height,
             support=self._support,

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.transform_buffer import Transform, TransformBuffer, TransformError
 from hmt_ros.tracking.ground import KnownGround
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
@@ -54,7 +53,9 @@ class CameraFrames:
         pose: of the camera in `fixed_frame` at the image that was looked up last; None: unknown.
     """
 
-    def __init__(self, gravity_frame: str, fixed_frame: str, *, floor: bool) -> None:
+    def __init__(
+        self, gravity_frame: str = '', fixed_frame: str = '', *, floor: bool = False
+    ) -> None:
         self.gravity_frame = gravity_frame
         self.fixed_frame = fixed_frame
         self.gravity: SeenGravity | None = None
@@ -91,7 +92,7 @@ class CameraFrames:
             return False
         return True
 
-    def look(self, camera_frame: str, stamp_ns: int) -> list[tuple[Fault, str]]:
+    def look(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
         """Looks gravity and the pose of the camera up at the time of an image.
 
         Returns:
@@ -113,7 +114,7 @@ class CameraFrames:
             height = self.gravity.height
         return KnownGround(self.gravity.up, height, UP_SIGMA)
 
-    def _look_for_gravity(self, camera_frame: str, stamp_ns: int) -> list[tuple[Fault, str]]:
+    def _look_for_gravity(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
         name, self.newest = self.gravity_frame, False
         try:
             found = self._transforms.lookup(camera_frame, name, stamp_ns)
@@ -122,7 +123,7 @@ class CameraFrames:
                 f'no transform from gravity_frame {name!r} to {camera_frame!r} at the image '
                 f'of {stamp_ns} ns: {error}; the track goes on with what was known of gravity'
             )
-            return [(Fault.NO_TRANSFORM, text)]
+            return [('no transform', text)]
         up = found.rotation[:, 2]
         height = float(found.inverse().translation[2])
         self.gravity, self.newest = SeenGravity(up / np.linalg.norm(up), height), True
@@ -132,9 +133,9 @@ class CameraFrames:
             f'the camera lies {-height:.2f} m below z = 0 of gravity_frame {name!r}, which '
             'can not be the floor'
         )
-        return [(Fault.CAMERA_HEIGHT, text)]
+        return [('height of the camera', text)]
 
-    def _look_for_pose(self, camera_frame: str, stamp_ns: int) -> list[tuple[Fault, str]]:
+    def _look_for_pose(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
         name = self.fixed_frame
         try:
             self.pose = self._transforms.lookup(name, camera_frame, stamp_ns)
@@ -145,7 +146,7 @@ class CameraFrames:
                 f'{stamp_ns} ns: {error}; the camera is taken to go on as before, and after '
                 f'{MAX_EXTRAPOLATION_TIME} s its motion is unknown'
             )
-            return [(Fault.NO_CAMERA_POSE, text)]
+            return [('no pose of the camera', text)]
         return []
 
 

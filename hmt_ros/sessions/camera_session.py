@@ -4,6 +4,10 @@ Images are taken in the order of their stamps. They wait until a calibrated came
 and for other inputs (`image_inputs`); at most `MOST_INCOMPLETE` wait, the oldest are dropped. A
 session is late where messages have come during an estimate while images waited for it: only the
 newest `queue_size` of the images that wait for no other input are then estimated from.
+
+Where a frame is named an image also waits for the transforms of its stamp, or for an image or a
+transform that is `input_timeout` younger, and never so long that it would be dropped. Where they do
+not come, the gravity known before holds, and the camera is taken to go on as before.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from itertools import takewhile
 from types import MappingProxyType
@@ -25,7 +29,6 @@ from hmt_ros.image.background import BackgroundModel, SceneWatch
 from hmt_ros.inference.arrays import Image, Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters
-from hmt_ros.sessions.handled import Fault, Handled
 from hmt_ros.sessions.image_inputs import (
     DEPTH,
     DETECTIONS,
@@ -34,10 +37,10 @@ from hmt_ros.sessions.image_inputs import (
     REMEMBERED,
     ImageInput,
     ImageInputs,
-    StampedInputs,
     Taken,
 )
 from hmt_ros.sessions.session import NeededInput, Order, Session, State
+from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, UncalibratedError, camera_from_info
 from msg_tools.messages.detections import stamp_of_floats
@@ -90,52 +93,12 @@ class WaitingImage(NamedTuple):
         return depth
 
 
-class NamedFrames:
-    """The frames that the messages of a camera name: they are to be one.
-
-    Two publishers on one topic, or the camera_info of another camera, else go unnoticed.
-
-    Args:
-        image, info: names of the sources of images and of camera_info.
-    """
-
-    def __init__(self, image: str, info: str) -> None:
-        self._image, self._info = image, info
-        self._seen: dict[str, list[str]] = {image: [], info: []}
-
-    def see(self, source: str, frame_id: str, naming: Callable[[str], str]) -> list[str]:
-        """Takes the frame of a message; returns warnings, once for each frame.
-
-        Args:
-            frame_id: may be empty.
-            naming: names a source for the user.
-        """
-        seen, other = self._seen[source], self._info if source == self._image else self._image
-        if not frame_id or frame_id in seen or len(seen) == _MOST_FRAMES:
-            return []
-        texts = []
-        if seen:
-            texts.append(
-                f'{naming(source)} has messages of the frames {seen[-1]!r} and {frame_id!r}: '
-                'wanted those of one camera; stop or remap one of the publishers'
-            )
-        elif self._seen[other] and frame_id not in self._seen[other]:
-            frames = {source: frame_id, other: self._seen[other][-1]}
-            texts.append(
-                f'{naming(self._image)} has frame_id {frames[self._image]!r}, '
-                f'{naming(self._info)} has {frames[self._info]!r}: results are in that of the '
-                'image; if both are of one camera, set one frame_id in its driver, else remap '
-                'camera_info'
-            )
-        seen.append(frame_id)
-        return texts
-
-
 class CameraSession(Session[CameraParameters, State]):
     """A session that estimates from images; see `Session` for arguments and attributes.
 
     Attributes:
         rows: inputs that may come with the images.
+        frames: that transforms lead to from the camera; without a name none are taken.
     """
 
     COUNTED = IMAGE
@@ -144,7 +107,8 @@ class CameraSession(Session[CameraParameters, State]):
     def _set_up(self) -> None:
         self._camera: Camera | None = None
         self._frame = ''
-        self._frames = NamedFrames(IMAGE, CAMERA_INFO)
+        self._named_frames: dict[str, list[str]] = {IMAGE: [], CAMERA_INFO: []}
+        self.frames = CameraFrames()
         self._uncalibrated = ''
         self._watch = SceneWatch()
         self._waiting: deque[WaitingImage] = deque()
@@ -165,6 +129,8 @@ class CameraSession(Session[CameraParameters, State]):
         if self._camera is None and not self._uncalibrated:
             needed.append(NeededInput((CAMERA_INFO,)))
         needed += [NeededInput(tuple(row.types), with_each=True) for row in self._awaited()]
+        if self.frames.wanted and not self.frames.heard:
+            needed.append(NeededInput(TRANSFORMS))
         return needed
 
     @classmethod
@@ -188,51 +154,49 @@ class CameraSession(Session[CameraParameters, State]):
     def most_waiting(self) -> int:
         """See `Session`."""
         size = self.parameters.queue_size
-        return max(size, MOST_INCOMPLETE) if self._waits_for_inputs() else size
+        return max(size, MOST_INCOMPLETE) if self._awaited() or self.frames.wanted else size
 
-    def drop(self, stamp_ns: int) -> Handled:
-        """See `Session`."""
+    def _drop(self, stamp_ns: int) -> None:
         self._dropped.append(stamp_ns)
-        return super().drop(stamp_ns)
-
-    def _waits_for_inputs(self) -> bool:
-        """Whether images have to wait for other inputs than camera_info."""
-        return bool(self._awaited())
+        super()._drop(stamp_ns)
 
     def _is_ready(self, waiting: WaitingImage) -> bool:
         """Whether an image need not wait for anything but a camera_info."""
-        return self._missing(waiting.stamp_ns) is None
+        return self._missing(waiting.stamp_ns) is None and self._has_transforms(waiting)
 
     def _missing(self, stamp: int) -> ImageInput | None:
         """The first input that an image waits for."""
-        timeout = self.parameters.input_timeout
         for row in self._awaited():
-            if not self._has(self._inputs[row.name], stamp, timeout):
+            if not self._inputs[row.name].is_settled(stamp) and not self._is_overdue(stamp):
                 return row
         return None
 
-    def _forget_inputs(self, stamp: int) -> None:
-        """Drops the inputs of images before time jumped back to a stamp."""
-        self._inputs.clear()
-
-    def _has(self, inputs: StampedInputs[Any], stamp: int, timeout: float) -> bool:
-        """Whether an image need not wait any longer for an input."""
+    def _is_overdue(self, stamp: int) -> bool:
+        """Whether an image has waited for its inputs as long as it may."""
         assert self._newest is not None
-        return inputs.is_settled(stamp) or self._newest - stamp > timeout * SECOND_NS
+        return self._newest - stamp > self.parameters.input_timeout * SECOND_NS
 
-    def _has_transforms(self, frames: CameraFrames, waiting: WaitingImage) -> bool:
+    def _has_transforms(self, waiting: WaitingImage) -> bool:
         """Whether an image need not wait for transforms to frames."""
-        if not frames.wanted or len(self._waiting) > self.most_waiting:
+        if not self.frames.wanted or len(self._waiting) > self.most_waiting:
             return True
         timeout = self.parameters.input_timeout * SECOND_NS
-        assert self._newest is not None
-        return self._newest - waiting.stamp_ns > timeout or frames.is_settled(
+        return self._is_overdue(waiting.stamp_ns) or self.frames.is_settled(
             self._frame_of(waiting), waiting.stamp_ns, timeout
         )
 
+    def _jump_back(self, stamp: int) -> None:
+        """Forgets inputs and estimate, as time begins again at a stamp."""
+        self._inputs.clear()
+        self.frames.forget_after(stamp)
+        self.restart()
+
     def _take(self, source: str, message: Any, stamp: int) -> None:
         row = self._inputs.row(source)
-        if source == CAMERA_INFO:
+        if source in TRANSFORMS and self.frames.wanted:
+            for text in self.frames.take(message, static=source == TF_STATIC):
+                self._log.note('transform', text)
+        elif source == CAMERA_INFO:
             self._take_camera_info(message)
         elif source == IMAGE:
             self._take_image(message, stamp)
@@ -240,6 +204,8 @@ class CameraSession(Session[CameraParameters, State]):
             self._inputs.put(source, message, stamp, partial(self._read_input, row))
 
     def _stamp_of(self, source: str, message: Any) -> int:
+        if source in TRANSFORMS:
+            return max((time_ns(each.header.stamp) for each in message.transforms), default=0)
         if source != DETECTIONS or not self._floats:
             return super()._stamp_of(source, message)
         told = stamp_of_floats(message)
@@ -259,23 +225,44 @@ class CameraSession(Session[CameraParameters, State]):
         except CameraInfoError as error:
             text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
             self._uncalibrated = text if self._camera is None else ''
-            self._log.fault(Fault.CAMERA_INFO, text)
+            self._log.fault('camera_info', text)
             return
         self._uncalibrated = ''
         self._frame = str(message.header.frame_id)
         known, self._camera = self._camera, camera
         if camera != known:
             for text in neglected:
-                self._log.note(Fault.CAMERA_INFO, text, warn=True)
+                self._log.note('camera_info', text, warn=True)
         if known is not None and camera != known:
             text = f'camera_info changes: {self.ESTIMATE} starts anew'
-            self._log.note(Fault.CALIBRATION, text)
-            self._start_anew()
+            self._log.note('calibration', text)
+            self.restart()
 
     def _see_frame(self, source: str, message: Any) -> None:
-        """Warns of a camera whose messages do not agree on its frame, once for each frame."""
-        for text in self._frames.see(source, str(message.header.frame_id), self._on_topic):
-            self._log.note(Fault.FRAME, text, warn=True)
+        """Warns where the messages of a camera name several frames, once for each frame.
+
+        Two publishers on one topic, or the camera_info of another camera, else go unnoticed.
+        """
+        frame, seen = str(message.header.frame_id), self._named_frames[source]
+        if not frame or frame in seen or len(seen) == _MOST_FRAMES:
+            return
+        seen.append(frame)
+        images, infos = self._named_frames[IMAGE], self._named_frames[CAMERA_INFO]
+        text = ''
+        if len(seen) > 1:
+            text = (
+                f'{self._on_topic(source)} has messages of the frames {seen[-2]!r} and {frame!r}: '
+                'wanted those of one camera; stop or remap one of the publishers'
+            )
+        elif images and infos and frame not in (images if source == CAMERA_INFO else infos):
+            text = (
+                f'{self._on_topic(IMAGE)} has frame_id {images[-1]!r}, '
+                f'{self._on_topic(CAMERA_INFO)} has {infos[-1]!r}: results are in that of the '
+                'image; if both are of one camera, set one frame_id in its driver, else remap '
+                'camera_info'
+            )
+        if text:
+            self._log.note('frame_id', text, warn=True)
 
     def _take_image(self, message: Any, stamp: int) -> None:
         self._see_frame(IMAGE, message)
@@ -287,12 +274,11 @@ class CameraSession(Session[CameraParameters, State]):
             self._log.counts['dropped'] += len(self._waiting)
             self._waiting.clear()
             self._newest = None
-            self._forget_inputs(stamp)
-            self._start_anew()
+            self._jump_back(stamp)
         try:
             image = self.decode_image(message)
         except ImageError as error:
-            self._log.skip(Fault.IMAGE, str(error))
+            self._log.skip('image', str(error))
             return
         self._newest, self._fresh = stamp, self._fresh + 1
         self._waiting.append(WaitingImage(image, stamp, str(message.header.frame_id)))
@@ -311,10 +297,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._watch.look(waiting.image, background)
         if self._watch.moved and not before:
             text = camera_moved_fault(self._watch.shift, waiting.stamp_ns, remedy)
-            self._log.note(Fault.CAMERA_MOVED, text, warn=True)
-
-    def _start_anew(self) -> None:
-        self.restart()
+            self._log.note('camera moved', text, warn=True)
 
     def _use_what_has_come(self) -> None:
         late, self._fresh, self._left = self._left or self._fresh > 1, 0, False
@@ -331,13 +314,7 @@ class CameraSession(Session[CameraParameters, State]):
         """Drops all but the newest of the images that need not wait."""
         ready = sum(1 for _ in takewhile(self._is_ready, self._waiting))
         for _ in range(ready - self.parameters.queue_size):
-            stamp = self._waiting.popleft().stamp_ns
-            self._dropped.append(stamp)
-            self._log.drop(self._late(stamp))
-            self._leave_out(stamp)
-
-    def _leave_out(self, stamp: int) -> None:
-        """Takes the inputs of an image that is dropped although they have come."""
+            self._drop(self._waiting.popleft().stamp_ns)
 
     def _drop_incomplete_images(self) -> None:
         most = max(self.parameters.queue_size, MOST_INCOMPLETE)
@@ -347,17 +324,17 @@ class CameraSession(Session[CameraParameters, State]):
             if self._camera is None:
                 # An uncalibrated camera_info has been reported already.
                 self._log.give_up(
-                    Fault.CAMERA_INFO,
+                    'camera_info',
                     'a calibrated camera_info',
                     f'image of {stamp} ns is dropped: it waited for a calibrated camera_info',
                 )
             else:
                 row = self._missing(stamp)
-                kind = Fault.NO_TRANSFORM if row is None else row.none
+                name = 'transform' if row is None else row.name
                 self._log.give_up(
-                    kind,
-                    kind.value.removeprefix('no '),
-                    f'image of {stamp} ns is dropped: {kind.value} of its stamp has come, and '
+                    f'no {name}',
+                    name,
+                    f'image of {stamp} ns is dropped: no {name} of its stamp has come, and '
                     f'{most} newer images wait',
                 )
 
@@ -366,18 +343,15 @@ class CameraSession(Session[CameraParameters, State]):
         try:
             check_size(waiting.image, camera)
         except ValueError as error:
-            self._log.skip(Fault.IMAGE_SIZE, str(error))
+            self._log.skip('size of the image', str(error))
             return
-        frame, given = self._frame_of(waiting), self._given_with(waiting)
-        self._estimate(waiting._replace(frame_id=frame, given=given), camera)
-
-    def _given_with(self, waiting: WaitingImage) -> dict[str, Taken]:
-        """Inputs that have come with an image, by name."""
-        return {
+        given = {
             row.name: self._inputs.take(row, waiting.stamp_ns, waiting.image, self._dropped)
             for row in self._awaited()
             if not row.together
         }
+        frame = self._frame_of(waiting)
+        self._estimate(waiting._replace(frame_id=frame, given=given), camera)
 
     def _frame_of(self, waiting: WaitingImage) -> str:
         """Optical frame of the camera, as the image names it, or else the camera_info."""

@@ -2,9 +2,8 @@
 
 A node is parametrised by a dataclass whose docstring describes the parameters and whose checks
 decide whether values go together. A field made by `parameter_field` is a parameter. A field with
-`nested_parameters` holds settings of a library class and lists which of them are parameters
-(`likelihood.edges.weight` is a field of a field of a field). Everything else can only be set by a
-program.
+`nested_parameters` holds settings of a library class and lists which of them are parameters.
+Everything else can only be set by a program.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import inspect
-import math
 import re
 import textwrap
 from array import array
@@ -40,7 +38,6 @@ EFFECTS = {
     AT_LAUNCH: 'The value can only be set at launch.',
 }
 
-NOT_NEGATIVE = (0.0, math.inf)
 FRACTION = (0.0, 1.0)
 
 TRANSPORTS = ('raw', 'compressed')
@@ -52,7 +49,7 @@ OWN_KEYPOINTS = 'keypoints'
 USUAL_ORDER = 'coco17'
 
 # Metadata of a field that is one parameter or holds several.
-_EFFECT, _LIMITS, _PREFIX = 'effect', 'limits', 'prefix'
+_EFFECT, _LIMITS = 'effect', 'limits'
 
 
 def parameter_field(default: Value, effect: str, limits: Limits = None) -> Any:
@@ -66,18 +63,14 @@ def parameter_field(default: Value, effect: str, limits: Limits = None) -> Any:
     return dataclasses.field(default=default, metadata={_EFFECT: effect, _LIMITS: {'': limits}})
 
 
-def nested_parameters(
-    effect: str, parameters: Mapping[str, Limits], prefix: str = ''
-) -> Mapping[str, Any]:
+def nested_parameters(effect: str, parameters: Mapping[str, Limits]) -> Mapping[str, Any]:
     """Metadata of a field that holds settings of a library class, some of which are parameters.
 
     Args:
         effect: when new values take effect; one of `EFFECTS`.
-        parameters: the limits of those that are parameters, by name; dots lead into settings within
-            the settings.
-        prefix: start of the names of the parameters.
+        parameters: the limits of those that are parameters, by name.
     """
-    return {_EFFECT: effect, _LIMITS: parameters, _PREFIX: prefix}
+    return {_EFFECT: effect, _LIMITS: parameters}
 
 
 def check_choices(settings: Any, **choices: tuple[str, ...]) -> None:
@@ -85,20 +78,6 @@ def check_choices(settings: Any, **choices: tuple[str, ...]) -> None:
     for name, values in choices.items():
         if (value := getattr(settings, name)) not in values:
             raise ValueError(f'{name} must be one of {values}, saw {value!r}')
-
-
-def namespaces_in(text: str) -> tuple[str, ...]:
-    """The namespaces in a text, which blanks separate, each once.
-
-    Raises:
-        ValueError: a name that no namespace can have.
-    """
-    for namespace in text.split():
-        if not re.fullmatch(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+', namespace):
-            raise ValueError(
-                f'namespaces: wanted names such as /humans/bodies/anna, saw {namespace!r}'
-            )
-    return tuple(dict.fromkeys(text.split()))
 
 
 @dataclass(frozen=True)
@@ -185,7 +164,7 @@ class DeclaredParameter:
     """A parameter.
 
     Attributes:
-        name: with dots.
+        name: of the field.
         default: its value unless another is given; its type is the type of the parameter.
         description: one sentence or more.
         limits: lowest and highest value, None where the parameter is no number.
@@ -243,17 +222,17 @@ def declared_parameters(settings: Any) -> list[DeclaredParameter]:
     """
     places = {name: i for i, name in enumerate(vars(type(settings)).get('__annotations__', ()))}
     ordered = sorted(fields(settings), key=lambda field: places.get(field.name, len(places)))
-    return [
-        _declared(
-            settings,
-            (field.name, *name.split('.')) if name else (field.name,),
-            f'{field.metadata[_PREFIX]}{name}' if name else field.name,
-            limits,
-            field.metadata[_EFFECT],
-        )
-        for field in ordered
-        for name, limits in field.metadata.get(_LIMITS, {}).items()
-    ]
+    found = []
+    for field in ordered:
+        for inner, limits in field.metadata.get(_LIMITS, {}).items():
+            owner, name = (
+                (getattr(settings, field.name), inner) if inner else (settings, field.name)
+            )
+            text = described_fields(type(owner)).get(name, '')
+            path = (field.name, inner) if inner else (field.name,)
+            effect = field.metadata[_EFFECT]
+            found.append(DeclaredParameter(name, getattr(owner, name), text, limits, effect, path))
+    return found
 
 
 def values_of(settings: Any) -> dict[str, Any]:
@@ -277,8 +256,18 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
             near = difflib.get_close_matches(name, known, n=1)
             hint = f'; is {near[0]} meant?' if near else ''
             raise ParameterError(f'there is no parameter {name}{hint}')
-    checked = {known[name].path: known[name].checked(value) for name, value in values.items()}
-    result: Settings = _rebuilt(settings, checked)
+    changes: dict[str, Any] = {}
+    for name, value in values.items():
+        field, *inner = known[name].path
+        checked = known[name].checked(value)
+        if inner:
+            changes.setdefault(field, {})[inner[0]] = checked
+        else:
+            changes[field] = checked
+    for field, inside in changes.items():
+        if isinstance(inside, dict):
+            changes[field] = replace(getattr(settings, field), **inside)
+    result: Settings = replace(settings, **changes)  # type: ignore[type-var]
     return result
 
 
@@ -295,26 +284,3 @@ def described_fields(cls: type) -> dict[str, str]:
             if colon:
                 result |= dict.fromkeys(re.split(r',\s*', names), ' '.join(words.split()))
     return result
-
-
-def _declared(
-    settings: Any, path: tuple[str, ...], name: str, limits: Limits, effect: str
-) -> DeclaredParameter:
-    groups = [settings]
-    for step in path[:-1]:
-        groups.append(getattr(groups[-1], step))
-    owner, outer = groups[-1], groups[-2:-1]
-    text = described_fields(type(owner)).get(path[-1], '')
-    # Fields of one class are told apart by their descriptions in the group.
-    if outer and sum(type(value) is type(owner) for value in vars(outer[0]).values()) > 1:
-        group = described_fields(type(outer[0]))[path[-2]].rstrip('.')
-        text = f'{group}: {text[0].lower()}{text[1:]}'
-    return DeclaredParameter(name, getattr(owner, path[-1]), text, limits, effect, path)
-
-
-def _rebuilt(settings: Any, values: Mapping[tuple[str, ...], Value]) -> Any:
-    changes: dict[str, Any] = {}
-    for name in dict.fromkeys(path[0] for path in values):
-        inner = {path[1:]: value for path, value in values.items() if path[0] == name}
-        changes[name] = inner[()] if () in inner else _rebuilt(getattr(settings, name), inner)
-    return replace(settings, **changes)

@@ -1,82 +1,52 @@
-"""Reports of sessions: the outcome of each message, and counts over all of them."""
+"""Reports of sessions: the outcome of each message, and counts over all of them.
+
+The kind of a fault, or of a remark, is a word or two, which name it in the diagnostics.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import Enum
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 from msg_tools import MessageFactory
 from msg_tools.files.error_line import one_line
+from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_message, time_ns
-from msg_tools.messages.message_error import MessageFault
 
 HANDLED = 'hmt_msgs/msg/Handled'
 
 
-class Fault(Enum):
-    """Kinds of faults, and of remarks; the values are their names in the diagnostics."""
-
-    MESSAGE = 'message'
-    NODE = 'node itself'
-    SAME_TIME = 'time stands still'
-    TIME_JUMP = 'time jumps back'
-    CAMERA_INFO = 'camera_info'
-    CALIBRATION = 'calibration'
-    IMAGE = 'image'
-    IMAGE_SIZE = 'size of the image'
-    KEYPOINTS = 'keypoints'
-    KEYPOINT_NAMES = 'names of keypoints'
-    NO_KEYPOINTS = 'no keypoints'
-    KEYPOINTS_3D = 'keypoints_3d'
-    NO_KEYPOINTS_3D = 'no keypoints_3d'
-    DETECTIONS = 'detections'
-    NO_DETECTIONS = 'no detections'
-    LONE_DETECTIONS = 'detections without an image'
-    PEOPLE = 'too many people'
-    MASK = 'mask'
-    NO_MASK = 'no mask'
-    LONE_MASK = 'mask without an image'
-    DEPTH = 'depth'
-    NO_DEPTH = 'no depth'
-    LONE_DEPTH = 'depth without an image'
-    DEPTH_ELSEWHERE = 'depth of something else'
-    TRANSFORM = 'transform'
-    NO_TRANSFORM = 'no transform'
-    NO_CAMERA_POSE = 'no pose of the camera'
-    CAMERA_HEIGHT = 'height of the camera'
-    GRAVITY = 'direction of gravity'
-    PREDICTION = 'pose_prediction'
-    NO_PREDICTION = 'no pose_prediction'
-    SILHOUETTE = 'silhouette'
-    BACKGROUND = 'background'
-    START = 'start'
-    OLD_START = 'old start'
-    ESTIMATE = 'estimate'
-    NEW_BODY = 'new body'
-    MIXTURE_KIND = 'kind of mixture'
-    GAP = 'gap'
-    FRAME = 'frame_id'
-    LOST = 'loss of the track'
-    CAMERA_MOVED = 'camera moved'
-    HUMAN = 'reference model'
-    NO_IMAGE = 'no image'
-    OTHER_CAMERA = 'other camera'
-
-
-class Output(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Output:
     """A message that is to be published.
 
     Attributes:
         topic: one of those that the node publishes.
         stamp_ns: of the image that it is about.
-        data: CDR bytes.
+        message: for whoever takes it as it is, and does not change it.
     """
 
     topic: str
     stamp_ns: int
-    data: bytes
+    message: Any
+
+    @cached_property
+    def data(self) -> bytes:
+        """CDR bytes."""
+        return serialise(self.message)
+
+    def __iter__(self) -> Iterator[Any]:
+        """Topic, stamp and bytes."""
+        return iter((self.topic, self.stamp_ns, self.data))
+
+    def __eq__(self, other: object) -> bool:
+        """Whether topic, stamp and bytes are those of another."""
+        return isinstance(other, Output) and tuple(self) == tuple(other)
+
+    __hash__ = None  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)
@@ -128,23 +98,23 @@ class HandlingLog:
         self._events: list[str] = []
         self._published: list[tuple[str, int]] = []
 
-    def fault(self, kind: Fault | MessageFault, text: str) -> None:
+    def fault(self, kind: str, text: str) -> None:
         """Reports a message or content that could not be used."""
         self._told.append(one_line(f'{self.prefix}{text}'))
         self.note(kind, text)
 
-    def note(self, kind: Fault | MessageFault, text: str, *, warn: bool = False) -> None:
+    def note(self, kind: str, text: str, *, warn: bool = False) -> None:
         """Warns of the first of a kind, and where `warn` says so; the others are counted."""
-        self.faults[kind.value] += 1
+        self.faults[kind] += 1
         self.last_fault = one_line(f'{self.prefix}{text}')
-        if warn or self.faults[kind.value] == 1:
+        if warn or self.faults[kind] == 1:
             self._warned.append(self.last_fault)
 
     def tell(self, text: str) -> None:
         """Logs something that is no fault."""
         self._events.append(one_line(f'{self.prefix}{text}'))
 
-    def skip(self, kind: Fault | MessageFault, text: str) -> None:
+    def skip(self, kind: str, text: str) -> None:
         """Reports a message that was to be estimated from and can not be used."""
         self.counts['skipped'] += 1
         self.fault(kind, text)
@@ -161,7 +131,7 @@ class HandlingLog:
         self.counts['dropped'] += messages
         self.held_up = ''
 
-    def give_up(self, kind: Fault, held_up: str, text: str) -> None:
+    def give_up(self, kind: str, held_up: str, text: str) -> None:
         """Reports a message that waited here in vain and is dropped.
 
         Args:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from hmt_ros.sessions.declared_parameters import (
@@ -10,7 +11,6 @@ from hmt_ros.sessions.declared_parameters import (
     TRANSPORTS,
     NodeParameters,
     check_choices,
-    namespaces_in,
     parameter_field,
 )
 
@@ -53,9 +53,13 @@ class HriParameters(NodeParameters):
 
     def __post_init__(self) -> None:
         check_choices(self, image_transport=TRANSPORTS, mixture_topic=MIXTURES)
-        namespaces_in(self.namespaces)
+        for namespace in self.named:
+            if not re.fullmatch(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+', namespace):
+                raise ValueError(
+                    f'namespaces: wanted names such as /humans/bodies/anna, saw {namespace!r}'
+                )
 
     @property
     def named(self) -> tuple[str, ...]:
         """The namespaces, each once."""
-        return namespaces_in(self.namespaces)
+        return tuple(dict.fromkeys(self.namespaces.split()))

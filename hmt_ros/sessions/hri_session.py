@@ -25,7 +25,6 @@ from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import Joint, ReferenceHuman, fit_reference_human
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, camera_info_fault
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.session import (
     NeededInput,
@@ -174,8 +173,7 @@ class HriSession(Session[HriParameters, HriState]):
         self._frame = ''
         self._now = 0
         self._people: dict[str, _Person] = {}
-        self._images: dict[int, Any] = {}
-        self.state = self._present_state()
+        self.restart()
 
     @property
     def identities(self) -> set[str]:
@@ -194,12 +192,14 @@ class HriSession(Session[HriParameters, HriState]):
             self._tell_tracked(self._now)
         return self._now
 
-    def _forget(self) -> None:
+    def restart(self) -> None:
+        """See `Session`."""
         # The numbers of their bodies are not given again.
         for person in self._people.values():
             person.end()
             person.newest = None
-        self._images.clear()
+        self._images: dict[int, Any] = {}
+        super().restart()
 
     # Inputs.
 
@@ -219,7 +219,7 @@ class HriSession(Session[HriParameters, HriState]):
             self._camera, self._frame = camera_from_info(message), str(message.header.frame_id)
         except CameraInfoError as error:
             text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
-            self._log.fault(Fault.CAMERA_INFO, text)
+            self._log.fault('camera_info', text)
         longest = self.parameters.longest_silence * SECOND_NS
         silent = [p for p in self._people.values() if p.identity and stamp - p.heard > longest]
         for person in silent:
@@ -252,7 +252,7 @@ class HriSession(Session[HriParameters, HriState]):
                 self._show(person, content)
             except ValueError as error:
                 person.tracked = False
-                self._log.skip(Fault.HUMAN, f'mixture of {stamp} ns shows no body: {error}')
+                self._log.skip('reference model', f'mixture of {stamp} ns shows no body: {error}')
                 self._tell_tracked(stamp)
                 return
         if not person.tracked:
@@ -296,7 +296,7 @@ class HriSession(Session[HriParameters, HriState]):
             return
         if self._frame and content.frame_id not in ('', self._frame):
             self._log.note(
-                Fault.OTHER_CAMERA,
+                'other camera',
                 f'mixtures of {person.name} are in the frame {content.frame_id}, camera_info is '
                 f'that of {self._frame}: their places in the image are not published; remap '
                 'camera_info and image to the camera of the filter',
@@ -355,12 +355,12 @@ class HriSession(Session[HriParameters, HriState]):
         image = self._images.get(stamp)
         if image is None:
             text = f'no image of {stamp} ns has come, of which a mixture tells: it is not cropped'
-            self._log.note(Fault.NO_IMAGE, text)
+            self._log.note('no image', text)
             return
         try:
             message = cropped_message(self._messages, image, region)
         except ImageError as error:
-            self._log.note(Fault.IMAGE, str(error))
+            self._log.note('image', str(error))
             return
         self._publish(topic, stamp, message)
 

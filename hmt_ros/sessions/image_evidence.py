@@ -12,7 +12,6 @@ from hmt_ros.sessions.smoothed_messages import SmoothedBody
 from hmt_ros.smoothing.likelihood import counted, merged_modes, or_missed
 from msg_tools import MessageError
 from msg_tools.messages.headers import SECOND_NS
-from msg_tools.messages.message_error import MessageFault
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 
 # Time of the free motion that tells how far a pose may be from where an image shows it, s.
@@ -79,14 +78,14 @@ def evidence_of(content: PoseMixture) -> Evidence:
     if content.kind is MixtureKind.FORECAST:
         raise MessageError(
             'mixture is of the kind FORECAST, wanted LIKELIHOOD: no image speaks of a forecast',
-            MessageFault.KIND,
+            'kind',
         )
     mixture, share, time = content.mixture, content.error_share, content.error_time
     if math.isnan(share) or math.isnan(time):
         if content.kind is MixtureKind.LIKELIHOOD:
             raise MessageError(
                 f'likelihood has error_share {share:g} and error_time {time:g}, wanted numbers',
-                MessageFault.ERRORS,
+                'error_share and error_time',
             )
         share, time = 1.0, 0.0
     return Evidence(content.stamp_ns, mixture, CueErrors(share, time), content.shape_covariance)

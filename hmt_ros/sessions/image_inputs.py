@@ -17,7 +17,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from hmt_ros.image.terms.depth import FURTHEST, NEAREST, usable_depths
 from hmt_ros.inference.arrays import Image
-from hmt_ros.sessions.handled import Fault, HandlingLog
+from hmt_ros.sessions.handled import HandlingLog
 from msg_tools.files.error_line import error_line
 from msg_tools.messages import keypoints
 from msg_tools.messages.detections import BOXES, FLOATS, PEOPLE_2D, SKELETON_2D, YOLO
@@ -53,25 +53,20 @@ class ImageInput:
         name: of the input.
         types: type of its messages, by source; a source is the name of its topic, too.
         parameter: name of the one that is true where images wait for it; '': they always do.
-        faulty, none: kinds of faults: of an unusable message, and of an image without one.
         read: content of a message of a stamp, None where it says that there is nothing; raises
             ValueError, in one line, where it can not be used.
-        lone: kind of fault of one that belongs to no image; None: it is not reported.
-        told: whether an image without one is reported.
+        told: whether an image without one, and one that belongs to no image, are reported.
         pixels: remedy, maybe '', where its size is not that of its image; None: it has no pixels.
         remembered: maximum number kept of stamps whose image has not come.
         largest: size of the largest message that is taken, bytes.
         reliable: whether none may be lost on its way.
-        together: whether those of images that were left out stay, to be used with the next.
+        together: whether those of images before stay, to be used with the next.
     """
 
     name: str
     types: Mapping[str, str]
     parameter: str
-    faulty: Fault
-    none: Fault
     read: Callable[[Any, int], Any] | None = None
-    lone: Fault | None = None
     told: bool = False
     pixels: str | None = None
     remembered: int = REMEMBERED
@@ -109,10 +104,7 @@ MASK_INPUT = ImageInput(
     MASK,
     {MASK: IMAGE_TYPE, COMPRESSED_MASK: COMPRESSED_TYPE},
     'use_mask',
-    Fault.MASK,
-    Fault.NO_MASK,
     _read_mask,
-    lone=Fault.LONE_MASK,
     told=True,
     pixels='',
     remembered=FEWER,
@@ -122,10 +114,7 @@ DEPTH_INPUT = ImageInput(
     DEPTH,
     {DEPTH: IMAGE_TYPE},
     'use_depth',
-    Fault.DEPTH,
-    Fault.NO_DEPTH,
     _read_depth,
-    lone=Fault.LONE_DEPTH,
     told=True,
     pixels=': use depth that is registered to the colour camera',
     remembered=FEWER,
@@ -135,33 +124,25 @@ KEYPOINTS_INPUT = ImageInput(
     KEYPOINTS,
     {KEYPOINTS: keypoints.KEYPOINTS_2D},
     'use_keypoints',
-    Fault.KEYPOINTS,
-    Fault.NO_KEYPOINTS,
 )
 KEYPOINTS_3D_INPUT = ImageInput(
     KEYPOINTS_3D,
     {KEYPOINTS_3D: keypoints.KEYPOINTS_3D},
     'use_keypoints_3d',
-    Fault.KEYPOINTS_3D,
-    Fault.NO_KEYPOINTS_3D,
     _read_positions,
 )
 PREDICTION_INPUT = ImageInput(
     PREDICTION,
     {PREDICTION: POSE_MIXTURE},
     'use_predictions',
-    Fault.PREDICTION,
-    Fault.NO_PREDICTION,
     reliable=True,
+    together=True,
 )
 # Its type depends on the parameter `source`.
 DETECTIONS_INPUT = ImageInput(
     DETECTIONS,
     {DETECTIONS: ''},
     '',
-    Fault.DETECTIONS,
-    Fault.NO_DETECTIONS,
-    lone=Fault.LONE_DETECTIONS,
     told=True,
 )
 
@@ -253,7 +234,7 @@ class ImageInputs:
         try:
             content = read(message, stamp_ns)
         except ValueError as error:
-            self._log.fault(row.faulty, error_line(error))
+            self._log.fault(row.name, error_line(error))
         self._waiting[row.name].put(stamp_ns, content)
 
     def take(self, row: ImageInput, stamp_ns: int, image: Image, dropped: Container[int]) -> Taken:
@@ -264,11 +245,11 @@ class ImageInputs:
             dropped: stamps of images that were dropped, whose inputs are not missed.
         """
         waiting = self._waiting[row.name]
-        if row.lone is not None:
+        if row.told:
             for each in (x for x in waiting.before(stamp_ns) if x not in dropped):
                 verb, what = ('belong', 'come') if row.name.endswith('s') else ('belongs', 'comes')
                 self._log.note(
-                    row.lone,
+                    f'{row.name} without an image',
                     f'{row.name} of {each} ns {verb} to no image, or {what} too late: wanted the '
                     'stamp of an image',
                 )
@@ -276,12 +257,14 @@ class ImageInputs:
         content = waiting.take(stamp_ns)
         if row.told and not answered:
             verb = 'have' if row.name.endswith('s') else 'has'
-            self._log.note(row.none, f'no {row.name} {verb} come for the image of {stamp_ns} ns')
+            self._log.note(
+                f'no {row.name}', f'no {row.name} {verb} come for the image of {stamp_ns} ns'
+            )
         if content is None or row.pixels is None or content.shape == image.shape[:2]:
             return Taken(content, answered)
         (height, width), (rows, columns) = content.shape, image.shape[:2]
         self._log.fault(
-            row.faulty,
+            row.name,
             f'{row.name} of {stamp_ns} ns has {width}x{height} pixels, wanted the {columns}x{rows} '
             f'of its image{row.pixels}',
         )

@@ -25,7 +25,7 @@ from hmt_ros.experts.lifter import Lifter, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO, JOINTS
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, CameraNodeParameters
-from hmt_ros.sessions.handled import Fault, HandlingLog
+from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS_INPUT, SOURCES, ImageInput
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
@@ -141,18 +141,16 @@ class KeypointReader:
         parameters: CameraNodeParameters,
         body: Body,
         camera: Camera | None,
-        sigma_px: float = 0.0,
     ) -> Keypoints:
         """The keypoints in a message.
 
         Args:
             camera: that took the image; None: it is not known yet.
-            sigma_px: standard deviation of keypoints without one, px; 0: the learned one.
 
         Raises:
             ValueError: it can not be used; one line.
         """
-        found = self._found(message, stamp, parameters, camera, sigma_px)
+        found = self._found(message, stamp, parameters, camera)
         if found is None or not found.names:
             return NO_KEYPOINTS
         _, unknown = found.named_for(body, parameters.keypoint_scheme)
@@ -166,10 +164,9 @@ class KeypointReader:
         stamp: int,
         p: CameraNodeParameters,
         camera: Camera | None,
-        sigma_px: float,
     ) -> Keypoints | None:
         if self._source == OWN_KEYPOINTS:
-            return keypoints_of(message, sigma_px)
+            return keypoints_of(message)
         try:
             if self._source == 'skeleton2d':
                 if camera is None:
@@ -212,7 +209,7 @@ class KeypointReader:
             found = positions.added_to(found)
             if not set(positions.names) & set(found.names):
                 self._log.note(
-                    Fault.KEYPOINTS_3D,
+                    'keypoints_3d',
                     f'keypoints_3d of {stamp_ns} ns has none of the names of its keypoints, such '
                     f'as {found.names[0]!r}, but {positions.names[0]!r}',
                 )
@@ -230,7 +227,7 @@ class KeypointReader:
             self._unknown.add(names)
         known = {AUTO: 'of the body or of a known scheme', JOINTS: 'of the body'}
         self._log.note(
-            Fault.KEYPOINT_NAMES,
+            'names of keypoints',
             f'keypoints {unknown} are not used: wanted names of joints '
             f'{known.get(scheme, f"in the scheme {scheme}")}',
             warn=new,

@@ -10,19 +10,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from hmt_ros.detectors.registry import DETECTORS
+from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE
-from hmt_ros.sessions.handled import Fault, Output
+from hmt_ros.sessions.declared_parameters import (
+    NEXT_CONFIGURE,
+    ImageNodeParameters,
+    check_choices,
+    parameter_field,
+)
 from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D, MASK
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
+from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState
 from msg_tools.messages import keypoints
 from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.images import ImageError, image_message
@@ -33,6 +36,23 @@ TOPICS = {
     KEYPOINTS_3D: PublishedTopic(keypoints.KEYPOINTS_3D),
     MASK: PublishedTopic('sensor_msgs/msg/Image'),
 }
+
+
+@dataclass(frozen=True)
+class KeypointsParameters(ImageNodeParameters):
+    """All parameters of the keypoints node.
+
+    Attributes:
+        detector: Detector of keypoints; 'mediapipe' is MediaPipe Pose.
+        publish_mask: If true, the node also publishes the mask of the person.
+    """
+
+    detector: str = parameter_field(USUAL_DETECTOR, NEXT_CONFIGURE)
+    publish_mask: bool = parameter_field(False, NEXT_CONFIGURE)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choices(self, detector=tuple(DETECTORS))
 
 
 @dataclass(frozen=True)
@@ -69,23 +89,17 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
     ESTIMATE = 'the sequence'
     CHECKED = ()
 
-    def __init__(
-        self,
-        parameters: KeypointsParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        super().__init__(parameters, publish, wanted)
-        kind = DETECTORS[parameters.detector]
-        self._detector = kind.make(with_mask=parameters.publish_mask)
+    def _set_up(self) -> None:
+        kind = DETECTORS[self.parameters.detector]
+        self._detector = kind.make(with_mask=self.parameters.publish_mask)
+        self.restart()
+
+    def restart(self) -> None:
+        """See `Session`."""
+        # The detector sees by the stamps that a new sequence begins.
         self._newest: int | None = None
         self._landmarks = 0
-        self.state = self._present_state()
-
-    def _forget(self) -> None:
-        # The detector sees by the stamps that a new sequence begins.
-        self._newest = None
-        self._landmarks = 0
+        super().restart()
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
         order = self._order(stamp, self._newest)
@@ -97,7 +111,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
             image = self.decode_image(message)
             found = self._detector.detect(image, stamp)
         except ImageError as error:
-            self._log.skip(Fault.IMAGE, str(error))
+            self._log.skip('image', str(error))
             return
         self._newest = stamp
         self._landmarks = 0 if found is None else len(found.names)

@@ -19,19 +19,29 @@ from hmt_ros.sessions.declared_parameters import (
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 _KEY = 'ros__parameters'
-_WIDTH = 100
+_WIDTH, _INDENT = 100, '    '
 _LARGEST_FILE = 1_000_000  # bytes
 
 
-def parameter_file_text(node: str, settings: Any) -> str:
-    """A parameter file with all parameters, each under a comment that describes it."""
+def parameter_file_text(node: str, settings: Any, like: str = '', others: Any = None) -> str:
+    """A parameter file with all parameters, each under a comment that describes it.
+
+    Args:
+        like: name of a node whose parameters this one has, too, and whose file lists those that
+            are the same; '': there is none.
+        others: settings of that node.
+    """
     declared = declared_parameters(settings)
+    if like:
+        known = declared_parameters(others)
+        declared = [parameter for parameter in declared if parameter not in known]
     used = {parameter.effect for parameter in declared}
     lines = [
         f'# Parameters of {node}, with their defaults. A file needs only those that it changes:',
         '#',
         f'#     ros2 run hmt_ros {node} --ros-args --params-file FILE',
         '#',
+        *([f'# All others are those of {like}: see {like}.yaml.', '#'] if like else []),
         '# In square brackets: lowest and highest value, and when a new value takes effect:',
         *(
             f'# "{name}": {text[0].lower()}{text[1:]}'
@@ -41,26 +51,18 @@ def parameter_file_text(node: str, settings: Any) -> str:
         f'/**/{node}:',
         f'  {_KEY}:',
     ]
-    open_groups: list[str] = []
     for parameter in declared:
-        *groups, name = parameter.name.split('.')
-        same = 0
-        while open_groups[same : same + 1] == groups[same : same + 1] != []:
-            same += 1
-        lines.extend(f'{_indent(depth)}{groups[depth]}:' for depth in range(same, len(groups)))
-        open_groups = groups
-        indent = _indent(len(groups))
         lines.extend(
             textwrap.wrap(
                 f'{parameter.description} [{_bounds(parameter)}{parameter.effect}]',
                 _WIDTH,
-                initial_indent=f'{indent}# ',
-                subsequent_indent=f'{indent}# ',
+                initial_indent=f'{_INDENT}# ',
+                subsequent_indent=f'{_INDENT}# ',
                 break_long_words=False,
                 break_on_hyphens=False,
             )
         )
-        lines.append(f'{indent}{name}: {yaml_scalar(parameter.default)}')
+        lines.append(f'{_INDENT}{parameter.name}: {yaml_scalar(parameter.default)}')
     return '\n'.join(lines) + '\n'
 
 
@@ -123,10 +125,6 @@ def _flattened(values: Any, prefix: str, path: Path) -> Iterator[tuple[str, Any]
             yield from _flattened(value, f'{name}.', path)
         else:
             yield name, value
-
-
-def _indent(depth: int) -> str:
-    return '  ' * (depth + 2)
 
 
 def _bounds(parameter: DeclaredParameter) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from hmt_ros.body import Body
 from hmt_ros.image.keypoint_evidence import FEWEST_KEYPOINTS
+from hmt_ros.image.keypoint_schemes import Scheme
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions.handled import Fault, HandlingLog
-from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.handled import HandlingLog
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
 from hmt_ros.tracking.association import Sighting
 from msg_tools import MessageError
 from msg_tools.messages.detections import (
@@ -23,6 +24,14 @@ from msg_tools.messages.detections import (
     people_of_message,
     people_of_yolo,
 )
+
+# The people in a message, by the parameter `source`, where keypoints without names have an order.
+_READERS: dict[str, Callable[[Any, Scheme], list[DetectedPerson]]] = {
+    'people': lambda message, _: people_of_message(message),
+    'boxes': lambda message, _: people_of_boxes(message),
+    'yolo': people_of_yolo,
+    'floats': people_of_floats,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,31 +66,21 @@ class PeopleReader:
         self._log = log
         self._unknown: set[frozenset[str]] = set()
 
-    def people(self, message: Any, stamp: int, sigma_px: float) -> list[DetectedPerson]:
+    def people(self, message: Any, stamp: int) -> list[DetectedPerson]:
         """The people in a message.
-
-        Args:
-            sigma_px: standard deviation of keypoints without covariances, px; 0: learned ones.
 
         Raises:
             MessageError: it can not be used.
         """
         try:
-            if self._source == 'people':
-                people = people_of_message(message, sigma_px)
-            elif self._source == 'boxes':
-                people = people_of_boxes(message)
-            elif self._source == 'yolo':
-                people = people_of_yolo(message, self._scheme)
-            else:
-                people = people_of_floats(message, self._scheme)
+            people = _READERS[self._source](message, self._scheme)
         except MessageError as error:
             raise MessageError(f'detections of {stamp} ns: {error}') from error
         names: set[str] = set()
         for i, person in enumerate(people):
             if person.name and person.name in names:
                 self._log.fault(
-                    Fault.DETECTIONS,
+                    'detections',
                     f'detections of {stamp} ns have the id {person.name!r} twice, wanted each id '
                     'once: the second is taken to have none',
                 )
@@ -115,7 +114,7 @@ class PeopleReader:
             return
         self._unknown.add(unknown)
         self._log.note(
-            Fault.KEYPOINT_NAMES,
+            'names of keypoints',
             f'keypoints {sorted(unknown)} are not used: wanted names of joints of the body or of '
             'a known scheme',
         )

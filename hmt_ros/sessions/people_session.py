@@ -1,11 +1,11 @@
-"""Several people before one camera: detections in, one filter for each person.
+"""Several people before one camera: detections in, one track for each person.
 
-The rules, besides those of `TrackingSession`:
+The rules, besides those of `CameraSession`:
 
 - An image waits for its detections (`image_inputs`).
 - Identities of the detector are kept. People without one are told apart by their last place
   and motion (`hmt_ros.tracking.association`).
-- A detection that matches nobody who is followed starts a filter, the largest first, up to
+- A detection that matches nobody who is followed starts a track, the largest first, up to
   `max_people`. A person without a track, or no longer in view (`Tracker.status`), is dropped.
 - The nearest person is tracked first. For each person the pixels of nearer people are unknown, and
   the pixels that only somebody farther away covers (`Tracker.step`, others).
@@ -16,7 +16,7 @@ The rules, besides those of `TrackingSession`:
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -24,11 +24,11 @@ import numpy as np
 
 from hmt_ros.body import Camera
 from hmt_ros.image.background import BackgroundModel, SceneWatch
+from hmt_ros.image.person_shape import covered
 from hmt_ros.image.silhouettes import Silhouettes, region_of
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.inference.arrays import Mask
+from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.sessions.camera_session import CAMERA_MOVED, WaitingImage
-from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.image_inputs import (
     DEPTH_INPUT,
     DETECTIONS,
@@ -38,11 +38,13 @@ from hmt_ros.sessions.image_inputs import (
     ImageInput,
 )
 from hmt_ros.sessions.people_inputs import Found, PeopleReader
-from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.person_session import BODIES, PersonSession, person_of
 from hmt_ros.sessions.session import PublishedTopic, SessionState
+from hmt_ros.sessions.track import BODIES, Seen, Track, person_of
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
+from hmt_ros.sessions.track_start import TrackStart
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
+from hmt_ros.tracking import Status
 from hmt_ros.tracking.association import (
     GATE,
     ImageTrack,
@@ -50,9 +52,11 @@ from hmt_ros.tracking.association import (
     assigned,
     grown,
     hull,
+    moved,
     unknown_area,
 )
 from hmt_ros.tracking.camera_motion import CameraPose
+from hmt_ros.tracking.hypotheses import LIKELY
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,
     PEOPLE_2D,
@@ -69,6 +73,11 @@ def published_topic(topic: str) -> PublishedTopic:
     if topic in PeopleSession.TOPICS:
         return PeopleSession.TOPICS[topic]
     return TOPICS_OF_NODE[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
+
+
+def session_of(parameters: FilterParameters) -> type[TrackingSession]:
+    """The class of the session that tracks with these parameters."""
+    return PeopleSession if isinstance(parameters, PeopleParameters) else TrackingSession
 
 
 # Least size in the image, px, of a person who is tracked.
@@ -106,27 +115,59 @@ class PeopleState(SessionState):
         return [('people', ' '.join(self.people)), ('people detected', str(self.detected))]
 
 
-@dataclass(eq=False)
-class _Person:
-    """Somebody who is followed.
+class _Person(Track):
+    """Somebody who is followed; see `Track`.
+
+    Args:
+        found: where the person is seen first.
+        stamp: of that image, ns.
 
     Attributes:
-        name: identity in topics.
         known_as: identity that the detector gives; '' if it gives none.
         place: where the person was last detected.
-        session: with the track.
     """
 
-    name: str
-    known_as: str
-    place: ImageTrack
-    session: PersonSession
+    def __init__(self, found: Found, stamp: int, *track: Any) -> None:
+        self.known_as = found.detected.name
+        self.place = ImageTrack(found.sighting, stamp)
+        super().__init__(*track)
+
+    @property
+    def depth(self) -> float:
+        """Distance of the person along the optical axis, m; infinite without a track."""
+        return float(self.tracker.modes.poses[0, 2]) if self.begun and self.tracker else np.inf
+
+    def area(self, camera: Camera, shift: Array | None = None) -> Mask | None:
+        """Where likely modes have the body (H, W), moved by a shift (2,) px; None: no track."""
+        if not self.begun or self.tracker is None:
+            return None
+        modes = self.tracker.modes
+        result = np.zeros((camera.height, camera.width), dtype=np.bool_)
+        for pose in modes.poses[modes.log_weights > -LIKELY]:
+            result |= covered(self.tracker.body, camera, pose)
+        return grown(result if shift is None else moved(result, shift))
+
+    def expected_area(self, camera: Camera, one: Found | None, stamp: int) -> Mask:
+        """Pixels (H, W) that the person is expected to cover.
+
+        Args:
+            one: the detection of the person in the image; None: there is none.
+        """
+        shift = self.place.shift(stamp)
+        if one is not None and self.begun and self.tracker is not None:
+            body = self.tracker.body
+            pixels = camera.project(body.joint_positions(self.tracker.modes.poses[:1]))[0]
+            names = dict(zip(body.joint_names, pixels, strict=True))
+            shifts = Sighting(names, one.sighting.corners).shifts_to(one.sighting)
+            shift = np.nan_to_num(np.median(shifts, axis=0))
+        area = self.area(camera, shift)
+        return hull(self.place.sighting, (camera.height, camera.width)) if area is None else area
 
 
-class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
+class PeopleSession(TrackingSession):
     """Tracks several people; see `TrackingSession` for arguments and attributes."""
 
-    # Each person has those of `track_messages` besides, with the prefix of `person_session`.
+    # Each person has those of `track_messages` besides, with the prefix of `track`.
     TOPICS: ClassVar[Mapping[str, PublishedTopic]] = {
         PEOPLE: PublishedTopic(PEOPLE_2D),
         '/tf': TOPICS_OF_NODE['/tf'],
@@ -134,77 +175,63 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
     ESTIMATE = 'every track'
     CHECKED = ('background_file', 'body_model', 'lifter')
 
+    parameters: PeopleParameters
+    tracks: Sequence[_Person]
+
     def _set_up(self) -> None:
+        self._reader = PeopleReader(self.parameters, self._log)
         super()._set_up()
-        self._used = self.parameters
-        self._reader = PeopleReader(self._used, self._log)
-        self._forget()
-        self.state = self._present_state()
 
-    @classmethod
-    def inputs_of(cls, parameters: PeopleParameters) -> tuple[ImageInput, ...]:
-        """See `CameraSession`."""
-        detections = {DETECTIONS: SOURCES[parameters.source]}
-        return replace(DETECTIONS_INPUT, types=detections), DEPTH_INPUT, MASK_INPUT
-
-    def _forget(self) -> None:
-        self._people: list[_Person] = []
+    def _begin(self) -> None:
+        self.tracks = ()
         self._scene: Silhouettes | None = None
         self._watch = SceneWatch()
         self._next, self._detected, self._begun = 1, 0, False
 
-    def stale(self, silence: float, answered: int) -> list[Output]:
-        """See `TrackingSession`; of everybody who is followed."""
-        if answered != self.answered:
-            return []
-        people = [person.session for person in self._people]
-        return [output for one in people for output in one.stale(silence, one.answered)]
+    def restart(self, start: TrackStart | None = None) -> None:
+        """See `TrackingSession`."""
+        self._begin()
+        super().restart(start)
 
     # Inputs.
 
+    @classmethod
+    def inputs_of(cls, parameters: FilterParameters) -> tuple[ImageInput, ...]:
+        """See `CameraSession`."""
+        detections = {DETECTIONS: SOURCES[parameters.source]}
+        return replace(DETECTIONS_INPUT, types=detections), DEPTH_INPUT, MASK_INPUT
+
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name == DETECTIONS:
-            return self._reader.people(message, stamp, self.parameters.keypoint_sigma_px)
+            return self._reader.people(message, stamp)
         return super()._read_input(row, message, stamp)
 
     # Estimates.
 
-    def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
-        stamp = waiting.stamp_ns
+    def _people_in(self, waiting: WaitingImage, camera: Camera) -> Iterator[tuple[Track, Seen]]:
+        p, stamp = self.parameters, waiting.stamp_ns
         detected: list[DetectedPerson] | None = waiting.content(DETECTIONS)
-        self._look_at_frames(waiting)
         if self._scene is None:
             self._scene = Silhouettes(self._background_for(camera))
         if (pose := self.frames.pose) is not None:
             # From another view the scene is another.
             self._scene.see_from(CameraPose.of(pose.translation, pose.rotation), camera)
-        p, found = self.parameters, []
-        if p is not self._used:
-            self._used = p
-            for person in self._people:
-                person.session.use(p)
+        found: list[Found] = []
         if detected is not None:
             found = self._reader.found(
                 detected, self.start.body, p.keypoint_scheme, use_keypoints=p.use_keypoints
             )
         own, left = self._matched(found, stamp)
         known = self._scene.scene.known
-        background = self._scene.background if known else BackgroundModel(p.background)
-        self._begin(left, own, camera, background, stamp)
+        background = self._scene.background if known else BackgroundModel()
+        self._start_tracks(left, own, camera, background, stamp)
         if detected is not None:
             self._detected = len(detected)
-            if not detected and not self._people:
+            if not detected and not self.tracks:
                 self._scene.learn(waiting.image, stamp, detected=False)
         if self._scene.scene.known:
             self._look_at_scene(waiting, self._scene.background, 'call ~/reset')
-        skipped, tracked = self._log.counts['skipped'], self._log.counts['tracked']
-        self._follow_all(waiting, camera, own, left, answered=detected is not None)
-        self.answered += 1
-        # Those are counts of images, not of people.
-        any_tracked = self._log.counts['tracked'] > tracked
-        any_skipped = self._log.counts['skipped'] > skipped and not any_tracked
-        self._log.counts['tracked'] = tracked + any_tracked
-        self._log.counts['skipped'] = skipped + any_skipped
+        yield from self._nearest_first(waiting, camera, own, left, detected is not None)
         self._drop_those_who_left(stamp)
         if detected is not None and self._wanted(PEOPLE):
             self._publish_people(waiting, camera)
@@ -214,9 +241,9 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         try:
             return self.start.background_model(camera)
         except ValueError as error:
-            self._log.note(Fault.BACKGROUND, f'{error}: silhouettes are not used')
+            self._log.note('background', f'{error}: silhouettes are not used')
             self.start = replace(self.start, background=None)
-            return BackgroundModel(self.parameters.background)
+            return BackgroundModel()
 
     def _matched(
         self, found: Sequence[Found], stamp: int
@@ -224,13 +251,13 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         """Detections of the people who are followed, by person, and the detections left over."""
         own: dict[_Person, Found] = {}
         left = list(found)
-        for person in self._people:
+        for person in self.tracks:
             for one in left:
                 if person.known_as and one.detected.name == person.known_as:
                     own[person] = one
                     left.remove(one)
                     break
-        others = [person for person in self._people if person not in own]
+        others = [person for person in self.tracks if person not in own]
         pairs = assigned([x.place for x in others], [x.sighting for x in left], stamp)
         for row, column in pairs.items():
             own[others[row]] = left[column]
@@ -240,7 +267,7 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
             person.place.update(one.sighting, stamp)
         return own, left
 
-    def _begin(
+    def _start_tracks(
         self,
         left: list[Found],
         own: dict[_Person, Found],
@@ -257,34 +284,25 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
             costs = [x.place.cost(one.sighting, stamp) for x in own if own[x] is not one]
             if min(costs, default=GATE) < 0.5 * GATE:
                 continue  # a second detection of the same person
-            if len(self._people) >= p.max_people:
+            if len(self.tracks) >= p.max_people:
                 self._log.note(
-                    Fault.PEOPLE,
+                    'too many people',
                     f'{len(own) + len(left)} people are detected in the image of {stamp} ns, but '
                     f'max_people is {p.max_people}: the others are not followed',
                 )
                 return
-            name = self._new_name(one.detected.name)
-            session = PersonSession(
-                name,
-                p,
-                self._publish_output,
-                self._wanted,
-                self.start,
-                background,
-                self.frames,
-                self._log,
-            )
+            start = self.start
             if not one.keypoints.names:
-                session.start_in((*corners[0].tolist(), *corners[1].tolist()))
-            person = _Person(name, one.detected.name, ImageTrack(one.sighting, stamp), session)
-            self._people.append(person)
+                start = replace(start, box=(*corners[0].tolist(), *corners[1].tolist()))
+            name = self._new_name(one.detected.name)
+            person = _Person(one, stamp, name, p, start, self._shared, background)
+            self.tracks = (*self.tracks, person)
             own[person] = one
             left.remove(one)
 
     def _new_name(self, given: str) -> str:
         """Identity for topics: letters, digits and underscores, a letter first."""
-        taken = {person.name for person in self._people}
+        taken = {track.person for track in self.tracks}
         name = re.sub(r'[^A-Za-z0-9_]', '_', given)
         if name:
             name = name if name[0].isalpha() else f'p{name}'
@@ -293,23 +311,22 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
             self._next += 1
         return name
 
-    def _follow_all(
+    def _nearest_first(
         self,
         waiting: WaitingImage,
         camera: Camera,
         own: dict[_Person, Found],
         strangers: Sequence[Found],
-        *,
         answered: bool,
-    ) -> None:
-        """Tracks everybody in an image, the nearest first."""
-        stamp, shape = waiting.stamp_ns, waiting.image.shape[:2]
+    ) -> Iterator[tuple[Track, Seen]]:
+        """Everybody in an image, with the pixels that others cover."""
+        shape = waiting.image.shape[:2]
         areas = {
-            person: self._area(person, camera, own.get(person), shape, stamp)
-            for person in self._people
+            person: person.expected_area(camera, own.get(person), waiting.stamp_ns)
+            for person in self.tracks
         }
         strange = [hull(one.sighting, shape) for one in strangers]
-        order = sorted(self._people, key=lambda x: x.session.depth)
+        order = sorted(self.tracks, key=lambda person: person.depth)
         for place, person in enumerate(order):
             nearer = [areas[other] for other in order[:place]]
             farther = [areas[other] for other in order[place + 1 :]]
@@ -319,53 +336,30 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
                 keypoints = one.keypoints
             elif answered and one is None and person.place.sighting.joints:
                 keypoints = NO_KEYPOINTS
-            person.session.follow(waiting, camera, keypoints, others)
-            seen = person.session.area(camera)
-            if seen is not None:
-                areas[person] = grown(seen)
-
-    def _area(
-        self,
-        person: _Person,
-        camera: Camera,
-        one: Found | None,
-        shape: tuple[int, ...],
-        stamp: int,
-    ) -> Mask:
-        """Pixels (H, W) that a person is expected to cover."""
-        tracker = person.session.tracker
-        if not person.session.begun or tracker is None:
-            return hull(person.place.sighting, shape)
-        shift = person.place.shift(stamp)
-        if one is not None:
-            pixels = camera.project(tracker.body.joint_positions(tracker.modes.poses[:1]))[0]
-            names = tracker.body.joint_names
-            seen = Sighting(dict(zip(names, pixels, strict=True)), one.sighting.corners)
-            shift = np.nan_to_num(np.median(seen.shifts_to(one.sighting), axis=0))
-        area = person.session.area(camera, shift)
-        assert area is not None
-        return grown(area)
+            yield person, Seen(keypoints, others=others)
+            if (area := person.area(camera)) is not None:
+                areas[person] = area
 
     def _drop_those_who_left(self, stamp: int) -> None:
-        self._people = [
+        self.tracks = tuple(
             person
-            for person in self._people
-            if not person.session.ended
-            and (person.session.begun or stamp - person.place.stamp <= UNSTARTED * SECOND_NS)
-        ]
+            for person in self.tracks
+            if person.status is not Status.NOBODY
+            and (person.begun or stamp - person.place.stamp <= UNSTARTED * SECOND_NS)
+        )
 
     def _publish_people(self, waiting: WaitingImage, camera: Camera) -> None:
         people = []
-        for person in self._people:
-            tracker = person.session.tracker
-            if tracker is None or not person.session.begun:
+        for person in self.tracks:
+            tracker = person.tracker
+            if tracker is None or not person.begun:
                 continue
             names, pose = tracker.body.joint_names, tracker.point_estimate[None]
             pixels = camera.project(tracker.body.joint_positions(pose))[0]
             unknown = np.full((len(names), 2, 2), np.nan)
             keypoints = Keypoints(names, pixels, unknown, np.ones(len(names)))
             box = region_of(tracker.body, camera, pose, margin=0.0)
-            people.append(DetectedPerson(person.name, keypoints, box))
+            people.append(DetectedPerson(person.person, keypoints, box))
         stamp, frame = waiting.stamp_ns, waiting.frame_id
         self._publish(PEOPLE, stamp, people_message(self._messages, people, stamp, frame))
 
@@ -375,8 +369,8 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
         return PeopleState(
             *self._status_and_wants(),
             **self._totals(),
-            people=tuple(person.name for person in self._people if person.session.begun),
-            followed=tuple(person.name for person in self._people),
+            people=tuple(track.person for track in self.tracks if track.begun),
+            followed=tuple(track.person for track in self.tracks),
             detected=self._detected,
             moved=self._watch.moved,
         )
@@ -384,4 +378,4 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
     def _status(self) -> tuple[str, str]:
         if not self._begun:
             return 'waiting', 'an image and its detections'
-        return ('tracking' if any(x.session.begun for x in self._people) else 'nobody'), ''
+        return ('tracking' if any(track.begun for track in self.tracks) else 'nobody'), ''

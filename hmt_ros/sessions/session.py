@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.declared_parameters import NodeParameters
-from hmt_ros.sessions.handled import Fault, Handled, HandlingLog, Output
+from hmt_ros.sessions.handled import Handled, HandlingLog, Output
 from msg_tools import RosbagsMessages
-from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image
 
@@ -173,7 +172,6 @@ class Session(ABC, Generic[Parameters, State]):
         self._wanted = wanted
         self._messages = RosbagsMessages()
         self._log = HandlingLog()
-        self._weights = np.empty(0)
         self._frame_id = ''
         self.topic_names: Mapping[str, str] = {}
         self.decode_image: Callable[[Any], Image] = decode_image
@@ -218,9 +216,7 @@ class Session(ABC, Generic[Parameters, State]):
         return [NeededInput((self.COUNTED,))]
 
     def restart(self) -> None:
-        """Starts the estimate anew."""
-        self._forget()
-        self._weights = np.empty(0)
+        """Drops the estimate; a new one starts with the messages that follow."""
         self.state = self._present_state()
 
     def finish(self) -> Handled:
@@ -235,7 +231,7 @@ class Session(ABC, Generic[Parameters, State]):
     def refuse(self, source: str, text: str, *, more: bool = False) -> Handled:
         """Counts a message that could not be read; `more` as for `take`."""
         self._log.begin()
-        self._log.fault(Fault.MESSAGE, f'message of {source} can not be read: {text}')
+        self._log.fault('message', f'message of {source} can not be read: {text}')
         if not more:
             self._use_what_has_come()
         return self._handled(source, 0)
@@ -244,13 +240,13 @@ class Session(ABC, Generic[Parameters, State]):
         """Reports a message to be estimated from that was dropped before it came here."""
         self._log.begin()
         self._log.counts['received'] += 1
-        self._log.drop(self._late(stamp_ns))
+        self._drop(stamp_ns)
         return self._handled(self.COUNTED, stamp_ns)
 
     def break_off(self, source: str, text: str) -> Handled:
         """Counts an error of the session itself, and restarts the estimate."""
-        self._log.fault(Fault.NODE, text)
-        self._start_again()
+        self._log.fault('node itself', text)
+        self.restart()
         # The traceback is in the log of the node already.
         return replace(self._log.handled(source, 0), warnings=())
 
@@ -267,13 +263,10 @@ class Session(ABC, Generic[Parameters, State]):
     def _use_what_has_come(self) -> None:
         """Estimates from the messages that `_take` has put aside."""
 
-    def _late(self, stamp_ns: int) -> str:
-        """Why a message is dropped."""
-        return f'{self.UNIT} of {stamp_ns} ns is dropped: newer ones came before its turn'
-
-    @abstractmethod
-    def _forget(self) -> None:
-        """Drops the estimate."""
+    def _drop(self, stamp_ns: int) -> None:
+        """Drops a message to be estimated from, because the session is late."""
+        text = f'{self.UNIT} of {stamp_ns} ns is dropped: newer ones came before its turn'
+        self._log.drop(text)
 
     @abstractmethod
     def _present_state(self) -> State:
@@ -283,19 +276,15 @@ class Session(ABC, Generic[Parameters, State]):
         """Stamp of a message, ns."""
         return time_ns(message.header.stamp)
 
-    def _start_again(self) -> None:
-        """Starts the estimate anew in the same way as last time."""
-        self.restart()
-
     def _handled(self, source: str, stamp: int) -> Handled:
         self.state = self._present_state()
         return self._log.handled(source, stamp)
 
-    def _totals(self) -> dict[str, Any]:
-        """Fields of `SessionState` over all messages."""
+    def _totals(self, weights: NDArray[np.float64] | None = None) -> dict[str, Any]:
+        """Fields of `SessionState` over all messages, and of the weights of a mixture."""
         log = self._log
         return {
-            'entropy': entropy(self._weights),
+            'entropy': math.nan if weights is None else entropy(weights),
             'counts': Counter(log.counts),
             'faults': Counter(log.faults),
             'last_fault': log.last_fault,
@@ -314,21 +303,21 @@ class Session(ABC, Generic[Parameters, State]):
             return Order.NEXT
         text = f'{self.UNIT} of {stamp} ns comes after one of {newest} ns'
         if stamp == newest:
-            self._log.skip(Fault.SAME_TIME, f'{text}, wanted stamps that increase')
+            self._log.skip('time stands still', f'{text}, wanted stamps that increase')
             return Order.SKIPPED
         if not self.parameters.reset_on_time_jump:
             self._log.skip(
-                Fault.TIME_JUMP,
+                'time jumps back',
                 f'{text}: skipped; with reset_on_time_jump {self.ESTIMATE} would start anew',
             )
             return Order.SKIPPED
-        self._log.note(Fault.TIME_JUMP, f'{text}: {self.ESTIMATE} starts anew')
+        self._log.note('time jumps back', f'{text}: {self.ESTIMATE} starts anew')
         return Order.JUMP
 
     def _publish(self, topic: str, stamp: int, message: Any) -> None:
         began = time.perf_counter()
         self._log.published(topic, stamp)
-        self._publish_output(Output(topic, stamp, serialise(message)))
+        self._publish_output(Output(topic, stamp, message))
         self.publishing += time.perf_counter() - began
 
 

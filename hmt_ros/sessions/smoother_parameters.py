@@ -74,19 +74,19 @@ class SmootherParameters(NodeParameters):
         fixed_lag: Time by which a smoothed pose is older than the newest image, s, at any rate of
             images. It may be a fifth more; 0 is filtering.
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
-        max_trajectories: Maximum number of components of a mixture over trajectories.
         max_hypotheses: Maximum number of components of smoothed_pose_mixture.
         resting_feet: If true, feet that rest do not slide between images. The frame of the mixtures
             must then stand still (a still camera, or publish_in_fixed_frame of the filter).
         random_seed: Seed of all random numbers; the same mixtures give the same results.
-        longest_interval: Interval between two mixtures above which a gap is reported, s; the
-            dynamics bridge it.
         publish_covariances: If true, trajectory_mixture has covariances, which make it forty times
             as large.
         publish_tf: If true, the links of the heaviest smoothed pose are published on /tf.
         frame_prefix: Prefix of the names of these links, beside those of the filter.
         queue_size: Maximum number of mixtures that wait, while ~/smooth_window is answered for
             example; the oldest are dropped.
+        max_trajectories: maximum number of components of a mixture over trajectories.
+        longest_interval: interval between two mixtures above which a gap is reported, s; the
+            dynamics bridge it.
         through_modes: whether the best path through every single mode is a candidate, besides the
             best between first and last modes.
         dynamics: settings of the motion model.
@@ -96,15 +96,15 @@ class SmootherParameters(NodeParameters):
     method: str = parameter_field('paths', NEXT_WINDOW)
     fixed_lag: float = parameter_field(0.5, NEXT_WINDOW, (0.0, 3600.0))
     window_length: int = parameter_field(47, AT_ONCE, (1, 10_000))
-    max_trajectories: int = parameter_field(16, NEXT_WINDOW, (1, 1024))
     max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))
     resting_feet: bool = parameter_field(True, NEXT_WINDOW)
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
-    longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))
     publish_covariances: bool = parameter_field(False, AT_ONCE)
     publish_tf: bool = parameter_field(False, AT_ONCE)
     frame_prefix: str = parameter_field('smoothed/', AT_ONCE)
     queue_size: int = parameter_field(100, AT_ONCE, (1, 1000))
+    max_trajectories: int = 16
+    longest_interval: float = 0.25
     through_modes: bool = False
     dynamics: SmootherDynamics = field(default_factory=SmootherDynamics)
 

@@ -39,7 +39,6 @@ from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.body.mirror import clear_level, free_limits, relevelled, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.image_evidence import Evidence, KeptMixtures, evidence_of
 from hmt_ros.sessions.session import Order, Session, SessionState
 from hmt_ros.sessions.smoothed_messages import (
@@ -60,7 +59,6 @@ from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import SECOND_NS
-from msg_tools.messages.message_error import MessageFault
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
@@ -135,15 +133,9 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             known_body(self.parameters.body_model)
         self._of: SmoothedBody | None = None
         self._resolved: tuple[Any, SmoothedBody] | None = None
-        self._window: SlidingWindow | None = None
-        # By stamp, of the poses of the window that have not been published.
-        self._open: dict[int, OpenPose] = {}
-        self._newest: int | None = None
-        self._nobody = False
         self._gaps, self._longest_gap = 0, 0.0
         self._first_identity = 1
-        self.kept = KeptMixtures(None, ())
-        self.state = self._present_state()
+        self.restart()
 
     def prepare(self) -> None:
         """See `Session`."""
@@ -161,12 +153,16 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._end_window()
         return stamp
 
-    def _forget(self) -> None:
-        self._window = None
-        self._open = {}
-        self._newest = None
+    def restart(self) -> None:
+        """See `Session`."""
+        self._window: SlidingWindow | None = None
+        self._weights = np.empty(0)
+        # By stamp, of the poses of the window that have not been published.
+        self._open: dict[int, OpenPose] = {}
+        self._newest: int | None = None
         self._nobody = False
         self.kept = KeptMixtures(self._of, ())
+        super().restart()
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
         try:
@@ -181,7 +177,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             return
         if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
             self._log.note(
-                Fault.MIXTURE_KIND,
+                'kind of mixture',
                 f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
                 'say counts more than once',
             )
@@ -201,7 +197,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 self._gaps += 1
                 self._longest_gap = max(self._longest_gap, interval)
                 self._log.note(
-                    Fault.GAP,
+                    'gap',
                     f'no mixture for {interval:.2f} s before {stamp} ns: the dynamics bridge it',
                 )
         if self._window is None:
@@ -212,7 +208,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             )
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
-            self._log.skip(Fault.ESTIMATE, f'mixture of {stamp} ns can not be smoothed: {text}')
+            self._log.skip('estimate', f'mixture of {stamp} ns can not be smoothed: {text}')
             self._end_window()
             return
         self._newest, self._nobody = stamp, False
@@ -278,7 +274,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             # A message must not cause files to be read: its body has to ship with the package.
             model = known_body(chosen) if chosen else known_body(content.body_model, named_body)
         except ValueError as error:
-            raise MessageError(str(error), MessageFault.BODY) from error
+            raise MessageError(str(error), 'body') from error
         body = body_of(content, model, any_name=bool(chosen))
         of = SmoothedBody(body, content.frame_id, content.track_id)
         self._resolved = about, of
@@ -304,7 +300,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             return
         if self._newest is not None:
             text = 'mixtures are about another body or another track: a new window begins'
-            self._log.note(Fault.NEW_BODY, text)
+            self._log.note('new body', text)
         self._end_window()
         self._of, self._first_identity = of, 1
         self.kept = KeptMixtures(of, ())
@@ -407,7 +403,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         return SmootherState(
             status,
             wants,
-            **self._totals(),
+            **self._totals(self._weights),
             window=0 if self._window is None else len(self._window.stamps_ns),
             trajectories=len(self._weights),
             gaps=self._gaps,

@@ -19,12 +19,12 @@ from hmt_ros.body.mirror import turned
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import WaitingImage
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.focal_length import depth_covariances
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.robot_outputs import RobotOutputs
 from hmt_ros.sessions.session import PublishedTopic
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.tracking import Status, Tracker
 from msg_tools import RosbagsMessages
 from msg_tools.messages.bodies import description_message, message_of_body
@@ -32,7 +32,7 @@ from msg_tools.messages.ground import GROUND, GroundState, ground_message
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.keep_out import KEEP_OUT, keep_out_markers, keep_out_message
 from msg_tools.messages.markers import ground_markers, removed_ground, skeleton_markers
-from msg_tools.messages.people import PERSON_POSE, person_pose, person_pose_message
+from msg_tools.messages.person_poses import PERSON_POSE, person_pose, person_pose_message
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
@@ -67,6 +67,8 @@ TOPICS_OF_NODE = {
 # Frame at the camera with x forward and z up, where gravity is known; a prefix stands before it.
 UPRIGHT = 'camera_upright'
 MESSAGES = RosbagsMessages()
+# Modes that are drawn on the image, the heaviest.
+OVERLAY_MODES = 3
 
 
 class Made(NamedTuple):
@@ -86,6 +88,7 @@ class TrackedImage:
         tracker: after the image.
         posterior, likelihood: mixtures over poses, heaviest first.
         parameters: of the node.
+        frame_prefix: of the names of the links.
         starts: whether the body is a new one, with other lengths than the image before.
         describe: whether the URDF is due: a new body, or other names of its frames.
         fixed: frame that mixtures, markers and the pose of the person are published in; None: the
@@ -97,6 +100,7 @@ class TrackedImage:
     posterior: GaussianMixture
     likelihood: GaussianMixture
     parameters: FilterParameters
+    frame_prefix: str
     starts: bool
     describe: bool
     fixed: FixedFrame | None = None
@@ -124,7 +128,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     if track.starts:
         yield 'body', message_of_body(MESSAGES, body, stamp, frame)
     if track.describe:
-        yield 'human_description', description_message(MESSAGES, body, frame, p.frame_prefix)
+        yield 'human_description', description_message(MESSAGES, body, frame, track.frame_prefix)
     for topic, mixture in mixtures.items():
         yield topic, pose_mixture_message(MESSAGES, mixture)
     if wanted('person_pose'):
@@ -153,14 +157,14 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
         stands = forward(skeleton, point[None]).joints()[..., 0]
         array.markers += ground_markers(MESSAGES, ground, stands, names)
         yield 'markers', array
-    if p.overlay_modes and wanted('overlay/compressed'):
+    if wanted('overlay/compressed'):
         drawn = draw_modes(
             track.waiting.image,
             tracker.camera,
             joints,
             skeleton.bones,
             posterior.weights,
-            p.overlay_modes,
+            OVERLAY_MODES,
         )
         yield 'overlay/compressed', compressed_image_message(MESSAGES, drawn, stamp, frame)
 
@@ -198,7 +202,7 @@ def nobody_messages(
         )
         markers.markers += removed_ground(MESSAGES, stamp, frame)
         yield 'markers', markers
-    if p.overlay_modes and wanted('overlay/compressed'):
+    if wanted('overlay/compressed'):
         picture = compressed_image_message(MESSAGES, waiting.image, stamp, frame)
         yield 'overlay/compressed', picture
 
@@ -313,7 +317,7 @@ def _in_range(probabilities: Mapping[str, float]) -> dict[str, float]:
 
 def _link_transforms(track: TrackedImage) -> Any:
     """Every link of the URDF in the point estimate, and frames with z up, from the camera."""
-    tracker, camera, prefix = track.tracker, track.waiting.frame_id, track.parameters.frame_prefix
+    tracker, camera, prefix = track.tracker, track.waiting.frame_id, track.frame_prefix
     names, rotations, origins = links_of(*_against_camera(tracker))
     parents = [camera] * len(names)
     children = [f'{prefix}{name}' for name in names]

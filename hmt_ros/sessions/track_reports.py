@@ -7,7 +7,7 @@ from typing import NamedTuple
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import IN_BACKGROUND, camera_moved_fault
-from hmt_ros.sessions.handled import Fault, HandlingLog
+from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.tracking import Status, Subject, Tracker
 from hmt_ros.tracking.beginning import Source
 from msg_tools.messages.headers import SECOND_NS
@@ -69,7 +69,7 @@ def report_change(
     now = TrackCondition.of(tracker)
     if now.doubted and not before.doubted:
         log.note(
-            Fault.BACKGROUND,
+            'background',
             f'{IN_BACKGROUND}, as the image of {stamp_ns} ns shows: silhouettes are not used until '
             'the scene has been seen where the person is now; give background_file, or begin with '
             'the empty scene',
@@ -77,10 +77,10 @@ def report_change(
     if now.moved and not before.moved:
         remedy = 'call ~/reset; a camera that is to move needs fixed_frame or use_mask'
         text = camera_moved_fault(tracker.silhouettes.watch.shift, stamp_ns, remedy)
-        log.note(Fault.CAMERA_MOVED, text, warn=True)
+        log.note('camera moved', text, warn=True)
     if now.contradicted and not before.contradicted:
         log.note(
-            Fault.GRAVITY,
+            'direction of gravity',
             f'the lines of the scene, or the person, contradict the gravity that is given, '
             f'{_numbers(-tracker.ground.up)}, at the image of {stamp_ns} ns; it is used all the '
             'same: check that it is in the optical frame (x right, y down, z forward), or '
@@ -89,7 +89,11 @@ def report_change(
         )
     newer = now.track_id != before.track_id and now.status is Status.TRACKING
     if now.reversed and not before.reversed:
-        log.note(Fault.GRAVITY, f'{reversed_gravity(tracker.ground.up)} ({stamp_ns} ns)', warn=True)
+        log.note(
+            'direction of gravity',
+            f'{reversed_gravity(tracker.ground.up)} ({stamp_ns} ns)',
+            warn=True,
+        )
     if newer or now.status is not before.status:
         _report_status(log, before, tracker, initial, stamp_ns)
 
@@ -132,7 +136,9 @@ def _report_status(
             _report_age(log, stamp_ns - initial.stamp_ns)
     if now is Status.LOST:
         log.note(
-            Fault.LOST, f'{track} is lost {at}: {tracker.reason}; it is searched for', warn=True
+            'loss of the track',
+            f'{track} is lost {at}: {tracker.reason}; it is searched for',
+            warn=True,
         )
 
 
@@ -140,7 +146,7 @@ def _report_age(log: HandlingLog, age_ns: int) -> None:
     """Warns of a start from joints that were seen long before."""
     if age_ns > _SAME_MOMENT_NS:
         log.note(
-            Fault.OLD_START,
+            'old start',
             f'the joints that start the track were seen {age_ns / SECOND_NS:.1f} s before its '
             'first image',
         )

@@ -13,8 +13,8 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import read_picture
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.keypoint_inputs import known_lifter
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.tracking import Subject, Tracker, read_subject
 from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
@@ -95,16 +95,15 @@ class TrackStart:
         Raises:
             ValueError: it was taken by another camera.
         """
-        p = self.parameters
-        background = BackgroundModel(p.background)
+        background, file = BackgroundModel(), self.parameters.background_file
         if self.background is not None:
             height, width = self.background.shape[:2]
             if (width, height) != (camera.width, camera.height):
                 raise ValueError(
-                    f'{p.background_file} has {width}x{height} pixels, but the camera gives '
+                    f'{file} has {width}x{height} pixels, but the camera gives '
                     f'{camera.width}x{camera.height}'
                 )
-            background = BackgroundModel.from_image(self.background, p.background)
+            background = BackgroundModel.from_image(self.background)
         return background
 
 

@@ -1,114 +1,278 @@
-"""The common part of sessions that track one person or several: starts, transforms, answers.
+"""The people before one camera, one track for each: here of one person, for the filter.
 
-- With `gravity_frame` or `fixed_frame` an image waits for the transforms of its stamp, or for an
-  image or a transform that is `input_timeout` younger, and never so long that it would be dropped.
-  Where they do not come, the gravity known before holds, and the camera is taken to go on as
-  before.
+The rules, besides those of `CameraSession`:
+
+- An image waits for the inputs that are used (`image_inputs`); keypoints without names, and
+  mixtures without components, say that nobody was seen.
 - A camera_info with another calibration, and ~/reset, start the tracks anew.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from typing import Any, TypeVar
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
+from hmt_ros.body import Body, Camera
 from hmt_ros.sessions.camera_frames import CameraFrames
-from hmt_ros.sessions.camera_session import CameraSession, WaitingImage
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.session import NeededInput, SessionState
+from hmt_ros.sessions.camera_session import (
+    CAMERA_MOVED,
+    IN_BACKGROUND,
+    CameraSession,
+    WaitingImage,
+)
+from hmt_ros.sessions.handled import Output
+from hmt_ros.sessions.image_inputs import (
+    INPUTS,
+    KEYPOINTS,
+    KEYPOINTS_3D,
+    KEYPOINTS_INPUT,
+    PREDICTION,
+    PREDICTION_INPUT,
+    ImageInput,
+)
+from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input
+from hmt_ros.sessions.session import PublishedTopic, SessionState
+from hmt_ros.sessions.track import Seen, Shared, Track
+from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
+from hmt_ros.sessions.track_reports import TrackCondition
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
-from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.warm_up import warm_up_tracking
-from msg_tools.messages.headers import time_ns
+from hmt_ros.tracking import PosePrediction, Status
+from msg_tools.messages.bodies import body_of
+from msg_tools.messages.pose_mixtures import PoseMixture, TrackState, pose_mixture_of
 
-Parameters = TypeVar('Parameters', bound=FilterParameters)
-State = TypeVar('State', bound=SessionState)
+
+@dataclass(frozen=True)
+class TrackingState(SessionState):
+    """State of the filter: its status is 'no camera', or a value of `Status`.
+
+    Attributes:
+        body: of the present track; None: there is none.
+        modes: components of the posterior.
+        misfit: share of the image that no mode explains.
+        evaluations: of the likelihood in the last image.
+        background: its state, in a few words.
+        doubted: whether it was learned with the person in it, and is not known again.
+        moved: whether the camera has moved since it was taken.
+        track_id: number of the present track, or of the last one; 0 before the first.
+        started_from: input that this track began from; '' before the first.
+        existence: probability that a person is in view; NaN: no image yet.
+        beliefs: probability that each cue shows the person, and that the track has the person.
+    """
+
+    body: Body | None = None
+    modes: int = 0
+    misfit: float = 0.0
+    evaluations: int = 0
+    background: str = 'unknown'
+    doubted: bool = False
+    moved: bool = False
+    track_id: int = 0
+    started_from: str = ''
+    existence: float = math.nan
+    beliefs: Mapping[str, float] = field(default_factory=dict)
+
+    def summary(self) -> str:
+        """The present estimate in a few words."""
+        return f'{self.modes} modes'
+
+    def trouble(self) -> str:
+        """Whether the track is lost, nobody is in view, or the background is of no use."""
+        if self.status == Status.NOBODY.value:
+            return 'nobody in view'
+        if self.status == Status.LOST.value:
+            lost = f'lost: misfit {self.misfit:.2f}, existence {self.existence:.2f}'
+            return f'{lost}; {CAMERA_MOVED}' if self.moved else lost
+        if self.moved:
+            return CAMERA_MOVED
+        return f'{IN_BACKGROUND}; {self.background}' if self.doubted else ''
+
+    def values(self) -> list[tuple[str, str]]:
+        """Keys and values of the diagnostics."""
+        return [
+            ('track', str(self.track_id)),
+            ('started from', self.started_from),
+            ('probability that a person is in view', f'{self.existence:.3f}'),
+            ('modes', str(self.modes)),
+            ('entropy of the weights, nats', f'{self.entropy:.3f}'),
+            ('misfit', f'{self.misfit:.3f}'),
+            *((f'belief in {cue}', f'{p:.2f}') for cue, p in self.beliefs.items()),
+            ('background', self.background),
+            ('evaluations of the likelihood', str(self.evaluations)),
+        ]
 
 
-class TrackingSession(CameraSession[Parameters, State]):
+class TrackingSession(CameraSession[FilterParameters, Any]):
     """Tracks the people before one camera; see `Session` for arguments and attributes.
 
     Attributes:
         start: of the tracks.
-        frames: that transforms lead to from the camera.
-        answered: number of images whose results went to the robot.
+        tracks: of the people; here there is always one.
     """
 
+    TOPICS: ClassVar[Mapping[str, PublishedTopic]] = TOPICS_OF_NODE
     DONE = 'tracked'
+    ESTIMATE = 'the track'
+    CHECKED: ClassVar[tuple[str, ...]] = (
+        'subject_file',
+        'background_file',
+        'body_model',
+        'lifter',
+    )
+
+    tracks: Sequence[Track]
 
     def _set_up(self) -> None:
         super()._set_up()
         p = self.parameters
         self.start = prepare_start(p)
         self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
-        self.answered = 0
+        self._shared = Shared(self.frames, self._log, self._publish, self._wanted)
+        self._keypoints = KeypointReader(p.source, self._log)
+        self._begin()
+        self.state = self._present_state()
 
     def prepare(self) -> None:
         """See `Session`."""
         warm_up_tracking()
 
+    @property
+    def answered(self) -> int:
+        """Number of answers to images that went to robots."""
+        return self._shared.answered
+
     def restart(self, start: TrackStart | None = None) -> None:
         """Drops the tracks; new ones start with the images that follow.
 
         Args:
-            start: of the new tracks; None: by the parameters.
-
-        Raises:
-            ValueError: the parameters name a file that can not be used; the tracks go on.
+            start: of the new tracks; None: by the parameters or, where these name a file that can
+                not be used, as the time before.
         """
-        self.start = prepare_start(self.parameters) if start is None else start
+        if start is None:
+            try:
+                start = prepare_start(self.parameters)
+            except ValueError as error:
+                text = f'{error}; {self.ESTIMATE} starts as the time before'
+                self._log.fault('start', text)
+                start = self.start
+        self.start = start
+        for track in self.tracks:
+            track.restart(start)
         super().restart()
 
-    @abstractmethod
     def stale(self, silence: float, answered: int) -> list[Output]:
-        """Messages for a robot where no image is answered; may be called by any thread.
+        """Messages for robots where no image is answered; may be called by any thread.
 
         Args:
             silence: time since the newest image was answered, s.
-            answered: number of images that were answered; if it has risen, there are no messages.
+            answered: as `answered` was then; if it has risen, there are no messages.
         """
+        with self._shared.answering:
+            if answered != self.answered:
+                return []
+            made = (one for track in self.tracks for one in track.stale(silence))
+            return [Output(topic, stamp, message) for topic, stamp, message in made]
 
-    def needed_inputs(self) -> list[NeededInput]:
-        """Inputs that are needed at present; may be called by any thread."""
-        needed = super().needed_inputs()
-        if self.frames.wanted and not self.frames.heard:
-            needed.append(NeededInput(TRANSFORMS))
-        return needed
+    def forecast(self, stamp_ns: int) -> PoseMixture:
+        """See `RobotOutputs`; may be called by any thread."""
+        return self.tracks[0].robot.forecast(stamp_ns)
 
-    def _take(self, source: str, message: Any, stamp: int) -> None:
-        if source not in TRANSFORMS:
-            super()._take(source, message, stamp)
-        elif self.frames.wanted:
-            for text in self.frames.take(message, static=source == TF_STATIC):
-                self._log.note(Fault.TRANSFORM, text)
-
-    def _stamp_of(self, source: str, message: Any) -> int:
-        if source not in TRANSFORMS:
-            return super()._stamp_of(source, message)
-        return max((time_ns(each.header.stamp) for each in message.transforms), default=0)
-
-    def _forget_inputs(self, stamp: int) -> None:
-        super()._forget_inputs(stamp)
-        self.frames.forget_after(stamp)
-
-    def _start_anew(self) -> None:
-        try:
-            self.restart()
-        except ValueError as error:
-            self._log.fault(Fault.START, f'{error}; {self.ESTIMATE} starts as the time before')
-            self._start_again()
-
-    def _start_again(self) -> None:
-        self.restart(self.start)
-
-    def _waits_for_inputs(self) -> bool:
-        return super()._waits_for_inputs() or self.frames.wanted
-
-    def _is_ready(self, waiting: WaitingImage) -> bool:
-        return super()._is_ready(waiting) and self._has_transforms(self.frames, waiting)
-
-    def _look_at_frames(self, waiting: WaitingImage) -> None:
-        """Looks up gravity and the pose of the camera at an image in the transforms."""
+    def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
         for kind, text in self.frames.look(waiting.frame_id, waiting.stamp_ns):
             self._log.note(kind, text)
+        outcomes = set()
+        for track, seen in self._people_in(waiting, camera):
+            self._log.prefix = f'{track.person}: ' if track.person else ''
+            outcomes.add(track.follow(waiting, camera, seen, self.parameters))
+            self._log.prefix = ''
+        # Those are counts of images, not of people.
+        if True in outcomes:
+            self._log.counts['tracked'] += 1
+        elif False in outcomes:
+            self._log.counts['skipped'] += 1
+
+    def _jump_back(self, stamp: int) -> None:
+        # Where time begins again, so do the numbers of the tracks.
+        self._keypoints.forget()
+        self._begin()
+        super()._jump_back(stamp)
+
+    # One person; several override these.
+
+    def _begin(self) -> None:
+        """Nothing has been tracked."""
+        self.tracks = (Track('', self.parameters, self.start, self._shared),)
+
+    @classmethod
+    def inputs_of(cls, parameters: FilterParameters) -> tuple[ImageInput, ...]:
+        """See `CameraSession`."""
+        own = keypoints_input(parameters.source)
+        return tuple(own if row is KEYPOINTS_INPUT else row for row in INPUTS)
+
+    def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
+        if row.name == KEYPOINTS:
+            return self._keypoints.read(
+                message, stamp, self.parameters, self.start.body, self._camera
+            )
+        if row is PREDICTION_INPUT:
+            return self._prediction_in(message)
+        return super()._read_input(row, message, stamp)
+
+    def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
+        """The mixture and its body, see `body_of`; `NOBODY`: nobody was seen; None: no prediction.
+
+        Raises:
+            ValueError: it can not be used; one line.
+        """
+        if len(message.components) == 0:
+            # A predictor that leaves the image to the track has seen neither somebody nor nobody.
+            left = message.state == TrackState.TRACKING or getattr(message, 'reason', '')
+            return None if left else Status.NOBODY
+        try:
+            content = pose_mixture_of(message)
+            return PosePrediction(content.mixture, body_of(content, self.start.body))
+        except ValueError as error:
+            raise ValueError(f'pose_prediction: {error}') from error
+
+    def _people_in(self, waiting: WaitingImage, camera: Camera) -> Iterator[tuple[Track, Seen]]:
+        """The tracks, and what an image shows of each; a track follows it before the next one."""
+        keypoints = self._keypoints.at_joints(
+            waiting.content(KEYPOINTS),
+            waiting.content(KEYPOINTS_3D),
+            self.start.body,
+            self.parameters.keypoint_scheme,
+            waiting.stamp_ns,
+        )
+        # A person moves little until the next image: a prediction is a hypothesis there, too.
+        taken = self._inputs[PREDICTION].take_all(waiting.stamp_ns).values()
+        known = [one for one in taken if one is not None and self.parameters.use_predictions]
+        prediction = known[-1] if known else None
+        yield self.tracks[0], Seen(keypoints, prediction)
+
+    def _present_state(self) -> SessionState:
+        track = self.tracks[0]
+        known, tracker = track.tracker, track.tracker if len(track.weights) else None
+        source = None if known is None else known.started_from
+        return TrackingState(
+            *self._status_and_wants(),
+            **self._totals(track.weights),
+            body=track.body,
+            modes=len(track.weights),
+            misfit=math.nan if tracker is None else tracker.misfit,
+            evaluations=0 if tracker is None else tracker.evaluations,
+            background='unknown' if known is None else known.silhouettes.known,
+            doubted=TrackCondition.of(known).doubted,
+            moved=known is not None and known.silhouettes.watch.moved,
+            track_id=track.track_id,
+            existence=math.nan if known is None else known.existence_probability,
+            started_from='' if source is None else source.value,
+            beliefs={} if tracker is None else tracker.validity.shown,
+        )
+
+    def _status(self) -> tuple[str, str]:
+        status = self.tracks[0].status
+        start, sources = self.tracks[0].start, self.parameters.sources
+        return status.value, start.wants(sources) if status is Status.WAITING else ''

@@ -8,9 +8,8 @@ holds at all times. The same messages in the same order give the same transforms
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,52 +72,47 @@ class _Sample(NamedTuple):
         return Transform(rotation_matrix(self.quaternion), self.position)
 
 
-@dataclass
 class _Moving:
-    """Places of a frame by stamp in ns, increasing."""
+    """Places of a frame.
 
-    stamps: list[int] = field(default_factory=list)
-    samples: list[_Sample] = field(default_factory=list)
+    Attributes:
+        places: stamps, ns, increasing, with the places then.
+    """
+
+    def __init__(self) -> None:
+        self.places: list[tuple[int, _Sample]] = []
 
     def put(self, stamp: int, sample: _Sample) -> None:
-        if self.stamps and stamp < self.stamps[-1] - REMEMBERED * SECOND_NS:
+        if self.places and stamp < self.places[-1][0] - REMEMBERED * SECOND_NS:
             # Time has jumped back.
-            self.stamps.clear()
-            self.samples.clear()
-        place = bisect_left(self.stamps, stamp)
-        if self.stamps[place : place + 1] == [stamp]:
-            self.samples[place] = sample
-        else:
-            self.stamps.insert(place, stamp)
-            self.samples.insert(place, sample)
-        old = bisect_left(self.stamps, self.stamps[-1] - round(REMEMBERED * SECOND_NS))
-        old = max(old, len(self.stamps) - MOST_STAMPS)
-        if old > 0:
-            del self.stamps[:old], self.samples[:old]
+            self.places.clear()
+        self.places[self._first(stamp) : self._first(stamp + 1)] = [(stamp, sample)]
+        old = self._first(self.places[-1][0] - round(REMEMBERED * SECOND_NS))
+        del self.places[: max(old, len(self.places) - MOST_STAMPS)]
 
     def forget_after(self, stamp: int) -> None:
-        kept = bisect_right(self.stamps, stamp)
-        del self.stamps[kept:], self.samples[kept:]
+        del self.places[self._first(stamp + 1) :]
 
     def at(self, stamp: int) -> _Sample | None:
         """The place at a time; None: it lies outside of the known ones."""
-        after = bisect_left(self.stamps, stamp)
-        if after == len(self.stamps):
+        after = self._first(stamp)
+        if after < len(self.places) and self.places[after][0] == stamp:
+            return self.places[after][1]
+        if after in (0, len(self.places)):
             return None
-        if self.stamps[after] == stamp:
-            return self.samples[after]
-        if after == 0:
-            return None
-        one, other = self.samples[after - 1 : after + 1]
+        (start, one), (end, other) = self.places[after - 1 : after + 1]
         if one.parent != other.parent:
             return one
-        start, end = self.stamps[after - 1 : after + 1]
         share = (stamp - start) / (end - start)
         return _Sample(
             one.parent,
             one.position + share * (other.position - one.position),
             slerp(one.quaternion, other.quaternion, share),
         )
+
+    def _first(self, stamp: int) -> int:
+        """Index of the first place that is not older."""
+        return bisect_left(self.places, stamp, key=lambda place: place[0])
 
 
 class TransformBuffer:
@@ -156,14 +150,14 @@ class TransformBuffer:
         """Forgets places of moving frames after a time, to which time has jumped back."""
         for child, moving in list(self._moving.items()):
             moving.forget_after(stamp_ns)
-            if not moving.stamps:
+            if not moving.places:
                 del self._moving[child]
-        self.newest_ns = max((x.stamps[-1] for x in self._moving.values()), default=None)
+        self.newest_ns = max((x.places[-1][0] for x in self._moving.values()), default=None)
 
     def frames(self) -> list[str]:
         """Names of all frames, sorted."""
         parents = {sample.parent for sample in self._static.values()}
-        parents.update(moving.samples[-1].parent for moving in self._moving.values())
+        parents.update(moving.places[-1][1].parent for moving in self._moving.values())
         return sorted(parents | self._static.keys() | self._moving.keys())
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
@@ -227,7 +221,7 @@ class TransformBuffer:
                     return reached, ''
                 sample = moving.at(stamp_ns)
                 if sample is None:
-                    first, last = moving.stamps[0], moving.stamps[-1]
+                    first, last = moving.places[0][0], moving.places[-1][0]
                     return reached, (
                         f'{here!r} has transforms of {first} to {last} ns, wanted {stamp_ns} ns'
                     )

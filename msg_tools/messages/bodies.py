@@ -9,7 +9,7 @@ import numpy as np
 
 from hmt_ros.body import Body
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_error import MessageError, MessageFault, check_names
+from msg_tools.messages.message_error import MessageError, check_names
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.pose_mixtures import PoseMixture
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
@@ -46,9 +46,9 @@ def resized(model: Body, segment_lengths: Mapping[str, float]) -> Body:
     try:
         return model.with_segment_lengths(segment_lengths)
     except KeyError as error:
-        raise MessageError(f'body {model.name}: {error.args[0]}', MessageFault.BODY) from error
+        raise MessageError(f'body {model.name}: {error.args[0]}', 'body') from error
     except ValueError as error:
-        raise MessageError(f'body {model.name}: {error}', MessageFault.BODY) from error
+        raise MessageError(f'body {model.name}: {error}', 'body') from error
 
 
 def body_of(
@@ -67,9 +67,7 @@ def body_of(
     """
     name = content.body_model
     if name not in ('', model.name) and not any_name:
-        raise MessageError(
-            f'mixture is of the body {name}, wanted one of {model.name}', MessageFault.BODY
-        )
+        raise MessageError(f'mixture is of the body {name}, wanted one of {model.name}', 'body')
     check_names(content.dof_names, model.dof_names, 'mixture: dof_names')
     return resized(model, content.segment_lengths) if content.segment_lengths else model
 

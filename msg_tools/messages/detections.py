@@ -89,7 +89,7 @@ def person_of_skeleton(message: Any, width: int, height: int) -> DetectedPerson:
     return _person('', scheme, rows)
 
 
-def people_of_message(message: Any, sigma_px: float) -> list[DetectedPerson]:
+def people_of_message(message: Any, sigma_px: float = 0.0) -> list[DetectedPerson]:
     """The people in an hmt_msgs/People2D.
 
     Args:

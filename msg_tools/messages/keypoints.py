@@ -51,7 +51,7 @@ class Positions:
         return replace(keypoints, positions=positions)
 
 
-def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
+def keypoints_of(message: Any, sigma_px: float = 0.0) -> Keypoints:
     """The content of an hmt_msgs/Keypoints2D, of `rosbags` or of ROS.
 
     Args:

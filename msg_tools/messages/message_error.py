@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -18,28 +17,14 @@ WEIGHT_TOLERANCE = 1e-6
 SYMMETRY_TOLERANCE = 1e-9
 
 
-class MessageFault(Enum):
-    """Kinds of contradictions in a message."""
-
-    NAMES = 'names'
-    BODY = 'body'
-    NO_COMPONENTS = 'no components'
-    NOT_FINITE = 'not finite'
-    WEIGHTS = 'weights'
-    COVARIANCES = 'covariances'
-    KIND = 'kind'
-    ERRORS = 'error_share and error_time'
-    OTHER = 'contents'
-
-
 class MessageError(ValueError):
     """A message that can not be understood, in one line: what was seen and what was wanted.
 
     Attributes:
-        fault: kind of the contradiction.
+        fault: kind of the contradiction, in a word or two.
     """
 
-    def __init__(self, text: str, fault: MessageFault = MessageFault.OTHER) -> None:
+    def __init__(self, text: str, fault: str = 'contents') -> None:
         super().__init__(text)
         self.fault = fault
 
@@ -82,7 +67,7 @@ def freeze_arrays(
 def check_finite(values: Array, what: str) -> None:
     """Raises MessageError where a value is NaN or infinite."""
     if not np.isfinite(values).all():
-        raise MessageError(f'{what} has values that are not finite', MessageFault.NOT_FINITE)
+        raise MessageError(f'{what} has values that are not finite', 'not finite')
 
 
 def identities_of(values: NDArray[Any], count: int, what: str) -> NDArray[np.uint32]:
@@ -102,14 +87,10 @@ def check_weights(weights: Array, what: str) -> None:
     """Raises MessageError where weights are no probabilities."""
     if not np.isfinite(weights).all() or (weights < 0).any():
         worst = weights[~(weights >= 0) | ~np.isfinite(weights)][0]
-        raise MessageError(
-            f'{what} has the weight {worst}, wanted numbers from 0 to 1', MessageFault.WEIGHTS
-        )
+        raise MessageError(f'{what} has the weight {worst}, wanted numbers from 0 to 1', 'weights')
     total = float(weights.sum())
     if abs(total - 1.0) > WEIGHT_TOLERANCE:
-        raise MessageError(
-            f'{what} has weights that sum to {total:.9g}, wanted 1', MessageFault.WEIGHTS
-        )
+        raise MessageError(f'{what} has weights that sum to {total:.9g}, wanted 1', 'weights')
 
 
 def check_covariances(covariances: Array, what: str, *, singular: bool = False) -> None:
@@ -126,7 +107,7 @@ def check_covariances(covariances: Array, what: str, *, singular: bool = False) 
     if asymmetry.any():
         scale = np.abs(covariances).max(axis=(-1, -2), keepdims=True)
         if (np.abs(asymmetry) > SYMMETRY_TOLERANCE * scale).any():
-            raise MessageError(f'covariance of {what} is not symmetric', MessageFault.COVARIANCES)
+            raise MessageError(f'covariance of {what} is not symmetric', 'covariances')
     if singular:
         size = covariances.shape[-1]
         largest = np.abs(covariances).max(axis=(-1, -2), keepdims=True)
@@ -138,7 +119,7 @@ def check_covariances(covariances: Array, what: str, *, singular: bool = False) 
         smallest = float(np.linalg.eigvalsh(covariances).min())
         raise MessageError(
             f'covariance of {what} is not positive definite: smallest eigenvalue {smallest:.3g}',
-            MessageFault.COVARIANCES,
+            'covariances',
         ) from None
 
 
@@ -151,7 +132,7 @@ def names_of(values: Sequence[str], what: str) -> tuple[str, ...]:
     names = tuple(str(value) for value in values)
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise MessageError(f'{what} has the name {twice!r} twice', MessageFault.NAMES)
+        raise MessageError(f'{what} has the name {twice!r} twice', 'names')
     return names
 
 
@@ -160,13 +141,9 @@ def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str)
     if wanted is None or names == tuple(wanted):
         return
     if len(names) != len(wanted):
-        raise MessageError(
-            f'{what} has {len(names)} names, wanted {len(wanted)}', MessageFault.NAMES
-        )
+        raise MessageError(f'{what} has {len(names)} names, wanted {len(wanted)}', 'names')
     index = next(i for i, (a, b) in enumerate(zip(names, wanted, strict=True)) if a != b)
-    raise MessageError(
-        f'{what} has {names[index]!r} at {index}, wanted {wanted[index]!r}', MessageFault.NAMES
-    )
+    raise MessageError(f'{what} has {names[index]!r} at {index}, wanted {wanted[index]!r}', 'names')
 
 
 def array_of_all(
@@ -183,7 +160,7 @@ def array_of_all(
     for k, value in enumerate(values):
         if len(value) == 0:
             text = f'{what}: component {k} has no {name}, others have one'
-            raise MessageError(text, MessageFault.COVARIANCES)
+            raise MessageError(text, 'covariances')
     return np.array(
         [numbers(value, shape, f'{what}: component {k}: {name}') for k, value in enumerate(values)]
     )

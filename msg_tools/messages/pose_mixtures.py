@@ -21,7 +21,6 @@ from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import (
     MessageError,
-    MessageFault,
     array_of_all,
     check_covariances,
     check_finite,
@@ -286,9 +285,9 @@ class PoseMixture:
             MessageError: there is no component, or the covariances are unknown.
         """
         if not len(self.weights):
-            raise MessageError('mixture has no components', MessageFault.NO_COMPONENTS)
+            raise MessageError('mixture has no components', 'no components')
         if self.covariances is None:
-            raise MessageError('mixture has no covariances', MessageFault.COVARIANCES)
+            raise MessageError('mixture has no covariances', 'covariances')
         return GaussianMixture(self.weights, self.means, self.covariances)
 
 

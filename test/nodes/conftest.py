@@ -106,13 +106,21 @@ class World:
         return self.node._session
 
     @property
-    def thread(self):
-        """The thread that estimates."""
-        return self.node._thread
+    def estimator(self):
+        """What gives the session its messages; None while the node is not active."""
+        return self.node._estimator
+
+    def receive(self, source, data):
+        """Hands bytes to the node, as the middleware does."""
+        from hmt_ros.nodes.estimating_thread import received
+
+        wanted = {one.source: (name, one) for name, one in self.node._heard.items()}
+        name, one = wanted[source]
+        self.node._hand_on(name, received(data, one))
 
     def limit(self, source):
         """How many messages of a source may wait."""
-        return self.thread.queue._limits[source]
+        return self.estimator.queue._limits[source]
 
     def own_periods(self):
         """Stops the clock of the diagnostics; returns what ends a period."""
@@ -220,11 +228,15 @@ class World:
         ).result
         return result.successful, result.reason
 
-    def assert_described(self, defaults):
-        """Parameters are those of the file, with their descriptions; all of them by name."""
-        file = ROOT / 'hmt_ros' / 'config' / f'{self.name}.yaml'
+    def assert_described(self, defaults, *others):
+        """Parameters are those of the files, with their descriptions; all of them by name.
+
+        `others` are nodes whose parameters this one has, too.
+        """
+        folder = ROOT / 'hmt_ros' / 'config'
+        listed = [read_parameter_file(folder / f'{x}.yaml', x) for x in (self.name, *others)]
         declared = {p.name: p for p in declared_parameters(defaults)}
-        assert sorted(read_parameter_file(file, self.name)) == sorted(declared)
+        assert {name for one in listed for name in one} == declared.keys()
         for name, parameter in declared.items():
             description = self.node.describe_parameter(name).description
             assert description == f'{parameter.description} {EFFECTS[parameter.effect]}'

@@ -21,7 +21,7 @@ def world(world_of, stub_predictor, background_file):
     inputs = {'camera_info': CameraInfo, 'image': Image}
 
     def make(**values):
-        values = {'background_file': str(background_file), 'least_height': 10, **values}
+        values = {'background_file': str(background_file), **values}
         return world_of(BmeNode, 'bme_node', inputs, **values)
 
     return make

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.sessions.camera_session import MOST_INCOMPLETE
-from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools.messages.cdr import serialise
 from test.nodes.conftest import PATIENCE, only_line
 
@@ -146,7 +146,6 @@ def test_parameters_are_those_of_the_file(running):
 def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
     running.assert_refused(
         ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
-        ({'background.method': 'guess'}, "saw 'guess'"),
         ({'subject_file': str(tmp_path / 'none.yaml')}, 'none.yaml: can not be read'),
         ({'background_file': str(tmp_path / 'two\nlines')}, 'two lines: can not be read'),
         ({'body_model': 'nobody'}, "no body 'nobody'"),
@@ -218,7 +217,7 @@ def test_bytes_that_are_no_message(running, small_camera):
     running.send('camera_info', small_camera.info())
     data = serialise(small_camera.image(0))
     count = len(running.handled)
-    running.thread.put('image', data[:60], time.monotonic())
+    running.receive('image', data[:60])
     running.spin_until(lambda: len(running.handled) > count)
     assert faults(running.handled[-1])[0].startswith('message of image can not be read: ')
     assert faults(running.send('image', small_camera.image(1))) == []
@@ -306,9 +305,9 @@ def test_reset_counts_though_the_node_is_deactivated(world, small_camera, held_e
     answers = [one.call(Reset, 'reset') for _ in range(3)]
     assert all(answer.success for answer in answers)
     # Several wait as one, the last.
-    assert len(one.thread.queue) == 1
+    assert len(one.estimator.queue) == 1
     one.publishers['image'].publish(serialise(small_camera.image(1)))
-    one.spin_until(lambda: len(one.thread.queue) == 2)
+    one.spin_until(lambda: len(one.estimator.queue) == 2)
     threading.Timer(0.3, go.set).start()
     assert one.change_state('deactivate')
     assert session.start is not before
@@ -323,7 +322,8 @@ def test_reset(running, small_camera, stub_tracker, subject_file, body):
     running.send('camera_info', small_camera.info())
     running.send('image', small_camera.image(0))
     answer = running.call(Reset, 'reset')
-    assert (answer.success, answer.message) == (True, 'the next image starts a new track')
+    assert answer.success
+    assert answer.message.startswith('a new track waits for an image of ')
     assert published(running.send('image', small_camera.image(1))) == STARTS
     assert len(stub_tracker.made) == 2
     mixture = PoseMixture(
@@ -363,7 +363,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     one = world(queue_size=2).start()
     end_period = one.own_periods()
     one.send('camera_info', small_camera.info())
-    queue = one.thread.queue
+    queue = one.estimator.queue
 
     def waiting_and_dropped():
         return len(queue), queue._dropped
@@ -374,7 +374,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
         one.spin_until(lambda index=index: sum(waiting_and_dropped()) == index)
     assert waiting_and_dropped() == (2, 9)
     assert one.state == 'active'
-    assert one.set(overlay_modes=1) == (True, '')
+    assert one.set(publish_tf=False) == (True, '')
     go.set()
     one.spin_until(lambda: one.session.state.counts['tracked'] == 3)
     stamps = [stamp for stamp, _ in stub_tracker.made[0].seen]
@@ -412,7 +412,7 @@ def test_late_node_goes_on_with_the_newest_complete_image(
     begun, go = held_estimate
     one = world(use_keypoints=True).start()
     one.send('camera_info', small_camera.info())
-    queue = one.thread.queue
+    queue = one.estimator.queue
     sent = 0
 
     def publish(source, index):
@@ -488,7 +488,7 @@ def test_a_track_leaves_lines_in_the_log(running, small_camera, stub_tracker):
     assert informed(running, *wanted)
     assert running.call(Reset, 'reset').success
     running.send('image', small_camera.image(6))
-    text = '~/reset: the next image starts a new track'
+    text = '~/reset: a new track waits for an image'
     running.spin_until(lambda: informed(running, text), text)
     (warning,) = running.warnings()
     assert 'were seen 0.6 s before' in warning
@@ -516,7 +516,7 @@ def test_kernels_are_ready_before_the_node_listens(world, monkeypatch):
     def prepare(session):
         prepared.append((one.node.preparing, topics()))
 
-    monkeypatch.setattr('hmt_ros.sessions.filter_session.FilterSession.prepare', prepare)
+    monkeypatch.setattr('hmt_ros.sessions.tracking_session.TrackingSession.prepare', prepare)
     one = world()
     one.node.trigger_configure()
     assert prepared == [(True, set())]
@@ -528,7 +528,7 @@ def test_kernels_are_ready_before_the_node_listens(world, monkeypatch):
     ('arguments', 'message'),
     [
         (('-p', 'max_hypotheses:=99'), 'out of range'),
-        (('-p', 'background.method:=guess'), "saw 'guess'"),
+        (('-p', 'image_transport:=guess'), "saw 'guess'"),
     ],
 )
 def test_wrong_arguments_are_one_line(arguments, message, ended):

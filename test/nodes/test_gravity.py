@@ -122,12 +122,15 @@ def test_no_value_is_an_empty_list_and_the_parameter_stays(world):
 
     one = world(gravity=[0.0, 1.0, 0.0]).start()
     nothing = ParameterValue(type=ParameterType.PARAMETER_NOT_SET)
-    given = [Parameter(name='gravity', value=nothing), Parameter(name='flow_weight', value=nothing)]
+    given = [
+        Parameter(name='gravity', value=nothing),
+        Parameter(name='camera_height', value=nothing),
+    ]
     emptied, refused = one.call(SetParameters, 'set_parameters', parameters=given).results
     assert (emptied.successful, refused.successful) == (True, False)
     assert one.session.parameters.gravity == ()
     names = one.call(ListParameters, 'list_parameters').result.names
-    assert {'gravity', 'flow_weight'} <= set(names)
+    assert {'gravity', 'camera_height'} <= set(names)
     (value,) = one.call(GetParameters, 'get_parameters', names=['gravity']).values
     assert (value.type, list(value.double_array_value)) == (
         ParameterType.PARAMETER_DOUBLE_ARRAY,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.detectors.registry import DETECTORS
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.keypoints_session import KeypointsParameters
 from msg_tools import BagReader
 from test.sessions.test_keypoints_session import STUB
 

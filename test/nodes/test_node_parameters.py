@@ -10,10 +10,10 @@ pytestmark = pytest.mark.ros
 def test_unknown_names_are_told_with_the_nearest():
     from hmt_ros.nodes.node_parameters import unknown_parameters
 
-    known = ['max_hypotheses', 'likelihood.edges.weight', 'flow_weight']
-    given = ['max_hypothesis', 'edges.weight', 'flow_weight', 'zzz']
+    known = ['max_hypotheses', 'dynamics.model', 'camera_height']
+    given = ['max_hypothesis', 'dynamic.model', 'camera_height', 'zzz']
     assert unknown_parameters(given, known) == [
-        "unknown parameter 'edges.weight'; did you mean 'likelihood.edges.weight'?",
+        "unknown parameter 'dynamic.model'; did you mean 'dynamics.model'?",
         "unknown parameter 'max_hypothesis'; did you mean 'max_hypotheses'?",
         "unknown parameter 'zzz', it is ignored",
     ]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
 from test.sessions.conftest import StubTracker
 from test.sessions.test_people_session import Follower, seen, somebody_at
 
@@ -74,7 +74,7 @@ def test_topics_come_and_go_with_the_people(world, small_camera):
     _, text, values = one.diagnosis()
     assert text == 'tracking, 1 of 1 people'
     assert (values['people'], values['people detected']) == ('anna', '1')
-    one.assert_described(PeopleParameters())
+    one.assert_described(PeopleParameters(), 'filter_node')
 
 
 def test_reset_drops_all_tracks(world, small_camera):
@@ -86,7 +86,7 @@ def test_reset_drops_all_tracks(world, small_camera):
     answer = one.call(Reset, 'reset', box=RegionOfInterest(width=5, height=5))
     assert (answer.success, answer.message[:26]) == (False, 'a mixture or a box is of o')
     answer = one.call(Reset, 'reset')
-    assert (answer.success, answer.message) == (True, 'the next detections start new tracks')
+    assert (answer.success, answer.message) == (True, 'a new track waits for detections of people')
     show(one, small_camera, 1, somebody_at(15, 'anna'))
     assert len(StubTracker.made) == 2
 

@@ -110,6 +110,87 @@ def test_what_one_publishes_the_next_gets_without_dds(together, small_camera):
     assert nodes['bme_node']._subscribers(PREDICTION) == 1
 
 
+def in_lock_step(together, small_camera, kinds, count=6):
+    """Bytes by topic of images in one process, and of the sessions by themselves, bytes between."""
+    from importlib import import_module
+
+    from sensor_msgs.msg import CameraInfo, Image
+
+    nodes, other, executor = together()
+    came = {topic: [] for topic in kinds}
+    for topic, name in kinds.items():
+        kind = getattr(import_module('hmt_msgs.msg'), name)
+        other.create_subscription(kind, topic, came[topic].append, 100, raw=True)
+    publishers = {
+        'camera_info': other.create_publisher(CameraInfo, 'camera_info', 100),
+        'image': other.create_publisher(Image, 'image', 100),
+    }
+    filter_node, bme_node = nodes['filter_node'], nodes['bme_node']
+    spin_until(
+        executor,
+        lambda: (
+            all(p.get_subscription_count() == 1 for p in publishers.values())
+            and all(other.count_publishers(topic) == 1 for topic in kinds)
+            and filter_node._outputs['pose_mixture'].get_subscription_count() == 1
+        ),
+        'subscriptions',
+    )
+    publishers['camera_info'].publish(serialise(small_camera.info()))
+    for index in range(count):
+        publishers['image'].publish(serialise(small_camera.image(index)))
+        spin_until(
+            executor,
+            lambda n=index: state_of(nodes['smoother_node']).counts['smoothed'] > n,
+            'smoothing',
+        )
+        # The experts have heard of the track.
+        spin_until(executor, lambda: not len(bme_node._estimator.queue), 'the track')
+    nodes['smoother_node'].trigger_deactivate()
+    spin_until(executor, lambda: len(came['smoothed_pose_mixture']) == count, 'the end')
+    settings = {name: nodes[name]._settings for name in nodes if name != 'other'}
+    return came, settings
+
+
+def test_the_bytes_are_those_of_nodes_in_processes_of_their_own(together, small_camera):
+    """What is handed on as it is and what went through bytes leads to the same."""
+    from hmt_ros.nodes.person_node import NODES
+    from msg_tools.messages.cdr import deserialise
+
+    count = 6
+    names = {'pose_prediction': 'PoseMixture', 'pose_mixture': 'PoseMixture'}
+    names['smoothed_pose_mixture'] = 'PoseMixture'
+    came, settings = in_lock_step(together, small_camera, names, count)
+    made = {topic: [] for topic in names}
+    sessions = {}
+    heard = {
+        'pose_prediction': ['filter_node'],
+        'pose_mixture': ['bme_node'],
+        'likelihood_mixture': ['smoother_node'],
+    }
+
+    def publish(output):
+        if output.topic in made:
+            made[output.topic].append(output.data)
+        for name in heard.get(output.topic, ()):
+            message = deserialise(output.data, 'hmt_msgs/msg/PoseMixture')
+            sessions[name].take(output.topic, message)
+
+    for name, parameters in settings.items():
+        sessions[name] = NODES[name].SESSION(parameters, publish)
+    for name in ('bme_node', 'filter_node'):
+        sessions[name].take('camera_info', small_camera.info())
+    for index in range(count):
+        for name in ('bme_node', 'filter_node'):
+            sessions[name].take('image', small_camera.image(index))
+    sessions['smoother_node'].finish()
+    # Two images are looked at behind their poses.
+    assert [len(made[topic]) for topic in names] == [count + 2, count, count]
+    for topic, own in made.items():
+        # The middleware may pad the end.
+        pairs = zip(came[topic], own, strict=True)
+        assert [data[: len(each)] for data, each in pairs] == own
+
+
 def test_parameters_follow_from_who_is_there():
     from hmt_ros.nodes.person_node import USUAL, used_of_each_other
 

@@ -27,7 +27,7 @@ def world(world_of):
     inputs = {'likelihood_mixture': PoseMixture}
 
     def make(**values):
-        values = {'fixed_lag': 0.1, 'max_trajectories': 4, **values}
+        values = {'fixed_lag': 0.1, **values}
         return world_of(SmootherNode, 'smoother_node', inputs, **values)
 
     return make
@@ -187,11 +187,10 @@ def test_lifecycle(world, likelihoods):
 
 def test_queue_holds_what_was_published(running, likelihoods):
     """Mixtures that come while one is smoothed wait."""
-    thread = running.thread
     data = serialise(likelihoods.message(0))
     count = len(running.handled)
-    thread.put('likelihood_mixture', data[:60], 0.0)
-    thread.put('likelihood_mixture', data, 0.0)
+    running.receive('likelihood_mixture', data[:60])
+    running.receive('likelihood_mixture', data)
     running.spin_until(lambda: len(running.handled) == count + 2)
     first, second = running.handled[-2:]
     assert 'message of likelihood_mixture can not be read' in first.faults[0]

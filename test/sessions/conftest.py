@@ -315,6 +315,7 @@ class StubPredictor:
 @pytest.fixture
 def stub_predictor(monkeypatch):
     monkeypatch.setattr(bme_session, 'load_predictor', lambda path: StubPredictor())
+    monkeypatch.setattr(bme_session, 'LEAST_HEIGHT', 10)  # images are small
     monkeypatch.setattr(StubPredictor, 'asked', [])
     monkeypatch.setattr(StubPredictor, 'intervals', [])
     monkeypatch.setattr(StubPredictor, 'fault', None)

@@ -8,6 +8,7 @@ import pytest
 from hmt_ros.body import Camera, load_body
 from hmt_ros.image.empty_scene import UNSEEN
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions import bme_session
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import SILHOUETTE, TOPICS, TRACK, BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
@@ -29,7 +30,7 @@ STILL = 16
 @pytest.fixture
 def session(stub_predictor, background_file, outputs):
     def make(wanted=TOPICS.__contains__, **values):
-        values = {'background_file': str(background_file), 'least_height': 10, **values}
+        values = {'background_file': str(background_file), **values}
         return BmeSession(with_values(BmeParameters(), values), outputs.append, wanted)
 
     return make
@@ -78,7 +79,6 @@ def test_nobody_is_a_prediction_without_components(session, outputs, somebody, s
     one = session()
     one.take(CAMERA_INFO, somebody.info())
     one.take(IMAGE, somebody.empty(0))
-    assert session(least_height=25) is not None
     (message,) = predictions(outputs)
     assert len(message.components) == 0
     assert (message.kind, message.body_model) == (MixtureKind.PREDICTION, 'human37')
@@ -87,8 +87,9 @@ def test_nobody_is_a_prediction_without_components(session, outputs, somebody, s
     assert stub_predictor.asked == []
 
 
-def test_low_silhouettes_are_nobody(session, outputs, somebody):
-    one = session(least_height=25)
+def test_low_silhouettes_are_nobody(session, outputs, somebody, monkeypatch):
+    monkeypatch.setattr(bme_session, 'LEAST_HEIGHT', 25)
+    one = session()
     one.take(CAMERA_INFO, somebody.info())
     one.take(IMAGE, somebody.image(0))
     assert len(predictions(outputs)[0].components) == 0
@@ -137,9 +138,9 @@ def test_masks_are_the_silhouettes(session, outputs, somebody, stub_predictor):
 
 
 def test_predictions_take_those_before_into_account(session, somebody, stub_predictor):
-    one = session(propagation='dynamics', longest_interval=0.25)
+    one = session(propagation='dynamics')
     one.take(CAMERA_INFO, somebody.info())
-    for index in (0, 1, 4):
+    for index in (0, 1, 7):
         one.take(IMAGE, somebody.image(index))
     (_, first, _), (_, second, _), (_, third, _) = stub_predictor.asked
     assert first is None
@@ -287,7 +288,6 @@ def test_one_image_is_predicted_on_demand(session, somebody, stub_predictor, mad
     [
         ({'background_file': 'nowhere.png'}, r'nowhere\.png: can not be read'),
         ({'image_transport': 'pigeon'}, 'image_transport must be one of'),
-        ({'background.method': 'magic'}, 'background method must be'),
         ({'max_hypotheses': 0}, 'must lie between 1 and 64'),
     ],
 )
@@ -349,17 +349,46 @@ def test_tracked_person_is_predicted_at_a_low_rate(
     one.take(CAMERA_INFO, somebody.info())
     # Without a track, from every image.
     assert looked_at(stub_predictor, one, somebody, range(3)) == 3
+    one.take(TRACK, track(likelihoods, 2))
     for index in range(3, 9):
-        one.take(TRACK, track(likelihoods, index - 1))
-        looked_at(stub_predictor, one, somebody, [index])
+        assert looked_at(stub_predictor, one, somebody, [index]) == 0
+        # Nobody waits for a prediction: it comes behind the pose.
+        looks = index in (5, 8)
+        assert len(one.take(TRACK, track(likelihoods, index)).published) == looks
     content = predictions(outputs)
-    assert [len(message.components) > 0 for message in content] == [
-        True, True, True, False, False, True, False, False, True,
-    ]  # fmt: skip
-    assert [message.state for message in content[3:5]] == [TrackState.TRACKING] * 2
+    assert [(message.header.stamp, len(message.components) > 0) for message in content] == [
+        (somebody.image(index).header.stamp, seen)
+        for index, seen in [
+            *((index, True) for index in range(3)),
+            *((3, False), (4, False), (5, False), (5, True)),
+            *((6, False), (7, False), (8, False), (8, True)),
+        ]
+    ]
+    assert [message.state for message in content[3:6]] == [TrackState.TRACKING] * 3
     assert (content[3].kind, content[3].header.frame_id) == (MixtureKind.PREDICTION, 'lens')
-    assert one.state.counts == {'received': 9, 'predicted': 5, 'left': 4}
-    assert dict(one.state.values())['images left to the track'] == '4'
+    assert one.state.counts == {'received': 9, 'predicted': 5, 'left': 6}
+    assert dict(one.state.values())['images left to the track'] == '6'
+
+
+def test_an_image_is_looked_at_although_the_track_is_late(
+    session, outputs, somebody, stub_predictor, likelihoods
+):
+    one = session(tracked_interval=0.3)
+    one.take(CAMERA_INFO, somebody.info())
+    looked_at(stub_predictor, one, somebody, [0])
+    one.take(TRACK, track(likelihoods, 0))
+    # The track is some images behind, and leaves some out.
+    looked_at(stub_predictor, one, somebody, range(1, 6))
+    assert one.take(TRACK, track(likelihoods, 2)).published == ()
+    looked_at(stub_predictor, one, somebody, [6])
+    assert one.take(TRACK, track(likelihoods, 5)).published == (
+        ('pose_prediction', somebody.stamp(3)),
+    )
+    # Where it is lost nobody waits for it.
+    looked_at(stub_predictor, one, somebody, [7])
+    one.take(TRACK, track(likelihoods, 6, TrackState.LOST))
+    assert looked_at(stub_predictor, one, somebody, [8]) == 1
+    assert one.take(TRACK, track(likelihoods, 8)).published == ()
 
 
 @pytest.mark.parametrize('state', [TrackState.LOST, TrackState.NOBODY, TrackState.UNKNOWN])

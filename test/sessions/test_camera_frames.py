@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import KEYPOINTS
 from hmt_ros.sessions.track_messages import TOPICS
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
@@ -22,7 +22,7 @@ from msg_tools.messages.states import transforms_message
 def session(stub_tracker, subject_file, outputs):
     def make(**values):
         values = {'subject_file': str(subject_file), 'gravity_frame': 'world', **values}
-        return FilterSession(with_values(FilterParameters(), values), outputs.append)
+        return TrackingSession(with_values(FilterParameters(), values), outputs.append)
 
     return make
 

@@ -11,7 +11,6 @@ from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     EFFECTS,
     NEXT_TRACK,
-    NOT_NEGATIVE,
     ParameterError,
     declared_parameters,
     described_fields,
@@ -20,9 +19,8 @@ from hmt_ros.sessions.declared_parameters import (
     values_of,
     with_values,
 )
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 
 ALL = (FilterParameters(), SmootherParameters(), BmeParameters())
 
@@ -47,21 +45,6 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Inner:
-    """Settings.
-
-    Attributes:
-        method: Method, 'a' or 'b'.
-        edges: Contours on edges.
-        flow: Flow of the texture.
-    """
-
-    method: str = 'a'
-    edges: Term = field(default_factory=Term)
-    flow: Term = field(default_factory=Term)
-
-
-@dataclass(frozen=True)
 class Base:
     """What all have.
 
@@ -78,77 +61,57 @@ class Outer(Base):
 
     Attributes:
         on: More: with a colon.
-        inner: settings of the part.
-        own: Another term.
+        own: A term.
 
     Raises:
         ValueError: never.
     """
 
     on: bool = parameter_field(True, AT_ONCE)
-    inner: Inner = field(
-        default_factory=Inner,
-        metadata=nested_parameters(
-            NEXT_TRACK,
-            {'method': None, 'edges.weight': (0.5, 9.0), 'edges.low': (-math.inf, math.inf)},
-        ),
-    )
     own: Term = field(
         default_factory=Term,
-        metadata=nested_parameters(AT_ONCE, {'high': (0, 9), 'weight': NOT_NEGATIVE}, 'own.'),
+        metadata=nested_parameters(NEXT_TRACK, {'high': (0, 9), 'low': (-math.inf, math.inf)}),
     )
     apart: Term = field(default_factory=Term)
 
 
 def test_fields_that_are_listed_are_parameters():
     found = {p.name: p for p in declared_parameters(Outer())}
-    assert list(found) == [
-        'on', 'method', 'edges.weight', 'edges.low', 'own.high', 'own.weight', 'shared',
-    ]  # fmt: skip
+    assert list(found) == ['on', 'high', 'low', 'shared']
     assert {name: p.default for name, p in found.items()} == values_of(Outer())
     assert found['on'].description == 'More: with a colon.'
-    assert found['method'].description == "Method, 'a' or 'b'."
-    assert found['edges.weight'].description == 'Contours on edges: weight of the term.'
-    assert found['own.high'].description == (
-        'Another term: thresholds, of which the first is the lower.'
-    )
+    assert found['high'].description == 'Thresholds, of which the first is the lower.'
     assert found['shared'].description == 'Shared by all.'
-    assert found['on'].effect == found['own.high'].effect == AT_ONCE
-    assert found['edges.low'].effect == NEXT_TRACK
+    assert (found['on'].effect, found['low'].effect) == (AT_ONCE, NEXT_TRACK)
     assert found['on'].limits is None
-    assert found['edges.weight'].limits == (0.5, 9.0)
-    assert found['edges.low'].path == ('inner', 'edges', 'low')
+    assert found['high'].limits == (0, 9)
+    assert found['low'].path == ('own', 'low')
 
 
 def test_values_replace_defaults():
-    settings = with_values(Outer(), {'edges.low': 1, 'own.high': 5, 'method': 'b', 'on': False})
-    assert settings == Outer(
-        on=False, inner=Inner('b', replace(Term(), low=1.0)), own=replace(Term(), high=5)
-    )
-    assert isinstance(settings.inner.edges.low, float)
+    settings = with_values(Outer(), {'low': 1, 'high': 5, 'on': False})
+    assert settings == Outer(on=False, own=Term(2.0, 1.0, 5))
+    assert isinstance(settings.own.low, float)
     assert with_values(Outer(), {}) == Outer()
 
 
 def test_settings_that_are_no_parameters_stay():
-    settings = Outer(apart=replace(Term(), high=7), inner=Inner(flow=replace(Term(), high=8)))
-    changed = with_values(settings, {'method': 'b'})
-    assert changed.apart.high == 7
-    assert changed.inner == Inner('b', flow=replace(Term(), high=8))
+    settings = Outer(own=Term(weight=7.0), apart=Term(high=7))
+    assert with_values(settings, {'high': 4}) == replace(settings, own=Term(7.0, -1.0, 4))
 
 
 @pytest.mark.parametrize(
     ('values', 'message'),
     [
-        ({'metod': 'b'}, 'no parameter metod; is method meant?'),
+        ({'hihg': 2}, 'no parameter hihg; is high meant?'),
         ({'zzz': 1}, 'no parameter zzz$'),
         ({'on': 1}, 'on must be a truth value, saw 1'),
-        ({'own.high': 2.5}, 'own.high must be a whole number, saw 2.5'),
-        ({'own.high': True}, 'own.high must be a whole number, saw True'),
-        ({'edges.low': 'x'}, "edges.low must be a number, saw 'x'"),
-        ({'own.low': 1.0}, 'no parameter own.low$'),
-        ({'method': None}, 'method must be a text, saw None'),
-        ({'edges.weight': 9.5}, 'edges.weight must lie between 0.5 and 9, saw 9.5'),
-        ({'own.weight': math.nan}, 'own.weight must lie between 0 and inf, saw nan'),
+        ({'high': 2.5}, 'high must be a whole number, saw 2.5'),
+        ({'high': True}, 'high must be a whole number, saw True'),
+        ({'low': 'x'}, "low must be a number, saw 'x'"),
+        ({'weight': 1.0}, 'no parameter weight'),
+        ({'high': 10}, 'high must lie between 0 and 9, saw 10'),
+        ({'low': math.nan}, 'low must lie between -inf and inf, saw nan'),
     ],
 )
 def test_wrong_values_are_refused(values, message):
@@ -158,9 +121,8 @@ def test_wrong_values_are_refused(values, message):
 
 def test_values_that_do_not_go_together_are_refused():
     with pytest.raises(ValueError, match=r'low 4.0 must be below high 3'):
-        with_values(Outer(), {'edges.low': 4.0})
-    both = with_values(Outer(own=Term(low=2.0)), {'own.high': 5, 'own.weight': 1.0})
-    assert both.own == Term(1.0, 2.0, 5)
+        with_values(Outer(), {'low': 4.0})
+    assert with_values(Outer(), {'low': 4.0, 'high': 5}).own == Term(2.0, 4.0, 5)
 
 
 def test_docstrings_without_attributes_describe_nothing():
@@ -171,21 +133,18 @@ def test_docstrings_without_attributes_describe_nothing():
     assert described_fields(Outer) == {
         'shared': 'Shared by all.',
         'on': 'More: with a colon.',
-        'inner': 'settings of the part.',
-        'own': 'Another term.',
+        'own': 'A term.',
     }
 
 
 def test_nodes_have_few_parameters():
     declared = [[p.name for p in declared_parameters(settings)] for settings in ALL]
-    assert len(declared[0]) <= 43
-    assert len({name for names in declared for name in names}) <= 60
+    assert len(declared[0]) <= 34
+    assert len({name for names in declared for name in names}) <= 55
     names = set(declared[0])
     assert {'max_hypotheses', 'evaluation_budget', 'random_seed', 'gravity'} < names
-    parameters = with_values(
-        FilterParameters(), {'likelihood.edges.weight': 7, 'max_hypotheses': 20}
-    )
-    assert parameters.tracker.likelihood.edges.weight == 7.0
+    parameters = with_values(FilterParameters(), {'camera_height': 7, 'max_hypotheses': 20})
+    assert parameters.camera_height == 7.0
     assert parameters.tracker.max_hypotheses == 20
 
 
@@ -220,9 +179,8 @@ def test_defaults_lie_between_limits(settings):
     [
         ({'max_hypotheses': 0}, 'max_hypotheses must lie between 1 and 64, saw 0'),
         ({'evaluation_budget': 0}, 'evaluation_budget must lie between 1 and 100000, saw 0'),
-        ({'likelihood.edges.wieght': 2.0}, 'is likelihood.edges.weight meant'),
+        ({'camera_hieght': 2.0}, 'is camera_height meant'),
         ({'surprise': 2.0}, 'there is no parameter surprise'),
-        ({'background.method': 'guess'}, "saw 'guess'"),
         ({'image_transport': 'theora'}, "image_transport must be one of .* saw 'theora'"),
         ({'body_model': ''}, 'body_model must be a name or a file'),
         ({'camera_height': -1.0}, 'camera_height must lie between 0 and 100'),

@@ -5,11 +5,10 @@ import pytest
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import DEPTH, DETECTIONS
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.messages.detections import PEOPLE_2D
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import depth_message
@@ -19,7 +18,7 @@ from msg_tools.messages.images import depth_message
 def session(stub_tracker, subject_file, outputs, small_camera):
     def make(**values):
         values = {'subject_file': str(subject_file), 'use_depth': True, **values}
-        one = FilterSession(with_values(FilterParameters(), values), outputs.append)
+        one = TrackingSession(with_values(FilterParameters(), values), outputs.append)
         one.take(CAMERA_INFO, small_camera.info())
         return one
 
@@ -127,9 +126,12 @@ def test_depth_of_something_else_is_told_once(session, small_camera, stub_tracke
 def test_several_people_are_seen_with_the_same_depth(small_camera, monkeypatch):
     """Images wait for the depth as for the detections, and go on without."""
     seen = []
-    monkeypatch.setattr(
-        PeopleSession, '_follow_all', lambda self, waiting, *_, **__: seen.append(waiting.depth)
-    )
+
+    def nobody(self, waiting, *_):
+        seen.append(waiting.depth)
+        return iter(())
+
+    monkeypatch.setattr(PeopleSession, '_nearest_first', nobody)
     values = {'use_depth': True, 'input_timeout': 0.25}
     one = PeopleSession(with_values(PeopleParameters(), values), lambda output: None)
     one.take(CAMERA_INFO, small_camera.info())

@@ -11,13 +11,13 @@ from hmt_ros.body.mirror import root_rotations
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TF, Transform
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
@@ -55,7 +55,7 @@ def session(stub_tracker, subject_file, outputs):
             'publish_in_fixed_frame': True,
             **values,
         }
-        return FilterSession(with_values(FilterParameters(), values), outputs.append)
+        return TrackingSession(with_values(FilterParameters(), values), outputs.append)
 
     return make
 

@@ -5,10 +5,10 @@ import pytest
 
 from hmt_ros.body import Camera, load_body
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.focal_length import depth_covariances, usual_camera
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.keep_out import keep_out_of
 from msg_tools.messages.pose_mixtures import pose_mixture_of
@@ -22,7 +22,7 @@ def told(stub_tracker, subject_file, outputs, small_camera):
 
     def run(**values):
         given = FilterParameters(subject_file=str(subject_file), **values)
-        one = FilterSession(given, outputs.append)
+        one = TrackingSession(given, outputs.append)
         one.take(CAMERA_INFO, small_camera.info())
         one.take(IMAGE, small_camera.image(0))
         one.take(IMAGE, small_camera.image(1))

@@ -14,8 +14,6 @@ from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.sessions import hri_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.hri_session import (
     FRAMES,
@@ -25,6 +23,8 @@ from hmt_ros.sessions.hri_session import (
     mixture_source,
     published_topic,
 )
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.detections import person_of_skeleton
 from msg_tools.messages.images import decode_image
@@ -140,7 +140,7 @@ def test_what_the_filter_publishes_is_a_body(
         if output.topic == 'pose_mixture':
             one.take(P1, deserialise(output.data, 'hmt_msgs/msg/PoseMixture'))
 
-    tracks = FilterSession(parameters, forward)
+    tracks = TrackingSession(parameters, forward)
     tracks.take(CAMERA_INFO, small_camera.info())
     stub_tracker.empty.add(small_camera.stamp(2))
     for index in range(3):

@@ -7,12 +7,10 @@ import pytest
 
 from hmt_ros.app.replay import inputs
 from hmt_ros.app.replay.inputs import recorded_input
-from hmt_ros.sessions import filter_session, image_inputs
+from hmt_ros.sessions import image_inputs, tracking_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import AT_ONCE, parameter_field
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
-from hmt_ros.sessions.handled import Fault, HandlingLog
+from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.image_inputs import (
     DEPTH_INPUT,
     DETECTIONS_INPUT,
@@ -21,6 +19,8 @@ from hmt_ros.sessions.image_inputs import (
     ImageInput,
     ImageInputs,
 )
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools import BagReader, BagWriter
 
 RANGE = 'sensor_msgs/msg/Range'
@@ -34,7 +34,7 @@ def _read_distance(message, stamp):
 
 # A radio that tells how far away the person is. What another input takes: this row ...
 UWB = ImageInput(
-    'uwb', {'uwb': RANGE}, 'use_uwb', Fault.DEPTH, Fault.NO_DEPTH, _read_distance,
+    'uwb', {'uwb': RANGE}, 'use_uwb', _read_distance,
 )  # fmt: skip
 
 
@@ -51,15 +51,15 @@ class Parameters(FilterParameters):
 
 
 # ... and where it is used.
-class Session(FilterSession):
-    def _follow(self, waiting, *others):
+class Session(TrackingSession):
+    def _people_in(self, waiting, camera):
         self.heard = [*getattr(self, 'heard', []), waiting.content('uwb')]
-        super()._follow(waiting, *others)
+        return super()._people_in(waiting, camera)
 
 
 @pytest.fixture
 def with_a_radio(monkeypatch):
-    for module in (image_inputs, filter_session):
+    for module in (image_inputs, tracking_session):
         monkeypatch.setattr(module, 'INPUTS', (*INPUTS, UWB))
     monkeypatch.setattr(inputs, 'RECORDED', (*inputs.RECORDED, UWB))
 
@@ -108,7 +108,7 @@ def test_an_input_is_a_row_and_its_parameter(
 def test_a_node_listens_to_every_row():
     from hmt_ros.nodes.subscribed_topic import input_topics
 
-    topics = {one.topic: one for one in input_topics(FilterSession.inputs_of(FilterParameters()))}
+    topics = {one.topic: one for one in input_topics(TrackingSession.inputs_of(FilterParameters()))}
     assert topics['uwb'].msgtype == RANGE
     assert list(topics) == [source for row in (*INPUTS, UWB) for source in row.types]
     assert topics['depth'].largest == DEPTH_INPUT.largest > topics['uwb'].largest

@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D
+from hmt_ros.sessions.keypoint_inputs import ChosenPerson
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
+from msg_tools.messages.detections import DetectedPerson
 from test.sessions.conftest import JOINTS
 
 
@@ -19,7 +22,7 @@ def session(stub_tracker, subject_file, outputs, small_camera):
 
     def make(**values):
         values = {'subject_file': str(subject_file), 'use_keypoints': True, **values}
-        one = FilterSession(with_values(FilterParameters(), values), outputs.append)
+        one = TrackingSession(with_values(FilterParameters(), values), outputs.append)
         one.take(CAMERA_INFO, small_camera.info())
         return one
 
@@ -150,3 +153,59 @@ def test_parameters_of_keypoints():
         FilterParameters(use_keypoints_3d=True)
     with pytest.raises(ValueError, match=r"keypoint_scheme must be one of .* saw 'coco'"):
         FilterParameters(keypoint_scheme='coco')
+
+
+# Who is followed among several people.
+
+NAMES = ('left_hip', 'right_hip', 'head')
+SECOND = 10**9
+
+
+def person(column, size=100.0, missing=()):
+    """Somebody whose head is in a column."""
+    pixels = size * np.array([[-0.1, 1.0], [0.1, 1.0], [0.0, 0.0]]) + (column, 50.0)
+    pixels[list(missing)] = np.nan
+    covariances = np.tile(np.eye(2), (3, 1, 1))
+    return DetectedPerson('', Keypoints(NAMES, pixels, covariances, np.ones(3)))
+
+
+@pytest.fixture
+def choose():
+    chosen = ChosenPerson()
+
+    def which(seconds, *people):
+        found = chosen.choose(people, int(seconds * SECOND), 1.0)
+        return next((i for i, x in enumerate(people) if x.keypoints is found), None)
+
+    which.forget = chosen.forget
+    return which
+
+
+def test_first_the_largest_then_the_nearest(choose):
+    assert choose(0.0, person(100, 80), person(400, 120)) == 1
+    # The other one comes nearer to the camera, in another order.
+    assert choose(0.1, person(410, 100), person(110, 300)) == 0
+    assert choose(0.2, person(130, 300), person(420, 100)) == 1
+
+
+def test_somebody_else_is_not_taken_for_the_person(choose):
+    assert choose(0.0, person(100)) == 0
+    assert choose(0.1, person(400)) is None
+    assert choose(0.2) is None
+    assert choose(0.9, person(400), person(120)) == 1
+
+
+def test_after_an_absence_the_largest_is_chosen_anew(choose):
+    assert choose(0.0, person(100)) == 0
+    assert choose(1.0, person(400)) is None
+    assert choose(1.1, person(400)) == 0
+    choose.forget()
+    assert choose(1.2, person(100, 150), person(400)) == 0
+
+
+def test_landmarks_that_are_missing(choose):
+    assert choose(0.0, person(100)) == 0
+    assert choose(0.1, person(300, missing=(1, 2)), person(105, missing=(1, 2))) == 1
+    # Of the left hip before, nothing is seen.
+    assert choose(0.2, person(300, missing=(0, 2)), person(110, missing=(0, 2))) == 1
+    assert choose(0.3, person(100, missing=(0, 1, 2))) is None

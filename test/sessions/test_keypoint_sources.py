@@ -10,9 +10,9 @@ from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import DETECTIONS
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.messages.headers import header_message
 
 COCO = schemes()['coco17'].names
@@ -27,7 +27,7 @@ def session(stub_tracker, subject_file, outputs):
             'subject_file': str(subject_file),
             **values,
         }
-        return FilterSession(with_values(FilterParameters(), values), outputs.append)
+        return TrackingSession(with_values(FilterParameters(), values), outputs.append)
 
     return make
 

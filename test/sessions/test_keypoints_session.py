@@ -10,8 +10,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
-from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
-from hmt_ros.sessions.keypoints_session import TOPICS, KeypointsSession
+from hmt_ros.sessions.keypoints_session import TOPICS, KeypointsParameters, KeypointsSession
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.images import decode_mask
 from msg_tools.messages.keypoints import keypoints_of, positions_of

@@ -1,7 +1,7 @@
 """Messages that come back to their publisher."""
 
-from hmt_ros.nodes import local_topics
-from hmt_ros.nodes.local_topics import OwnMessages
+from hmt_ros.nodes import own_messages
+from hmt_ros.nodes.own_messages import OwnMessages
 
 HEAD = b'\x00\x01\x00\x00'
 
@@ -20,7 +20,7 @@ def test_each_message_comes_back_once():
 
 
 def test_what_never_comes_back_is_forgotten(monkeypatch):
-    monkeypatch.setattr(local_topics, '_MOST_OWN', 3)
+    monkeypatch.setattr(own_messages, '_MOST_OWN', 3)
     own = OwnMessages()
     for k in range(5):
         own.sent(HEAD + bytes([k + 1]))

@@ -4,8 +4,8 @@ import pytest
 import yaml
 
 from hmt_ros.sessions.declared_parameters import ParameterError, values_of, with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.parameter_file import parameter_file_text, read_parameter_file, yaml_scalar
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
@@ -18,12 +18,23 @@ def test_file_of_the_node_is_what_it_declares():
     assert read_parameter_file(CONFIG, 'filter_node') == values_of(FilterParameters())
 
 
+def test_what_two_nodes_have_alike_is_written_once():
+    file = CONFIG.with_name('people_node.yaml')
+    wanted = parameter_file_text(
+        'people_node', PeopleParameters(), 'filter_node', FilterParameters()
+    )
+    assert file.read_text('utf-8') == wanted, 'write it: python docs/generate.py people_node'
+    own, shared = read_parameter_file(file, 'people_node'), values_of(FilterParameters())
+    assert list(own) == ['source', 'max_people', 'use_keypoints', 'frame_prefix']
+    assert shared | own == values_of(PeopleParameters())
+    assert '# All others are those of filter_node: see filter_node.yaml.' in wanted
+
+
 def test_other_values_survive(tmp_path):
     changed = with_values(
         FilterParameters(),
-        {'subject_file': "it's: #1", 'keypoint_sigma_px': 1e-5, 'publish_tf': False,
-         'likelihood.edges.weight': float('inf')},
-    )  # fmt: skip
+        {'subject_file': "it's: #1", 'camera_height': 1e-5, 'publish_tf': False},
+    )
     path = tmp_path / 'changed.yaml'
     path.write_text(parameter_file_text('filter_node', changed))
     assert with_values(FilterParameters(), read_parameter_file(path, 'filter_node')) == changed
@@ -42,16 +53,16 @@ def test_sections_are_chosen_by_the_name_of_the_node(tmp_path):
         '/camera:\n  ros__parameters: {rate: 30}\n'
         'filter_node:\n  ros__parameters:\n    max_hypotheses: 4\n'
         '    background: {method: knn}\n'
-        '/**:\n  ros__parameters: {max_hypotheses: 6, likelihood.edges.weight: 3.0}\n'
+        '/**:\n  ros__parameters: {max_hypotheses: 6, dynamics.model: learned}\n'
     )
     assert read_parameter_file(path, 'filter_node') == {
         'max_hypotheses': 4,
-        'likelihood.edges.weight': 3.0,
+        'dynamics.model': 'learned',
         'background.method': 'knn',
     }
     assert read_parameter_file(path, 'other') == {
         'max_hypotheses': 6,
-        'likelihood.edges.weight': 3.0,
+        'dynamics.model': 'learned',
     }
 
 

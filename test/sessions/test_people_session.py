@@ -12,8 +12,8 @@ from hmt_ros.sessions import track_start
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.image_inputs import DETECTIONS
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PEOPLE, PeopleSession, published_topic
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.beginning import Source
 from msg_tools.messages.cdr import deserialise
@@ -140,7 +140,7 @@ def test_two_people_have_topics_of_their_own(session, outputs, small_camera):
     }
     assert frames == {'body_p1', 'body_p2'}
     assert listed(outputs) == [['p1', 'p2']]
-    assert one.state.counts == {'received': 1, 'tracked': 1, 'skipped': 0}
+    assert one.state.counts == {'received': 1, 'tracked': 1}
     assert (one.state.people, one.state.status) == (('p1', 'p2'), 'tracking')
     # One image, decoded once, and one background.
     first, second = StubTracker.made
@@ -418,11 +418,11 @@ def test_a_moved_camera_is_told_once_for_all(session, small_camera, tmp_path):
 
 def test_parameters_that_change_reach_those_who_are_followed(session, outputs, small_camera):
     one = started(session(keep_out_probability=0.5), small_camera)
-    for index, values in enumerate(({}, {'keep_out_probability': 0.9, 'overlay_modes': 0})):
+    for index, values in enumerate(({}, {'keep_out_probability': 0.9, 'publish_tf': False})):
         one.parameters = with_values(one.parameters, values)
         outputs.clear()
         show(one, small_camera, index, somebody_at(15))
         topics = {output.topic: output.data for output in outputs}
-        assert ('humans/bodies/p1/overlay/compressed' in topics) == (index == 0)
+        assert ('/tf' in topics) == (index == 0)
         told = keep_out_of(deserialise(topics['humans/bodies/p1/keep_out'], KEEP_OUT))
         assert told.probability == (0.5, 0.9)[index]

@@ -12,9 +12,9 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.camera_session import WaitingImage
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.track_messages import TOPICS, TrackedImage, track_messages
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.ground import Ground
 from msg_tools import MessageError
@@ -69,7 +69,8 @@ def track(body):
         tracker,
         posterior,
         GaussianMixture(np.array([0.6, 0.4]), poses[:2], covariances[:2]),
-        FilterParameters(frame_prefix='anna/'),
+        FilterParameters(),
+        'anna/',
         starts=True,
         describe=True,
     )

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, CAMERA_MOVED, IMAGE, MOST_INCOMPLETE
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking import Status
 
 
 @pytest.fixture
 def one(stub_tracker, subject_file, outputs, small_camera):
-    found = FilterSession(FilterParameters(subject_file=str(subject_file)), outputs.append)
+    found = TrackingSession(FilterParameters(subject_file=str(subject_file)), outputs.append)
     found.take(CAMERA_INFO, small_camera.info())
     return found
 
@@ -146,7 +146,7 @@ def test_what_a_dropped_image_waited_for_is_known(stub_tracker, subject_file, sm
     parameters = FilterParameters(
         subject_file=str(subject_file), use_keypoints=True, input_timeout=60.0
     )
-    one = FilterSession(parameters, lambda output: None)
+    one = TrackingSession(parameters, lambda output: None)
     for index in range(MOST_INCOMPLETE + 1):
         one.take(IMAGE, small_camera.image(index))
     assert one.state.held_up == 'a calibrated camera_info'
@@ -162,7 +162,7 @@ def test_what_a_dropped_image_waited_for_is_known(stub_tracker, subject_file, sm
 
 
 def test_what_is_needed_follows_the_parameters(stub_tracker, subject_file, small_camera):
-    one = FilterSession(
+    one = TrackingSession(
         FilterParameters(
             subject_file=str(subject_file), use_keypoints=True, use_mask=True, gravity_frame='map'
         ),

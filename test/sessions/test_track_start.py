@@ -5,8 +5,8 @@ import pytest
 
 from hmt_ros.sessions import track_start
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools import RosbagsMessages
 
 

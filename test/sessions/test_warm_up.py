@@ -8,18 +8,17 @@ import sys
 from hmt_ros.compiled_code import compiled_functions
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession
 from hmt_ros.sessions.session import FINISH
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.warm_up import film, likelihoods, warm_up_tracking
 from hmt_ros.tracking import Status, Tracker
 
 SESSIONS = [
-    (FilterSession, FilterParameters()),
+    (TrackingSession, FilterParameters()),
     (PeopleSession, PeopleParameters()),
     (SmootherSession, SmootherParameters()),
     (BmeSession, BmeParameters()),

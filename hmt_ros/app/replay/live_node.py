@@ -21,7 +21,7 @@ from typing import Any
 
 import hmt_ros
 from hmt_ros.app.replay.player import LiveNodeError, Player, environment
-from hmt_ros.nodes.local_topics import OwnMessages
+from hmt_ros.nodes.own_messages import OwnMessages
 from hmt_ros.sessions.declared_parameters import values_of
 from hmt_ros.sessions.handled import HANDLED, Handled, handled_of
 from hmt_ros.sessions.parameter_file import yaml_scalar

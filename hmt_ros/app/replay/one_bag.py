@@ -14,16 +14,15 @@ from typing import Any, Generic, TypeVar
 from hmt_ros.app.progress import Progress, show_progress
 from hmt_ros.app.replay.inputs import GROUND_TRUTH, RECORDED, RecordedInput, fitted
 from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_parameters
-from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PeopleTrack, PlayedTrack
+from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PlayedTrack
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, KEYPOINTS
-from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.people_session import PeopleSession
+from hmt_ros.sessions.people_session import published_topic, session_of
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.tracking_parameters import PeopleParameters
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
@@ -117,13 +116,18 @@ def _track(
     options: ReplayOptions, parameters: NodeParameters, out: BagWriter, behind: WriteBehind
 ) -> PlayedTrack:
     write = partial(behind.call, out.write_serialised)
-    if options.people:
+    if options.live:
+        return LiveTrack(parameters, write)
+    known: set[str] = set()
 
-        def add_topic(name: str, msgtype: str, latched: bool) -> None:
-            behind.call(partial(out.add_topic, name, msgtype, latched=latched))
+    def write_of_person(topic: str, stamp: int, data: bytes) -> None:
+        if topic not in known:
+            known.add(topic)
+            msgtype, latched = published_topic(topic)
+            behind.call(partial(out.add_topic, topic, msgtype, latched=latched))
+        write(topic, stamp, data)
 
-        return PeopleTrack(parameters, write, add_topic)
-    return LiveTrack(parameters, write) if options.live else OfflineTrack(parameters, write)
+    return OfflineTrack(parameters, write_of_person if options.people else write)
 
 
 def _subject_hint(bag: Path) -> str:
@@ -134,10 +138,7 @@ def _subject_hint(bag: Path) -> str:
 def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
     """The topics that some node uses."""
     tracking, bme = parameters.filter, parameters.bme
-    if isinstance(tracking, PeopleParameters):
-        rows = PeopleSession.inputs_of(tracking)
-    else:
-        rows = FilterSession.inputs_of(tracking)
+    rows = session_of(tracking).inputs_of(tracking)
     used = [row for row in rows if row.is_used(tracking)]
     if bme is not None:
         used += [row for row in BmeSession.inputs_of(bme) if row.is_used(bme)]

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 from hmt_ros.app.replay.inputs import RECORDED, RecordedInput, recorded_input, upright_frame
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.image_inputs import (
     DEPTH,
     DETECTIONS,
@@ -20,8 +19,8 @@ from hmt_ros.sessions.image_inputs import (
     SOURCES,
 )
 from hmt_ros.sessions.parameter_file import read_parameter_file
-from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from hmt_ros.tracking.settings import ACCURATE_BUDGET
 from msg_tools import BagReader
 from msg_tools.files.error_line import error_line
@@ -246,7 +245,7 @@ def _bme_parameters(
     }
     if options.bme:
         values['model_file'] = options.bme
-    return with_values(BmeParameters(background=tracking.background), values)
+    return with_values(BmeParameters(), values)
 
 
 def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:

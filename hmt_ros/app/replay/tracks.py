@@ -21,15 +21,13 @@ from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE, PREDICTION
-from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.people_session import PeopleSession, published_topic
+from hmt_ros.sessions.people_session import session_of
 from hmt_ros.sessions.session import FINISH
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
-from msg_tools.messages.cdr import deserialise
 
 PERSON = 'person_node'
 # Topics of the filter that the smoother takes, as sources of the same names.
@@ -66,9 +64,8 @@ class OfflineTrack(PlayedTrack):
         if parameters.bme is not None:
             self._bme = BmeSession(parameters.bme, self._predict, bme_session.TOPICS.__contains__)
         self._seen, self._heard = _seen_by_bme(parameters), _heard_by_bme(parameters)
-        self._filter = FilterSession(
-            parameters.filter, self._filtered, track_messages.TOPICS.__contains__
-        )
+        kind = session_of(parameters.filter)
+        self._filter = kind(parameters.filter, self._filtered, _is_recorded)
         if parameters.smoother is not None:
             self._smoother = SmootherSession(parameters.smoother, lambda output: write(*output))
 
@@ -93,20 +90,19 @@ class OfflineTrack(PlayedTrack):
     def _hand_to_filter(self, result: Handled) -> Handled:
         """Hands the predictions to the filter."""
         predicted, self._predicted = self._predicted, []
-        for topic, _, data in predicted:
-            read = deserialise(data, bme_session.TOPICS[topic].msgtype)
-            result = _together(result, self._filter.take(PREDICTION, read))
+        for output in predicted:
+            result = _together(result, self._filter.take(PREDICTION, output.message))
         return result
 
     def _hand_on(self, result: Handled) -> Handled:
         """Hands the messages of the filter to smoother and BME."""
         handed, self._handed = self._handed, []
-        for topic, _, data in handed:
-            read = deserialise(data, track_messages.TOPICS[topic].msgtype)
+        for output in handed:
+            topic, message = output.topic, output.message
             if self._smoother is not None and topic in HANDED_ON:
-                result = _together(result, self._smoother.take(topic, read))
+                result = _together(result, self._smoother.take(topic, message))
             if self._bme is not None and topic in self._heard:
-                result = _together(result, self._bme.take(topic, read))
+                result = _together(result, self._hand_to_filter(self._bme.take(topic, message)))
         return result
 
     def _predict(self, output: Output) -> None:
@@ -117,44 +113,6 @@ class OfflineTrack(PlayedTrack):
         self._write(*output)
         if output.topic in HANDED_ON or output.topic in self._heard:
             self._handed.append(output)
-
-
-class PeopleTrack(PlayedTrack):
-    """Several people, without ROS.
-
-    Args:
-        parameters: parameters of the nodes; those of the filter are those of the people node.
-        add_topic: takes name, type and `latched` of a topic of a person before its first message.
-
-    Raises:
-        ValueError: the parameters name a file that can not be used.
-    """
-
-    def __init__(
-        self, parameters: NodeParameters, write: Write, add_topic: Callable[[str, str, bool], None]
-    ) -> None:
-        assert isinstance(parameters.filter, PeopleParameters)
-        self._write, self._add_topic = write, add_topic
-        self._known: set[str] = set()
-        self._session = PeopleSession(parameters.filter, self._take_output, _is_recorded)
-
-    def __exit__(self, *_: object) -> None:
-        """See `PlayedTrack`; nothing is open."""
-
-    def take(self, source: str, message: Any) -> Handled:
-        """See `PlayedTrack`."""
-        return self._session.take(source, message)
-
-    def finish(self) -> Handled:
-        """See `PlayedTrack`."""
-        return self._session.finish()
-
-    def _take_output(self, output: Output) -> None:
-        if output.topic not in self._known:
-            self._known.add(output.topic)
-            published = published_topic(output.topic)
-            self._add_topic(output.topic, published.msgtype, published.latched)
-        self._write(*output)
 
 
 class LiveTrack(PlayedTrack):
@@ -181,7 +139,7 @@ class LiveTrack(PlayedTrack):
             image = topic, COMPRESSED_TYPE if compressed else IMAGE_TYPE
             given = {
                 source: (source, msgtype)
-                for row in FilterSession.inputs_of(self._parameters.filter)
+                for row in TrackingSession.inputs_of(self._parameters.filter)
                 for source, msgtype in row.types.items()
                 if source != PREDICTION
             }
@@ -272,12 +230,13 @@ class LiveTrack(PlayedTrack):
             if self._smoother is not None and topic in HANDED_ON:
                 result = _together(result, self._smoother.answer(topic))
             if self._bme is not None and topic in self._heard:
-                result = _together(result, self._bme.answer(topic))
+                predicted = self._answers_to_predictions(self._bme.answer(topic))
+                result = _together(result, predicted)
         return result
 
 
 def _is_recorded(topic: str) -> bool:
-    """Whether bags have a topic of `PeopleSession`."""
+    """Whether bags have a topic of a session that tracks."""
     return topic.rpartition('/')[2] not in track_messages.TOPICS_OF_NODE.keys() - (
         track_messages.TOPICS.keys()
     )

@@ -371,12 +371,12 @@ def test_options_reach_the_tracker(still, short, tmp_path):
         '    qos_overrides: {/image: {subscription: {depth: 3}}}\n    random_seed: 3\n'
     )
     options = ['--config', str(config), '--set', 'evaluation_budget=120']
-    options += ['--set', 'likelihood.edges.weight=3', '--seed', '7', '--body', 'human34', '--quiet']
+    options += ['--set', 'threads=1', '--seed', '7', '--body', 'human34', '--quiet']
     assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT, *options]) == 0
     (tracker,) = still
     settings = tracker.settings
     assert (settings.max_hypotheses, settings.evaluation_budget) == (5, 120)
-    assert settings.likelihood.edges.weight == 3.0
+    assert settings.threads == 1
     assert (tracker.seed, tracker.body.name) == (7, 'human34')
 
 
@@ -675,7 +675,7 @@ def test_nothing_is_overwritten_unasked(still, short, tmp_path, capsys):
     assert main([*command, '--seed', '1']) == 1
     assert 'exists; give another name' in capsys.readouterr().err
     assert content(out) == before
-    assert main([*command, '--overwrite', '--set', 'overlay_modes=0']) == 0
+    assert main([*command, '--overwrite', '--set', 'frame_prefix=a/']) == 0
     assert content(out) != before
     (out / 'notes.txt').write_text('mine')
     assert main([*command, '--overwrite']) == 1

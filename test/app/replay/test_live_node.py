@@ -22,9 +22,9 @@ from hmt_ros.app.replay.player import (
 from hmt_ros.app.replay.tracks import LiveTrack
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.image_inputs import KEYPOINTS
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
@@ -89,7 +89,7 @@ def test_same_of_every_image_without_a_subject(tmp_path, capsys):
     """Each node in a process of its own.
 
     What the BME predicts reaches the filter beside the image that it is from. It hears the track,
-    too: the second image comes 0.07 s after the first.
+    too: the second image comes 0.07 s after the first, and the third is looked at behind its pose.
     """
     bag = write(tmp_path / 'bag', recorded(3))
     # Filter and smoother tell of links on the same topic.
@@ -106,7 +106,7 @@ def test_same_of_every_image_without_a_subject(tmp_path, capsys):
         assert messages(offline, topic) == messages(live, topic)
     with BagReader(offline) as bag_out:
         found = [len(x.message.components) > 0 for x in bag_out.messages(['pose_prediction'])]
-    assert found == [True, False, True]
+    assert found == [True, False, False, True]
     # What a robot acts on, too.
     assert len(messages(offline, 'keep_out')) == 3
     assert len(messages(offline, 'pose_forecast')) > 3

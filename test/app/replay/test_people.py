@@ -72,7 +72,7 @@ def nearest_person(truths, bag, name, chosen):
 
 
 def test_both_keep_their_tracks(crossing, tmp_path, capsys):
-    settings = [word for each in [*SMALL, 'overlay_modes=0'] for word in ('--set', each)]
+    settings = [word for each in SMALL for word in ('--set', each)]
     target = tmp_path / 'tracked'
     command = [str(crossing), '-o', str(target), '--people', '--quiet', *settings]
     background = ['--background', str(crossing / 'background.png')]

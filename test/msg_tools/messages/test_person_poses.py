@@ -10,7 +10,7 @@ from hmt_ros.body import Body, load_body
 from hmt_ros.inference import GaussianMixture
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.messages.cdr import deserialise, serialise
-from msg_tools.messages.people import PERSON_POSE, person_pose, person_pose_message
+from msg_tools.messages.person_poses import PERSON_POSE, person_pose, person_pose_message
 
 
 @pytest.fixture(scope='module')

@@ -15,7 +15,6 @@ from hmt_ros.inference import GaussianMixture
 from msg_tools import MessageError, RosbagsMessages, typestore
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.cdr import deserialise, serialise
-from msg_tools.messages.message_error import MessageFault
 from msg_tools.messages.pose_mixtures import (
     POSE_MIXTURE,
     MixtureKind,
@@ -81,7 +80,7 @@ def test_nobody(messages: RosbagsMessages) -> None:
     assert back.joint_positions.shape == (0, len(body.joint_names), 3)
     with pytest.raises(MessageError, match='mixture has no components') as caught:
         _ = back.mixture
-    assert caught.value.fault is MessageFault.NO_COMPONENTS
+    assert caught.value.fault == 'no components'
 
 
 def test_error_model(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
@@ -195,10 +194,10 @@ def test_whose_poses_they_are() -> None:
     ):
         with pytest.raises(MessageError, match=error) as caught:
             body_of(strange, model)
-        assert caught.value.fault is MessageFault.BODY
+        assert caught.value.fault == 'body'
     with pytest.raises(MessageError, match='wanted 32') as caught:
         body_of(content, load_body('human32'), any_name=True)
-    assert caught.value.fault is MessageFault.NAMES
+    assert caught.value.fault == 'names'
 
 
 def test_equal_weights_keep_their_order(

@@ -1,19 +1,17 @@
-"""Parameters of the filter node, which are the settings of offline replay as well."""
+"""Parameters of the nodes that track, of one person and of several, and of offline replay."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
-from hmt_ros.image.background import BackgroundSettings
-from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     FRACTION,
     NEXT_CONFIGURE,
     NEXT_TRACK,
-    NOT_NEGATIVE,
     CameraNodeParameters,
     nested_parameters,
     parameter_field,
@@ -22,17 +20,15 @@ from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.ground import KnownGround
 from hmt_ros.tracking.settings import LIVE_BUDGET
 
+# Standard deviation of the parameter gravity: of a level or a protractor, rad.
+GRAVITY_SIGMA = math.radians(2.0)
 # Settings that are parameters, with their limits.
 _TRACKER = {
     'evaluation_budget': (1, 100_000),
     'max_hypotheses': (1, 64),
-    'flow_weight': NOT_NEGATIVE,
     'lifter': None,
     'threads': (0, 64),
-    **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
-    'likelihood.keypoints.weight': NOT_NEGATIVE,
 }
-BACKGROUND = {'method': None}
 
 
 @dataclass(frozen=True)
@@ -49,15 +45,12 @@ class FilterParameters(CameraNodeParameters):
         use_keypoints: If true, keypoints are a measurement and start a track without subject_file.
         use_keypoints_3d: If true, positions of the same landmarks in space (topic keypoints_3d) are
             weak evidence of depth.
-        keypoint_sigma_px: Standard deviation of keypoints without a covariance, px; 0 selects the
-            learned one, by confidence and size of the person.
         use_depth: If true, depth images registered to the images (topic depth) are a measurement.
         use_predictions: If true, predictions of bme_node start a track without subject_file and are
             hypotheses.
         gravity: Direction of gravity in the camera optical frame, three numbers of any length,
-            [0.0, 1.0, 0.0] for a level camera; if empty, lines of the scene show it where they can.
-        gravity_sigma: Standard deviation of the parameter gravity, degrees; lines of the scene
-            refine it within that.
+            [0.0, 1.0, 0.0] for a level camera; lines of the scene refine it within 2 degrees. If
+            empty, these lines show it where they can.
         camera_height: Height of the camera above the floor, m; 0 if unknown.
         focal_length_sigma: Relative standard deviation of the focal length in camera_info, which
             makes the published depths uncertain; 0 for a calibrated camera, 0.2 for a guess.
@@ -70,8 +63,6 @@ class FilterParameters(CameraNodeParameters):
         publish_in_fixed_frame: If true, markers, person_pose and keep_out are in fixed_frame, whose
             z axis must point up, and mixtures in <fixed_frame>_optical; if false, in the frame of
             the camera.
-        overlay_modes: Maximum number of modes drawn on the image, heaviest first; 0 switches the
-            overlay off.
         publish_tf: If true, /tf has the links of the point estimate, and camera_upright where
             gravity is known.
         frame_prefix: Prefix of link names on /tf and in human_description; in a namespace its
@@ -84,7 +75,6 @@ class FilterParameters(CameraNodeParameters):
         forecast_horizon: Maximum time from an image to a forecast, s; it should last until the next
             image is answered.
         tracker: settings of the tracker.
-        background: settings of the background subtraction.
     """
 
     subject_file: str = parameter_field('', NEXT_TRACK)
@@ -93,18 +83,15 @@ class FilterParameters(CameraNodeParameters):
     random_seed: int = parameter_field(0, NEXT_TRACK, (0, 2**31 - 1))
     use_keypoints: bool = parameter_field(False, AT_ONCE)
     use_keypoints_3d: bool = parameter_field(False, AT_ONCE)
-    keypoint_sigma_px: float = parameter_field(0.0, AT_ONCE, (0.0, 1000.0))
     use_depth: bool = parameter_field(False, AT_ONCE)
     use_predictions: bool = parameter_field(False, AT_ONCE)
     gravity: tuple[float, ...] = parameter_field((), NEXT_TRACK)
-    gravity_sigma: float = parameter_field(2.0, NEXT_TRACK, (0.1, 45.0))
     camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))
     focal_length_sigma: float = parameter_field(0.0, AT_ONCE, FRACTION)
     gravity_frame: str = parameter_field('', NEXT_CONFIGURE)
     floor_in_gravity_frame: bool = parameter_field(False, NEXT_CONFIGURE)
     fixed_frame: str = parameter_field('', NEXT_CONFIGURE)
     publish_in_fixed_frame: bool = parameter_field(False, NEXT_CONFIGURE)
-    overlay_modes: int = parameter_field(3, AT_ONCE, (0, 64))
     publish_tf: bool = parameter_field(True, AT_ONCE)
     frame_prefix: str = parameter_field('human/', AT_ONCE)
     keep_out_probability: float = parameter_field(0.99, AT_ONCE, (0.5, 0.9999))
@@ -114,10 +101,6 @@ class FilterParameters(CameraNodeParameters):
     tracker: TrackerSettings = field(
         default_factory=lambda: TrackerSettings(evaluation_budget=LIVE_BUDGET),
         metadata=nested_parameters(NEXT_TRACK, _TRACKER),
-    )
-    background: BackgroundSettings = field(
-        default_factory=BackgroundSettings,
-        metadata=nested_parameters(NEXT_TRACK, BACKGROUND, 'background.'),
     )
 
     def __post_init__(self) -> None:
@@ -154,4 +137,51 @@ class FilterParameters(CameraNodeParameters):
     def known_ground(self) -> KnownGround:
         """Gravity and floor from the parameters, without transforms."""
         up = -unit_vector(self.gravity, 'gravity') if self.gravity else None
-        return KnownGround(up, self.camera_height or None, math.radians(self.gravity_sigma))
+        return KnownGround(up, self.camera_height or None, GRAVITY_SIGMA)
+
+
+# Inputs of a single person, whose topics can not tell which person it is.
+_OF_ONE = {
+    'subject_file': '',
+    'use_predictions': False,
+    'use_keypoints_3d': False,
+    'person_id': '',
+}
+
+
+@dataclass(frozen=True)
+class PeopleParameters(FilterParameters):
+    """All parameters of the people node.
+
+    Attributes:
+        source: Type of the messages on the topic detections, 'people' (hmt_msgs/People2D), 'yolo'
+            (yolo_msgs/DetectionArray), 'boxes' (vision_msgs/Detection2DArray) or 'floats'
+            (std_msgs/Float32MultiArray).
+        max_people: Maximum number of people who are followed at the same time; of those who come
+            together the largest in the image are taken.
+        use_keypoints: If true, keypoints of the detections are a measurement and start tracks; if
+            false, only their boxes are used.
+        frame_prefix: Prefix of the names of all frames on /tf and in human_description, before
+            body_<id>/, which tells several robots apart.
+    """
+
+    source: str = parameter_field('people', NEXT_CONFIGURE)
+    max_people: int = parameter_field(4, AT_ONCE, (1, 20))
+    use_keypoints: bool = parameter_field(True, AT_ONCE)
+    frame_prefix: str = parameter_field('', AT_ONCE)
+
+    SOURCES: ClassVar[tuple[str, ...]] = ('people', 'yolo', 'boxes', 'floats')
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, unused in _OF_ONE.items():
+            if getattr(self, name) != unused:
+                raise ValueError(
+                    f'{name} is {getattr(self, name)!r}, but people_node takes no input of one '
+                    f'person: wanted {unused!r}, or filter_node'
+                )
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """See `FilterParameters`."""
+        return ('detections of people',)

@@ -9,11 +9,11 @@ import pytest
 from hmt_ros.body import Camera, load_body
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.image_inputs import COMPRESSED_MASK, KEYPOINTS, MASK, PREDICTION
 from hmt_ros.sessions.track_messages import TOPICS, TOPICS_OF_NODE
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.beginning import Source
 from msg_tools import RosbagsMessages
@@ -41,7 +41,7 @@ def session(stub_tracker, subject_file, outputs):
     def make(wanted=lambda topic: True, **values):
         values.setdefault('subject_file', str(subject_file))
         parameters = with_values(FilterParameters(), values)
-        return FilterSession(parameters, outputs.append, wanted)
+        return TrackingSession(parameters, outputs.append, wanted)
 
     return make
 
@@ -449,7 +449,7 @@ def test_last_keypoints_of_a_stamp_count(session, small_camera, stub_tracker):
 
 
 def test_nan_is_not_seen(session, small_camera, stub_tracker):
-    one = session(use_keypoints=True, keypoint_sigma_px=2.0)
+    one = session(use_keypoints=True)
     one.take(CAMERA_INFO, small_camera.info())
     place = np.array([np.nan, 3.0])
     handled = one.take(
@@ -460,7 +460,7 @@ def test_nan_is_not_seen(session, small_camera, stub_tracker):
     ((_, keypoints),) = stub_tracker.made[0].seen
     assert keypoints.names == ('left_hip',)
     assert np.array_equal(keypoints.pixels, [[3.0, 3.0]])
-    assert np.array_equal(keypoints.covariances, [4.0 * np.eye(2)])
+    assert np.array_equal(keypoints.covariances, [2.25 * np.eye(2)])  # the learned one
     assert np.array_equal(keypoints.confidences, [1.0])
 
 
@@ -665,14 +665,16 @@ def test_a_person_in_the_background_is_told(session, small_camera, stub_tracker)
     assert dict(one.state.values())['background'] == 'forgotten'
 
 
-@pytest.mark.parametrize(
-    ('values', 'source'),
-    [({}, Source.KEYPOINTS), ({'likelihood.coverage.weight': 0.0}, Source.SUBJECT)],
-)
+@pytest.mark.parametrize(('weight', 'source'), [(30.0, Source.KEYPOINTS), (0.0, Source.SUBJECT)])
 def test_a_person_in_the_background_is_not_told_where_silhouettes_are_not_used(
-    session, small_camera, stub_tracker, monkeypatch, values, source
+    session, small_camera, stub_tracker, monkeypatch, weight, source
 ):
-    one = session(**values)
+    one = session()
+    usual = one.parameters.tracker
+    coverage = replace(usual.likelihood.coverage, weight=weight)
+    tracking = replace(usual, likelihood=replace(usual.likelihood, coverage=coverage))
+    one.parameters = replace(one.parameters, tracker=tracking)
+    one.restart()
     one.take(CAMERA_INFO, small_camera.info())
     step = stub_tracker.step
 
@@ -765,6 +767,25 @@ def test_late_filter_leaves_images_out_but_not_what_was_predicted(
     one.take(IMAGE, small_camera.image(4))
     one.take(PREDICTION, likelihoods.nobody(4))
     assert stub_tracker.made[0].nobody_predicted == [False, True]
+
+
+def test_a_prediction_behind_the_pose_is_a_hypothesis_for_the_next_image(
+    session, small_camera, likelihoods, stub_tracker
+):
+    """Experts that leave an image to the track look at it once its pose is out."""
+    one = session(use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index, behind in enumerate([likelihoods.message(0), likelihoods.nobody(1), None]):
+        left = likelihoods.nobody(index)
+        left.state = int(TrackState.TRACKING)
+        one.take(PREDICTION, left)
+        assert one.take(IMAGE, small_camera.image(index)).published
+        if behind is not None:
+            assert one.take(PREDICTION, behind).published == ()
+    _, used, none = stub_tracker.made[0].predictions
+    assert np.array_equal(used.mixture.means, likelihoods.mixture(0).means)
+    assert none is None
+    assert stub_tracker.made[0].nobody_predicted == [False, False, True]
 
 
 def test_images_that_are_complete_at_once_are_all_used_in_lock_step(
@@ -872,25 +893,15 @@ def test_settings_reach_the_tracker(session, small_camera, stub_tracker, backgro
         max_hypotheses=3,
         random_seed=5,
         background_file=str(background_file),
-        **{'background.method': 'knn', 'likelihood.edges.weight': 2.0},
+        evaluation_budget=200,
     )
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
     (tracker,) = stub_tracker.made
     assert tracker.settings.max_hypotheses == 3
-    assert tracker.settings.likelihood.edges.weight == 2.0
+    assert tracker.settings.evaluation_budget == 200
     assert tracker.seed == 5
-    assert tracker.background.settings.method == 'knn'
     assert tracker.background.frames > 0
-
-
-def test_background_is_learned_with_the_settings(session, small_camera, stub_tracker):
-    one = session(**{'background.method': 'knn'})
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(IMAGE, small_camera.image(0))
-    (tracker,) = stub_tracker.made
-    assert tracker.background.settings.method == 'knn'
-    assert tracker.background.frames == 0
 
 
 def test_changed_parameters_take_effect_with_the_next_track(session, small_camera, stub_tracker):
@@ -983,11 +994,11 @@ def test_frames_are_named_by_the_image_or_the_camera(session, small_camera, outp
 
 
 def test_switches_of_the_outputs(session, small_camera, outputs):
-    one = session(overlay_modes=0, publish_tf=False)
+    one = session(publish_tf=False)
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
     assert [o.topic for o in outputs] == [
-        topic for topic in [*STARTS, *ONE_IMAGE] if topic not in ('/tf', 'overlay/compressed')
+        topic for topic in [*STARTS, *ONE_IMAGE] if topic != '/tf'
     ]
 
 

@@ -1,0 +1,360 @@
+"""The track of one person before a camera: images in, mixtures over poses out.
+
+Of several people each has topics in `humans/bodies/<id>/` (REP 155), and frames of links that begin
+with `body_<id>/`; a person without a name has neither. When the person is no longer in view one
+mixture without components of either kind goes out, with markers that remove those before, and then
+nothing until a new track starts. Outputs for robots go out for every image, whatever it shows.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hmt_ros.body import Body, Camera
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Mask
+from hmt_ros.sessions.camera_frames import CameraFrames
+from hmt_ros.sessions.camera_session import WaitingImage
+from hmt_ros.sessions.fixed_frame import FixedFrame
+from hmt_ros.sessions.focal_length import with_depth_error
+from hmt_ros.sessions.handled import HandlingLog
+from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
+from hmt_ros.sessions.track_messages import (
+    TOPICS_OF_NODE,
+    Made,
+    TrackedImage,
+    nobody_messages,
+    robot_messages,
+    track_messages,
+)
+from hmt_ros.sessions.track_reports import TrackCondition, report_change
+from hmt_ros.sessions.track_start import TrackStart
+from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.tracking import PosePrediction, Status, Tracker
+from hmt_ros.tracking.ground import KnownGround
+from msg_tools.files.error_line import error_line
+from msg_tools.messages.keep_out import KeepOutState
+
+BODIES = 'humans/bodies'
+# Change of a length above which a body is described anew, m.
+RESHAPED = 0.005
+_STATES = {
+    Status.WAITING: KeepOutState.UNKNOWN,
+    Status.TRACKING: KeepOutState.TRACKING,
+    Status.LOST: KeepOutState.LOST,
+    Status.NOBODY: KeepOutState.NOBODY,
+}
+
+
+def topic_of(person: str, topic: str) -> str:
+    """Name of a topic of a person; all people share absolute ones, and nobody has no name."""
+    return f'{BODIES}/{person}/{topic}' if person and not topic.startswith('/') else topic
+
+
+def person_of(topic: str) -> str:
+    """The person whose topic this is; '' for a shared topic."""
+    name = topic.removeprefix(f'{BODIES}/')
+    return '' if name == topic else name.partition('/')[0]
+
+
+@dataclass(eq=False)
+class Shared:
+    """What the tracks of a session share.
+
+    Attributes:
+        frames: that transforms lead to from the camera.
+        log: of the session.
+        publish: takes topic, stamp and message.
+        wanted: whether a topic needs to be published.
+        answering: held while outputs for robots are made: those of the watchdog never follow the
+            answer to a newer image.
+        answered: number of answers to images that went to robots.
+    """
+
+    frames: CameraFrames
+    log: HandlingLog
+    publish: Callable[[str, int, Any], None]
+    wanted: Callable[[str], bool]
+    answering: threading.Lock = field(default_factory=threading.Lock)
+    answered: int = 0
+
+
+class Seen(NamedTuple):
+    """What is seen of a person in an image, besides the image itself; see `Tracker.step`.
+
+    Attributes:
+        keypoints: of this person, those that were seen; None: the detector has not answered.
+        prediction: of the pose, or that nobody is there; None: there is none.
+        others: (H, W) pixels that other people cover; None: none.
+    """
+
+    keypoints: Keypoints | None
+    prediction: PosePrediction | Status | None = None
+    others: Mask | None = None
+
+
+class Track:
+    """Tracks one person; all but `stale` is for the thread that estimates.
+
+    Args:
+        person: identity, which is part of topics and frames; '': the only one.
+        parameters: of the node, until the next image brings others.
+        background: of several people, which is learned elsewhere; None: an own one.
+
+    Attributes:
+        person: identity.
+        start: of the track.
+        tracker: None: nothing was tracked since the start.
+        body: that was described last; None: there is no track.
+        weights: of the present mixture; empty: there is none.
+        robot: outputs for robots; may be read by any thread.
+    """
+
+    def __init__(
+        self,
+        person: str,
+        parameters: FilterParameters,
+        start: TrackStart,
+        shared: Shared,
+        background: BackgroundModel | None = None,
+    ) -> None:
+        self.person = person
+        self.tracker: Tracker | None = None
+        self.robot = RobotOutputs()
+        self._parameters, self._shared, self._background = parameters, shared, background
+        self._last_id = 0
+        self._described: tuple[str, str] | None = None
+        self.restart(start)
+        for topic in TOPICS_OF_NODE if person else ():
+            # The publisher opens them now, not at the first message, which would be lost.
+            self._wants(topic)
+
+    def restart(self, start: TrackStart) -> None:
+        """Drops the track; the next images start another one."""
+        self._last_id, self.start = self.track_id, start
+        self.tracker = None
+        self.body: Body | None = None
+        self.weights = np.empty(0)
+        # Angle by which the root is turned in the fixed frame, see `FixedFrame`.
+        self._turn = 0.0
+
+    @property
+    def track_id(self) -> int:
+        """Number of the present track, or of the last one; 0 before the first."""
+        return self._last_id if self.tracker is None else self.tracker.track_id
+
+    @property
+    def status(self) -> Status:
+        """Of the tracker."""
+        return Status.WAITING if self.tracker is None else self.tracker.status
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is a track."""
+        return self.status in (Status.TRACKING, Status.LOST)
+
+    def follow(
+        self, waiting: WaitingImage, camera: Camera, seen: Seen, parameters: FilterParameters
+    ) -> bool | None:
+        """Takes an image, and publishes the results.
+
+        Returns:
+            Whether they were published, or the image could not be used; None: there is no track.
+        """
+        self._parameters = parameters
+        log, stamp, answered = self._shared.log, waiting.stamp_ns, False
+        before = TrackCondition.of(self.tracker)
+        starts = before.status is Status.WAITING
+        try:
+            tracker = self._placed_tracker(camera)
+            posterior, likelihood = tracker.step(
+                waiting.image,
+                stamp,
+                seen.keypoints,
+                seen.prediction if isinstance(seen.prediction, PosePrediction) else None,
+                waiting.mask,
+                nobody_predicted=seen.prediction is Status.NOBODY,
+                others=seen.others,
+                depth=waiting.depth,
+            )
+            report_change(log, before, tracker, self.start.initial, stamp)
+            if waiting.depth is not None and not tracker.validity.believes('depth'):
+                log.note(
+                    'depth of something else',
+                    f'depth of {stamp} ns does not show the person where the image does: depth '
+                    'images are not used until they do; wanted depth of the same time, registered '
+                    'to the colour camera',
+                )
+            published = None
+            if posterior is not None and likelihood is not None:
+                posterior = with_depth_error(posterior, parameters.focal_length_sigma)
+                published = self._publish(tracker, waiting, posterior, likelihood)
+            elif len(self.weights):
+                self._publish_nobody(tracker, waiting)
+            if not starts and tracker.status is Status.WAITING:
+                # The track was of nobody.
+                self.robot.forget()
+            answered = True
+            self._answer_robot(waiting, tracker, posterior)
+        except (ValueError, ArithmeticError) as error:
+            text = error_line(error)
+            if not answered:
+                self._answer_robot(waiting)
+            if not starts:
+                log.fault('estimate', f'image of {stamp} ns can not be tracked: {text}')
+                return False
+            # The next image would fail in the same way, and take the same time.
+            log.fault('start', f'no track starts at the image of {stamp} ns: {text}')
+            self.restart(replace(self.start, background=None, initial=None, box=None))
+            return False
+        return published
+
+    def stale(self, silence: float) -> Iterator[Made]:
+        """Messages for a robot where no image is answered; may be called by any thread.
+
+        Args:
+            silence: time since the newest image was answered, s.
+        """
+        for made in robot_messages(self.robot, self._parameters, self._wants, silence):
+            yield made._replace(topic=topic_of(self.person, made.topic))
+
+    def _placed_tracker(self, camera: Camera) -> Tracker:
+        """The tracker, which knows gravity and the pose of the camera at the image.
+
+        Raises:
+            ValueError: no tracker can start.
+        """
+        frames, tracker = self._shared.frames, self.tracker
+        if tracker is None:
+            ground = frames.known_ground(self.start.parameters.known_ground)
+            tracker = self.tracker = self.start.tracker(camera, ground, self._background)
+            tracker.track_id = self._last_id
+        elif frames.newest:
+            seen = frames.known_ground(KnownGround())
+            assert seen.up is not None
+            tracker.set_gravity(seen.up, seen.camera_height, seen.up_sigma)
+        if (pose := frames.pose) is not None:
+            tracker.set_camera(pose.translation, pose.rotation)
+        return tracker
+
+    # Outputs.
+
+    def _wants(self, topic: str) -> bool:
+        return self._shared.wanted(topic_of(self.person, topic))
+
+    def _put_out(self, topic: str, stamp: int, message: Any) -> None:
+        self._shared.publish(topic_of(self.person, topic), stamp, message)
+
+    def _fixed_frame(self) -> FixedFrame | None:
+        """The frame that is published in; None: that of the camera, or its place is unknown."""
+        p, pose = self._parameters, self._shared.frames.pose
+        if not p.publish_in_fixed_frame or pose is None:
+            return None
+        return FixedFrame(p.fixed_frame, pose, self._turn)
+
+    def _publish(
+        self,
+        tracker: Tracker,
+        waiting: WaitingImage,
+        posterior: GaussianMixture,
+        likelihood: GaussianMixture,
+    ) -> bool:
+        p, fixed = self._parameters, self._fixed_frame()
+        starts = self.body is None or not _looks_like(tracker.body, self.body)
+        if starts:
+            self.body = tracker.body
+        if fixed is not None:
+            self._turn = fixed.turn_of(tracker.body, posterior.means[0])
+        elif p.publish_in_fixed_frame:
+            self._shared.log.fault(
+                'no pose of the camera',
+                f'the image of {waiting.stamp_ns} ns is tracked, but not published: its place '
+                f'in fixed_frame {p.fixed_frame!r} is unknown',
+            )
+            return False
+        prefix = f'{p.frame_prefix}body_{self.person}/' if self.person else p.frame_prefix
+        frames = (waiting.frame_id, prefix)
+        track = TrackedImage(
+            waiting,
+            tracker,
+            posterior,
+            likelihood,
+            p,
+            frame_prefix=prefix,
+            starts=starts,
+            describe=starts or self._described != frames,
+            fixed=fixed,
+        )
+        for topic, message in track_messages(track, self._wants):
+            self._put_out(topic, waiting.stamp_ns, message)
+        self._described = frames
+        self.weights = posterior.weights
+        return True
+
+    def _publish_nobody(self, tracker: Tracker, waiting: WaitingImage) -> None:
+        """The end of a track whose person is no longer in view."""
+        for topic, message in nobody_messages(tracker, waiting, self._parameters, self._wants):
+            self._put_out(topic, waiting.stamp_ns, message)
+        self.weights = np.empty(0)
+
+    def _answer_robot(
+        self,
+        waiting: WaitingImage,
+        tracker: Tracker | None = None,
+        posterior: GaussianMixture | None = None,
+    ) -> None:
+        """Publishes the outputs for robots.
+
+        Args:
+            tracker: after the image; None: it could not be tracked.
+            posterior: of the image; None: there is no track.
+        """
+        p, fixed = self._parameters, self._fixed_frame()
+        placed = fixed is not None or not p.publish_in_fixed_frame
+        state, seen, existence = KeepOutState.UNKNOWN, None, math.nan
+        reason = 'the image can not be tracked'
+        if tracker is not None:
+            state, existence = _STATES[tracker.status], tracker.existence_probability
+            reason = tracker.reason
+            if tracker.status is Status.WAITING and self.start.initial is not None:
+                reason = f'waiting for {self.start.wants(())}'
+            if state is KeepOutState.NOBODY and not tracker.nobody_shown:
+                # An earlier image showed that nobody is there; this one shows nothing.
+                state = KeepOutState.UNKNOWN
+            elif state is KeepOutState.TRACKING:
+                if placed and posterior is not None and not tracker.foreseen:
+                    seen = LastSeen(
+                        waiting.stamp_ns,
+                        waiting.frame_id,
+                        tracker.body,
+                        posterior,
+                        tracker.forecaster,
+                        fixed,
+                        p.keep_out_probability,
+                        p.focal_length_sigma,
+                    )
+                else:
+                    state = KeepOutState.LOST
+        number = self._last_id if tracker is None else tracker.track_id
+        frame = p.fixed_frame if p.publish_in_fixed_frame else waiting.frame_id
+        with self._shared.answering:
+            self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen, reason)
+            for made in robot_messages(self.robot, p, self._wants):
+                self._put_out(*made)
+            self._shared.answered += 1
+
+
+def _looks_like(body: Body, shown: Body) -> bool:
+    """Whether a body is the one that has been described, up to small changes of its estimate."""
+    if body.dof_names != shown.dof_names:
+        return False
+    change = np.abs(body.skeleton.lengths - shown.skeleton.lengths)
+    return bool(change.max(initial=0.0) <= RESHAPED)

@@ -1,0 +1,105 @@
+"""The pose of a person: place, heading and their covariance.
+
+geometry_msgs/PoseWithCovarianceStamped tells which way a person faces. The frame of a person has
+its origin in the pelvis, x forward, y left, z towards the head (REP 103). Its pose is that of the
+heaviest component, and the covariance is that of the mixture about it,
+
+    S = sum_k w_k (S_k + e_k e_k'),    e_k = (p_k - p_0, log R_k R_0')
+
+so that it is wide where the components disagree. Rotations turn about the fixed axes of the frame
+of the header, as the message says.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from hmt_ros.body import Body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import root_rotation_dofs
+from hmt_ros.inference import GaussianMixture
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.message_error import MessageError, check_finite
+from msg_tools.messages.message_types import MessageFactory
+from msg_tools.messages.states import pose_message, quaternions
+
+Array = NDArray[np.float64]
+
+PERSON_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+
+# Axes of the frame of a person, as columns in the frame of the pelvis: x right, y forward, z up.
+_PERSON_IN_PELVIS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+class PersonPose(NamedTuple):
+    """Pose of a person.
+
+    Attributes:
+        position: (3,) of the pelvis, m.
+        rotation: (3, 3) from the frame of the person.
+        covariance: (6, 6) of the position, m, and of the rotation about fixed axes, rad.
+    """
+
+    position: Array
+    rotation: Array
+    covariance: Array
+
+    def seen_from(self, rotation: Array, translation: Array) -> PersonPose:
+        """The pose in another frame, p' = R p + t with rotation (3, 3), translation (3,), m."""
+        both = np.zeros((6, 6))
+        both[:3, :3] = both[3:, 3:] = rotation
+        return PersonPose(
+            rotation @ self.position + translation,
+            rotation @ self.rotation,
+            both @ self.covariance @ both.T,
+        )
+
+
+def person_pose(body: Body, mixture: GaussianMixture) -> PersonPose:
+    """The pose of the person in a mixture over poses of a body.
+
+    Raises:
+        MessageError: a mixture without components.
+    """
+    if not len(mixture):
+        raise MessageError('a mixture without components has no pose of a person')
+    root = root_rotation_dofs(body.skeleton)
+    frames = forward(body.skeleton, mixture.means)
+    places = frames.origins[0].T
+    turns = frames.columns[0].transpose(2, 1, 0) @ _PERSON_IN_PELVIS
+    # How place and rotation of the root move with its degrees of freedom.
+    jacobians = np.zeros((len(mixture), 6, body.dimension))
+    jacobians[:, :3, :3] = frames.axes[:3].transpose(2, 1, 0)
+    jacobians[:, 3:, root] = frames.axes[root].transpose(2, 1, 0)
+    best = int(np.argmax(mixture.weights))
+    away = Rotation.from_matrix(turns @ turns[best].T).as_rotvec()
+    errors = np.concatenate([places - places[best], away], axis=1)
+    own = jacobians @ mixture.covariances @ jacobians.swapaxes(1, 2)
+    weights = mixture.weights / mixture.weights.sum()
+    covariance = np.einsum('k,kij->ij', weights, own + errors[:, :, None] * errors[:, None, :])
+    return PersonPose(places[best], turns[best], 0.5 * (covariance + covariance.T))
+
+
+def person_pose_message(
+    messages: MessageFactory, pose: PersonPose, stamp_ns: int, frame_id: str
+) -> Any:
+    """geometry_msgs/PoseWithCovarianceStamped.
+
+    Raises:
+        MessageError: numbers that are not finite.
+    """
+    for values in pose:
+        check_finite(values, 'person_pose')
+    return messages.create(
+        PERSON_POSE,
+        header=header_message(messages, stamp_ns, frame_id),
+        pose=messages.create(
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=pose_message(messages, pose.position, quaternions(pose.rotation[None])[0]),
+            covariance=pose.covariance.ravel(),
+        ),
+    )
