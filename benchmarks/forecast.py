@@ -114,9 +114,9 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
 
 def _mean(scores: list[dict[str, dict[str, float]]], name: str) -> dict[str, float]:
-    return {
-        what: float(np.nanmean([one[name][what] for one in scores])) for what in ('mm', 'region')
-    }
+    known = [one[name] for one in scores if np.isfinite(one[name]['mm'])]
+    mean = {x: [one[x] for one in known] or [np.nan] for x in ('mm', 'region')}
+    return {what: float(np.mean(values)) for what, values in mean.items()}
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
