@@ -30,81 +30,76 @@ class Rates:
 
     Attributes:
         name: of the messages.
-        dropped, faults, lost: of the period.
+        change: of the counts in the period.
         computing: time that a message takes, in words.
     """
 
     def __init__(self, name: str, done: str) -> None:
-        self.dropped = 0
-        self.faults = 0
-        self.lost = 0
-        self.computing = 'computing takes too long'
         self.name, self._done = name, done
-        self._received = self._used = 0.0
-        self._latencies: list[float] = []
-        self._stages, self._waiting = (math.nan, math.nan), 0
+        self.computing = 'computing takes too long'
         self._counts: Counter[str] = Counter()
-        self._began = time.monotonic()
+        self.change: Counter[str] = Counter()
+        self._durations: list[Duration] = []
+        self._waiting, self._seconds, self._began = 0, 1.0, time.monotonic()
 
-    def next_period(
-        self, counts: Counter[str], latencies: list[float], durations: list[Duration], waiting: int
-    ) -> None:
+    def next_period(self, counts: Counter[str], durations: list[Duration], waiting: int) -> None:
         """Ends a period.
 
         Args:
             counts: 'received', 'dropped', 'faults', 'lost' and those used, since the start.
         """
-        self._waiting, self._stages = waiting, (math.nan, math.nan)
-        if durations:
-            mean, publishing = (1e3 * sum(x) / len(durations) for x in zip(*durations, strict=True))
-            self._stages = mean - publishing, publishing
-            self.computing = f'computing takes {mean:.0f} ms for one of the {self.name}'
         now = time.monotonic()
+        self._seconds, self._began = max(now - self._began, 1e-3), now
         # A node that was configured anew counts anew.
-        change = counts - self._counts
-        duration = max(now - self._began, 1e-3)
-        self._received = change['received'] / duration
-        self._used = change[self._done] / duration
-        self.dropped, self.faults = change['dropped'], change['faults']
-        self.lost = change['lost']
-        self._latencies, self._counts, self._began = latencies, counts, now
+        self.change, self._counts = counts - self._counts, counts
+        self._waiting, self._durations = waiting, durations
+        if durations:
+            mean = self._means().whole
+            self.computing = f'computing takes {mean:.0f} ms for one of the {self.name}'
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
-        known = self._latencies or [math.nan]
+        latency, whole, publishing = self._means()
+        largest = max((one.latency for one in self._durations), default=math.nan)
         return [
-            (f'{self.name} received a second', f'{self._received:.1f}'),
-            (f'{self.name} {self._done} a second', f'{self._used:.1f}'),
-            ('latency, mean, ms', f'{1e3 * sum(known) / len(known):.1f}'),
-            ('latency, largest, ms', f'{1e3 * max(known):.1f}'),
-            ('estimating, mean, ms', f'{self._stages[0]:.1f}'),
-            ('publishing, mean, ms', f'{self._stages[1]:.1f}'),
+            (f'{self.name} received a second', f'{self._rate("received"):.1f}'),
+            (f'{self.name} {self._done} a second', f'{self._rate(self._done):.1f}'),
+            ('latency, mean, ms', f'{latency:.1f}'),
+            ('latency, largest, ms', f'{1e3 * largest:.1f}'),
+            ('estimating, mean, ms', f'{whole - publishing:.1f}'),
+            ('publishing, mean, ms', f'{publishing:.1f}'),
             ('messages waiting', str(self._waiting)),
         ]
 
     def line(self) -> str:
         """The rates as a line for the console."""
-        latency = ''
-        if self._latencies:
-            mean = 1e3 * sum(self._latencies) / len(self._latencies)
-            latency = f', latency {mean:.0f} ms'
-        dropped = f', {self.dropped} dropped' if self.dropped else ''
+        dropped = self.change['dropped']
         return (
-            f'{self._received:.1f} {self.name} a second, {self._used:.1f} {self._done}'
-            f'{latency}{dropped}'
+            f'{self._rate("received"):.1f} {self.name} a second, '
+            f'{self._rate(self._done):.1f} {self._done}'
+            f'{f", latency {self._means().latency:.0f} ms" if self._durations else ""}'
+            f'{f", {dropped} dropped" if dropped else ""}'
         )
+
+    def _rate(self, what: str) -> float:
+        return self.change[what] / self._seconds
+
+    def _means(self) -> Duration:
+        """Means of the period, ms."""
+        known = self._durations or [Duration(math.nan, math.nan, math.nan)]
+        return Duration(*(1e3 * sum(each) / len(known) for each in zip(*known, strict=True)))
 
 
 def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -> str:
     """Trouble of the last period, the reason first; '' if there was none."""
     name, why = rates.name, '; '.join(silent.texts.values())
-    if rates.dropped:
+    if rates.change['dropped']:
         held_up = f'waits for {state.held_up}' if state.held_up else rates.computing
-        return f'{why or held_up}; late: {rates.dropped} {name} dropped in a second'
-    if rates.faults:
+        return f'{why or held_up}; late: {rates.change["dropped"]} {name} dropped in a second'
+    if rates.change['faults']:
         return state.last_fault
-    if rates.lost:
-        return f'{rates.lost} messages lost on their way in a second'
+    if rates.change['lost']:
+        return f'{rates.change["lost"]} messages lost on their way in a second'
     if silent.silence:
         return f'no {name} for {silent.silence:.0f} s; {why}'.removesuffix('; ')
     if state.wants:
