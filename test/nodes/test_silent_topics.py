@@ -58,7 +58,8 @@ def silent(transport, *published, name='/image'):
             'raw',
             [(f'/{side}/{what}', RAW) for side in ('left', 'right') for what in ('image', 'mono')],
             '; nobody publishes it; there are /left/image (sensor_msgs/Image), /right/image '
-            '(sensor_msgs/Image), /right/mono (sensor_msgs/Image): remap with -r image:=/left/image',
+            '(sensor_msgs/Image), /right/mono (sensor_msgs/Image): remap with -r '
+            'image:=/left/image',
         ),
     ],
 )
