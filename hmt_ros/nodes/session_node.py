@@ -129,7 +129,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._outputs: dict[str, Any] = {}
         self._handled: Any = None
         self._offered: list[Any] = []
-        self._threads = EstimatingThreads() if beside is None else beside._threads
+        self._threads: EstimatingThreads = (
+            EstimatingThreads() if beside is None else beside._threads
+        )
         # The nodes of this process, in the order of their turns.
         self._nodes: list[SessionNode[Any, Any]] = [] if beside is None else beside._nodes
         self._local_names: dict[str, str] = {}
