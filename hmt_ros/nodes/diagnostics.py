@@ -6,7 +6,6 @@ Without these events a publisher of an incompatible quality of service goes unno
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -19,6 +18,8 @@ from rclpy.qos import qos_policy_name_from_kind
 from hmt_ros.nodes.estimating_thread import Duration
 from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.sessions.session import SessionState
+
+_LOST = 'messages lost'
 
 
 class Rates:
@@ -108,25 +109,24 @@ def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -
 
 
 class MiddlewareEvents:
-    """Counts lost messages and partners that do not fit, and warns of the first of each kind."""
+    """Counts lost messages and partners that do not fit, and warns of the first of each kind.
+
+    Callbacks and `forget` are for the thread of the executor, the others for any.
+    """
 
     def __init__(self, warn: Callable[[str], None]) -> None:
         self._warn = warn
         self._counts: Counter[str] = Counter()
-        self._lost: Counter[str] = Counter()
+        # That the last partner which does not fit has another of, by partners and topic.
         self._policies: dict[str, str] = {}
-        # The thread that estimates makes diagnostics, too.
-        self._lock = threading.Lock()
 
     def of_subscription(self, topic: str) -> SubscriptionEventCallbacks:
         """Callbacks for a subscription to a topic, by its full name."""
 
         def lost(event: Any) -> None:
             count = event.total_count_change
-            with self._lock:
-                self._lost[topic] += count
             text = f'{topic}: {count} messages were lost on their way'
-            self._count(f'messages lost of {topic}', count, text)
+            self._count(f'{_LOST} of {topic}', count, text)
 
         callbacks = self._misfits(
             topic,
@@ -153,9 +153,7 @@ class MiddlewareEvents:
         wants, than, has = words
 
         def incompatible(event: Any) -> None:
-            policy = _policy(event)
-            with self._lock:
-                self._policies[f'{partners} {topic}'] = policy
+            policy = self._policies[f'{partners} {topic}'] = _policy(event)
             self._count(
                 f'{partners} {topic} with another {policy}',
                 event.total_count_change,
@@ -170,17 +168,12 @@ class MiddlewareEvents:
 
         return {'incompatible_qos': incompatible, 'incompatible_type': other_type}
 
-    def refused_policy(self, topic: str) -> str:
-        """The policy of the last publisher that did not fit; '' where all fit."""
-        with self._lock:
-            return self._policies.get(f'publishers of {topic}', '')
-
     def deaf_topic(self, subscriptions: Iterable[Any]) -> str:
         """A topic whose publishers all have a quality of service that does not fit, and why."""
         try:
             for subscription in list(subscriptions):
                 topic = subscription.topic_name
-                policy = self.refused_policy(topic)
+                policy = self._policies.get(f'publishers of {topic}')
                 if policy and not subscription.get_publisher_count():
                     return f'{topic}: publishers offer another {policy} than is asked for'
         except InvalidHandle:
@@ -191,26 +184,22 @@ class MiddlewareEvents:
     @property
     def lost(self) -> int:
         """Number of messages lost so far, over all topics."""
-        with self._lock:
-            return self._lost.total()
+        counts = dict(self._counts)
+        return sum(count for what, count in counts.items() if what.startswith(_LOST))
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
-        with self._lock:
-            counts = [(what, str(count)) for what, count in sorted(self._counts.items())]
-        return [('messages lost', str(self.lost)), *counts]
+        counts = sorted(dict(self._counts).items())
+        return [(_LOST, str(self.lost)), *((what, str(count)) for what, count in counts)]
 
     def forget(self) -> None:
         """Forgets the publishers that did not fit; those that still exist will be found again."""
-        with self._lock:
-            self._policies.clear()
+        self._policies.clear()
 
     def _count(self, what: str, count: int, text: str) -> None:
-        with self._lock:
-            first = what not in self._counts
-            self._counts[what] += count
-        if first:
+        if what not in self._counts:
             self._warn(f'{text} (more of the kind are counted in /diagnostics)')
+        self._counts[what] += count
 
 
 def _policy(event: Any) -> str:
