@@ -17,7 +17,8 @@ from benchmarks.clips import table
 from benchmarks.runs import INPUTS, KEYPOINTS, USUAL_RATE, Record, Run, run_all
 from benchmarks.tracking_means import GROUPS, OF_CHOSEN, group_of
 from benchmarks.tracking_scores import interval, scores_of
-from hmt_ros.tracking.settings import ACCURATE_BUDGET, LIVE_BUDGET
+from hmt_ros.sessions.filter_parameters import LIVE_BUDGET
+from hmt_ros.tracking.settings import ACCURATE_BUDGET
 
 Array = NDArray[Any]
 PROFILES = {'accurate': ACCURATE_BUDGET, 'live': LIVE_BUDGET}
