@@ -1,10 +1,9 @@
 """How poses are tracked: the settings of a tracker, and the numbers of its model.
 
 Settings are what users choose. The numbers below are the same for all of them. Each has its unit
-and its source: `physical` follows from people or from sensors, `chosen` was set by hand and kept on
-the clips of docs/tracking.md, `KJS` and other names are papers. Numbers of a concept of a lower
-layer stand with it: the person in `body`, silhouettes, colours and keypoints in `image`, errors of
-cues in `inference.error_model`.
+and its source: `Physical` follows from people or from sensors, `Chosen` was set by hand, by tracked
+clips. Numbers of a concept of a lower layer stand with it: the person in `body`, silhouettes,
+colours and keypoints in `image`, errors of cues in `inference.error_model`.
 """
 
 from __future__ import annotations
