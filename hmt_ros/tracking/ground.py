@@ -32,17 +32,13 @@ from hmt_ros.inference.error_model import seconds
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.settings import (
-    AXIS_DEPTH_SIGMA,
     AXIS_SIGMA,
-    FIRST_LEVEL_SIGMA,
     GIVEN_UP_SIGMA,
     HEAD_DOWN_IMAGES,
-    HEAD_UP_COSINE,
     LEVEL_QUANTILE,
     LEVEL_SIGMA,
     LEVEL_TIME,
     LOOK_NATS,
-    MAX_TILT,
     MEASURED_SIGMA,
     RIGHT_VERTICAL_NATS,
     TURN_NOISE,
@@ -236,8 +232,7 @@ class GroundEstimator:
         if self.known.up is not None:
             trunk = keypoints.trunk
             length = max(float(np.linalg.norm(trunk)), np.finfo(np.float64).eps)
-            cosine = float(trunk @ self.known.up[:2]) / length
-            self._by_keypoints += cosine if abs(cosine) > HEAD_UP_COSINE else 0.0
+            self._by_keypoints += float(trunk @ self.known.up[:2]) / length
             self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
@@ -316,17 +311,18 @@ class GroundEstimator:
             return
         ray = place / np.linalg.norm(place)
         along = np.outer(ray, ray)
-        error = AXIS_SIGMA**2 * (AXES - along) + AXIS_DEPTH_SIGMA**2 * along
+        error = AXIS_SIGMA**2 * (AXES - along) + (2.0 * AXIS_SIGMA) ** 2 * along
         error = error * max(VERTICAL_TIME / (resting * dt), 1.0)
         covariance = self._covariance + UP_DRIFT**2 * dt * AXES
         gain = covariance @ np.linalg.inv(covariance + error)
         mean = self._mean + gain @ (axis / length - self._mean)
         mean = mean / np.linalg.norm(mean)
         angle = float(np.arccos(np.clip(mean @ IMAGE_UP, -1.0, 1.0)))
-        if angle > MAX_TILT:
+        most = 2.0 * UP_SIGMA
+        if angle > most:
             aside = mean - IMAGE_UP * (mean @ IMAGE_UP)
             aside = aside / np.linalg.norm(aside)
-            mean = np.cos(MAX_TILT) * IMAGE_UP + np.sin(MAX_TILT) * aside
+            mean = np.cos(most) * IMAGE_UP + np.sin(most) * aside
         self._mean = mean
         values, vectors = np.linalg.eigh(covariance - gain @ covariance)
         values = np.clip(values, AXIS_SIGMA**2, UP_SIGMA**2)
@@ -360,7 +356,7 @@ class GroundEstimator:
             return None, np.inf
         levels = np.array([level for _, level in self._levels])
         low, high = np.quantile(levels, [0.5, LEVEL_QUANTILE])
-        few = FIRST_LEVEL_SIGMA / np.sqrt(len(levels))
+        few = 2.0 * LEVEL_SIGMA / np.sqrt(len(levels))
         return float(high), float(np.sqrt(LEVEL_SIGMA**2 + (high - low) ** 2 + few**2))
 
 

@@ -30,8 +30,8 @@ from hmt_ros.inference.error_model import (
 )
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.inference.motion_states import PredictedStates, fused
 from hmt_ros.tracking.hypotheses import Modes, Optimised
-from hmt_ros.tracking.motion_states import PredictedStates, fused
 from hmt_ros.tracking.posterior import ImageFit, Posterior, free_covariances
 from hmt_ros.tracking.settings import GATE_SIGMAS
 from hmt_ros.tracking.shape_estimation import ShapeEstimate

@@ -102,9 +102,7 @@ class LimbSearch:
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: plan.refined]]
         self.posterior.evaluations += len(samples) + plan.refined * s.iterations
-        return term.minimise(
-            best, step_scale=0.4, damping=1.0, max_iterations=s.iterations, tolerance=0.05
-        ).x
+        return term.minimise(best, max_iterations=s.iterations, tolerance=0.05).x
 
     def _draw(self, angles: Array, block: Array, n: int, rng: np.random.Generator) -> Array:
         """N samples from the mode, from it stretched, and from the body's prior: a third each."""
@@ -180,7 +178,7 @@ class KinematicJumps:
         ).chosen
         poses, members = poses[kept], members[kept]
         # A chain that jumped is expected where it landed, the rest where it was predicted.
-        changed = np.abs(poses - base.x[members]) > 1e-9
+        changed = np.abs(poses - base.x[members]) > np.sqrt(np.finfo(np.float64).eps)
         return Hypotheses(
             poses,
             sources.log_weights[members],
