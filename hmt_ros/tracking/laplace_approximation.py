@@ -33,7 +33,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.inference.motion_states import PredictedStates, fused
 from hmt_ros.tracking.hypotheses import Modes, Optimised
 from hmt_ros.tracking.posterior import ImageFit, Posterior, free_covariances
-from hmt_ros.tracking.settings import GATE_SIGMAS
+from hmt_ros.tracking.settings import MAX_MODE_SHIFT
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.weighting import at_least, normalised
 
@@ -142,7 +142,7 @@ def likelihood_modes(
     covariances = fit.covariances
     gradient = np.where(fit.free, fit.energy.derivatives()[0], 0.0)
     step = -np.einsum('kij,kj->ki', covariances, gradient)
-    limit = GATE_SIGMAS * np.sqrt(np.einsum('kii->ki', modes.covariances))
+    limit = MAX_MODE_SHIFT * np.sqrt(np.einsum('kii->ki', modes.covariances))
     step = np.clip(step, -limit, limit)
     means = np.clip(poses + step, body.lower, body.upper)
     volumes = 0.5 * np.linalg.slogdet(covariances)[1]

@@ -48,6 +48,9 @@ MAX_JOINT_DISTANCE = 0.3
 TRANSITION_SPREAD, TRANSITION_TAILS = 0.01, 2.0
 # A mode ends where all its continuations are less likely than exp(-c); c in nats. Chosen.
 END_NATS = 5.0
+# Largest shift of a mode of the posterior to that of the likelihood, in standard deviations of the
+# posterior: the likelihood alone may be flat. Chosen.
+MAX_MODE_SHIFT = 5.0
 # Standard deviations beyond which a measurement is not explained, and a value not believed. Chosen.
 GATE_SIGMAS = 4.0
 
