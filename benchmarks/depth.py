@@ -169,9 +169,9 @@ def follow(made: DepthClip, seed: int, *, use_depth: bool) -> Record:
     for stamp, image, depth in zip(clip.stamps, clip.images, made.depths, strict=True):
         posterior, _ = tracker.step(image, stamp, depth=depth if use_depth else None)
         assert posterior is not None
-        bodies.append(tracker.body)
+        bodies.append(tracker.estimate.body)
         mixtures.append(posterior)
-        points.append(tracker.point_estimate)
+        points.append(tracker.estimate.point_estimate)
     nothing = [0.0] * len(bodies)
     return recorded(clip, bodies, mixtures, points, clip.stamps, nothing, nothing, seed)
 

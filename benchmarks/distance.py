@@ -65,7 +65,9 @@ def measured(folder: Path, case: str) -> list[tuple[float, float]] | None:
 
 def _distance(tracker: Tracker, clip: Clip, stamp: int) -> tuple[float, float]:
     """Relative error of the distance, and its published deviation."""
-    (mixture,) = joint_mixtures(tracker.body, [tracker.posterior], HIPS, origin=())
+    (mixture,) = joint_mixtures(
+        tracker.estimate.body, [tracker.estimate.posterior], HIPS, origin=()
+    )
     names = clip.truth.joint_names
     true = float(np.mean([clip.truth.joints[stamp][names.index(name)][2] for name in HIPS]))
     own = float(mixture.joints[0, :, 2].mean())

@@ -88,8 +88,8 @@ def said_of(folder: Path, inputs: str) -> list[Said]:
             continue
         rows = [clip.truth.joint_names.index(name) for name in (ORIGIN, *names)]
         true = clip.truth.joints[stamp][rows]
-        joints = tracker.body.joint_positions(posterior.means)[:, which]
-        jacobians = tracker.body.joint_jacobians(posterior.means)[:, which]
+        joints = tracker.estimate.body.joint_positions(posterior.means)[:, which]
+        jacobians = tracker.estimate.body.joint_jacobians(posterior.means)[:, which]
         for relative in (True, False):
             share = float(relative)
             moved = (jacobians - share * jacobians[:, :1]) @ posterior.cholesky()[:, None]

@@ -123,10 +123,10 @@ def scores_of(folder: Path, scene: Scene, limit: int | None = None) -> dict[str,
         if any(start <= one.index < end for start, end in scene.empty):
             empty[0] += one.tracked
             empty[1] += 1
-        if not one.tracked or one.tracker.status is not Status.TRACKING:
+        if not one.tracked or one.tracker.estimate.status is not Status.TRACKING:
             before = None
             continue
-        body, pose = one.tracker.body, one.tracker.modes.poses[:1]
+        body, pose = one.tracker.estimate.body, one.tracker.estimate.modes.poses[:1]
         joints = dict(zip(body.joint_names, body.joint_positions(pose)[0], strict=True))
         sizes.append(float(sum(body.segment_lengths.values())))
         if any(start <= one.index < end for start, end in scene.whole):
@@ -137,7 +137,7 @@ def scores_of(folder: Path, scene: Scene, limit: int | None = None) -> dict[str,
             dt = 1e-9 * (one.stamp - before[0])
             speeds += [
                 float(np.linalg.norm(feet[foot] - before[1][foot])) / dt
-                for foot, probability in one.tracker.contacts.items()
+                for foot, probability in one.tracker.estimate.contacts.items()
                 if probability > STANDS
             ]
         before = one.stamp, feet
@@ -222,7 +222,7 @@ def _cell(
     true: Array | None,
 ) -> NDArray[np.uint8]:  # fmt: skip
     """A column of a sheet: the image, the side view and the view from above."""
-    body, modes = tracker.body, tracker.modes
+    body, modes = tracker.estimate.body, tracker.estimate.modes
     weights = np.exp(modes.log_weights - modes.log_weights.max())
     drawn: list[tuple[Array, tuple[str, ...], Any, int]] = [
         (joints, body.joint_names, OTHERS, 1)
@@ -243,7 +243,7 @@ def _cell(
     matrix = np.array([[1.0, 0.0, half - middle[0]], [0.0, 1.0, half - middle[1]]])
     matrix *= CELL / (2.0 * half)
     cells = [cv2.warpAffine(picture, matrix, (CELL, CELL), flags=cv2.INTER_AREA)]
-    up = tracker.ground.up
+    up = tracker.estimate.ground.up
     away = np.array([0.0, 0.0, 1.0]) - up[2] * up
     away = away / np.linalg.norm(away)
     right = np.cross(up, away)

@@ -264,15 +264,15 @@ def follow(
             tracker.set_gravity(clip.ups[stamp])
         posterior, _ = tracker.step(image, stamp, seen, prediction)
         spent, cpu_spent = time.perf_counter() - start, time.process_time() - cpu_start
-        statuses.append(tracker.status.value)
+        statuses.append(tracker.estimate.status.value)
         if posterior is not None:
-            later += lagged.update(stamp, posterior, tracker.origins)
+            later += lagged.update(stamp, posterior, tracker.estimate.origins)
         if posterior is not None and stamp in clip.truth.joints:
-            bodies.append(tracker.body)
+            bodies.append(tracker.estimate.body)
             mixtures.append(posterior)
-            points.append(tracker.point_estimate)
+            points.append(tracker.estimate.point_estimate)
             stamps.append(stamp)
-            evaluations.append(float(tracker.evaluations))
+            evaluations.append(float(tracker.estimate.evaluations))
             seconds.append(spent)
             cpu_seconds.append(cpu_spent)
     record = recorded(clip, bodies, mixtures, points, stamps, evaluations, seconds, seed)

@@ -270,12 +270,12 @@ def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
             result.append(
                 Seen(
                     stamp,
-                    tracker.body,
+                    tracker.estimate.body,
                     posterior,
                     likelihood,
-                    tracker.likelihood_errors,
-                    tracker.shape_covariance,
-                    tracker.point_estimate,
+                    tracker.estimate.likelihood.errors,
+                    tracker.estimate.likelihood.shape_covariance,
+                    tracker.estimate.point_estimate,
                 )
             )
     return result

@@ -85,9 +85,9 @@ def _costs(clip: Clip, settings: TrackerSettings) -> dict[str, Any]:
             tracker.step(image, stamp)
             cpu.append(time.process_time() - start)
             wall.append(time.perf_counter() - began)
-            kept.append(len(tracker.modes))
-            evaluations.append(tracker.evaluations)
-            poses.append(tracker.modes.poses)
+            kept.append(len(tracker.estimate.modes))
+            evaluations.append(tracker.estimate.evaluations)
+            poses.append(tracker.estimate.modes.poses)
     count = len(cpu) - STARTING
     vision = 1e3 * clock.seconds.get('vision', 0.0) / count
     mean = 1e3 * float(np.mean(cpu[STARTING:]))

@@ -272,10 +272,12 @@ def tracked(film: Film, count: int, seed: int) -> dict[str, float]:
         posterior, _ = tracker.step(image, i * 100_000_000)
         assert posterior is not None
         mixtures.append(posterior)
-        evaluations.append(tracker.evaluations)
+        evaluations.append(tracker.estimate.evaluations)
     where = film.body.skeleton.joint_index((ORIGIN, *EVALUATED_JOINTS))
     true = film.body.joint_positions(film.poses)[:, where]
-    summary = score(joint_mixtures(tracker.body, mixtures), true[:, 1:] - true[:, :1]).summary()
+    summary = score(
+        joint_mixtures(tracker.estimate.body, mixtures), true[:, 1:] - true[:, :1]
+    ).summary()
     return {
         'best_mm': summary['best_mm'],
         'heaviest_mm': summary['heaviest_mm'],

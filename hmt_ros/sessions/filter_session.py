@@ -269,7 +269,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                 depth=waiting.depth,
             )
             report_change(self._log, before, self._tracker, self.start.initial, stamp)
-            if waiting.depth is not None and not self._tracker.validity.believes('depth'):
+            if waiting.depth is not None and not self._tracker.estimate.validity.believes('depth'):
                 self._log.note(
                     Fault.DEPTH_ELSEWHERE,
                     f'depth of {stamp} ns does not show the person where the image does: depth '
@@ -282,7 +282,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             elif len(self._weights):
                 self._publish_nobody(self._tracker, waiting)
             answered = True
-            if not starts and self._tracker.status is Status.WAITING:
+            if not starts and self._tracker.estimate.status is Status.WAITING:
                 # The track was of nobody.
                 self.robot.forget()
             self._tell_robot(waiting, self._tracker, posterior)
@@ -306,9 +306,9 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
     ) -> None:
         p = self.parameters
         shown = self._shown_body
-        starts = shown is None or not _looks_like(tracker.body, shown)
+        starts = shown is None or not _looks_like(tracker.estimate.body, shown)
         if starts:
-            self._shown_body = tracker.body
+            self._shown_body = tracker.estimate.body
         fixed = None
         if p.publish_in_fixed_frame:
             if self.frames.pose is None:
@@ -319,7 +319,7 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                 )
                 return
             fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
-            self._turn = fixed.turn_of(tracker.body, posterior.means[0])
+            self._turn = fixed.turn_of(tracker.estimate.body, posterior.means[0])
         shown_frames = (waiting.frame_id, p.frame_prefix)
         track = TrackedImage(
             waiting,
@@ -355,18 +355,22 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
             frame, placed = p.fixed_frame, self.frames.pose is not None
             if self.frames.pose is not None:
                 fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
-        state = KeepOutState.UNKNOWN if tracker is None else _STATES[tracker.status]
-        if state is KeepOutState.NOBODY and tracker is not None and not tracker.nobody_shown:
+        state = KeepOutState.UNKNOWN if tracker is None else _STATES[tracker.estimate.status]
+        if (
+            state is KeepOutState.NOBODY
+            and tracker is not None
+            and not tracker.estimate.nobody_shown
+        ):
             # An earlier image showed that nobody is there; this one shows nothing.
             state = KeepOutState.UNKNOWN
         if state is KeepOutState.TRACKING and tracker is not None:
-            if placed and posterior is not None and not tracker.foreseen:
+            if placed and posterior is not None and not tracker.estimate.foreseen:
                 seen = LastSeen(
                     waiting.stamp_ns,
                     waiting.frame_id,
-                    tracker.body,
+                    tracker.estimate.body,
                     posterior,
-                    tracker.forecaster,
+                    tracker.estimate.forecaster,
                     fixed,
                     p.keep_out_probability,
                     p.focal_length_sigma,
@@ -375,9 +379,9 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
                 state = KeepOutState.LOST
         number, existence, reason = self._tracks, math.nan, 'the image can not be tracked'
         if tracker is not None:
-            number, existence = tracker.track_id, tracker.existence_probability
-            reason = tracker.reason
-            if tracker.status is Status.WAITING and self.start.initial is not None:
+            number, existence = tracker.track_id, tracker.estimate.existence_probability
+            reason = tracker.estimate.reason
+            if tracker.estimate.status is Status.WAITING and self.start.initial is not None:
                 reason = f'waiting for {self.start.wants(())}'
         with self._telling:
             self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen, reason)
@@ -404,25 +408,27 @@ class FilterSession(TrackingSession[FilterParameters, FilterState]):
     def _present_state(self) -> FilterState:
         tracker = self._tracker if len(self._weights) else None
         silhouettes = None if self._tracker is None else self._tracker.silhouettes
-        source = None if self._tracker is None else self._tracker.started_from
+        source = None if self._tracker is None else self._tracker.estimate.started_from
         return FilterState(
             *self._status_and_wants(),
             **self._totals(),
             body=self._shown_body,
             modes=len(self._weights),
-            misfit=math.nan if tracker is None else tracker.misfit,
-            evaluations=0 if tracker is None else tracker.evaluations,
+            misfit=math.nan if tracker is None else tracker.estimate.misfit,
+            evaluations=0 if tracker is None else tracker.estimate.evaluations,
             background='unknown' if silhouettes is None else silhouettes.known,
             doubted=TrackCondition.of(self._tracker).doubted,
             moved=silhouettes is not None and silhouettes.watch.moved,
             track_id=self._tracks if self._tracker is None else self._tracker.track_id,
-            existence=math.nan if self._tracker is None else self._tracker.existence_probability,
+            existence=math.nan
+            if self._tracker is None
+            else self._tracker.estimate.existence_probability,
             started_from='' if source is None else source.value,
-            beliefs={} if tracker is None else tracker.validity.shown,
+            beliefs={} if tracker is None else tracker.estimate.validity.shown,
         )
 
     def _status(self) -> tuple[str, str]:
-        status = Status.WAITING if self._tracker is None else self._tracker.status
+        status = Status.WAITING if self._tracker is None else self._tracker.estimate.status
         wants = self.start.wants(self.parameters.sources) if status is Status.WAITING else ''
         return status.value, wants
 

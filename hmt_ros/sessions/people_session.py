@@ -338,8 +338,10 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
             return hull(person.place.sighting, shape)
         shift = person.place.shift(stamp)
         if one is not None:
-            pixels = camera.project(tracker.body.joint_positions(tracker.modes.poses[:1]))[0]
-            names = tracker.body.joint_names
+            pixels = camera.project(
+                tracker.estimate.body.joint_positions(tracker.estimate.modes.poses[:1])
+            )[0]
+            names = tracker.estimate.body.joint_names
             seen = Sighting(dict(zip(names, pixels, strict=True)), one.sighting.corners)
             shift = np.nan_to_num(np.median(seen.shifts_to(one.sighting), axis=0))
         area = person.session.area(camera, shift)
@@ -360,11 +362,11 @@ class PeopleSession(TrackingSession[PeopleParameters, PeopleState]):
             tracker = person.session.tracker
             if tracker is None or not person.session.begun:
                 continue
-            names, pose = tracker.body.joint_names, tracker.point_estimate[None]
-            pixels = camera.project(tracker.body.joint_positions(pose))[0]
+            names, pose = tracker.estimate.body.joint_names, tracker.estimate.point_estimate[None]
+            pixels = camera.project(tracker.estimate.body.joint_positions(pose))[0]
             unknown = np.full((len(names), 2, 2), np.nan)
             keypoints = Keypoints(names, pixels, unknown, np.ones(len(names)))
-            box = region_of(tracker.body, camera, pose, margin=0.0)
+            box = region_of(tracker.estimate.body, camera, pose, margin=0.0)
             people.append(DetectedPerson(person.name, keypoints, box))
         stamp, frame = waiting.stamp_ns, waiting.frame_id
         self._publish(PEOPLE, stamp, people_message(self._messages, people, stamp, frame))

@@ -100,12 +100,15 @@ class PersonSession(FilterSession):
     @property
     def begun(self) -> bool:
         """Whether there is a track."""
-        return self._tracker is not None and self._tracker.status in (Status.TRACKING, Status.LOST)
+        return self._tracker is not None and self._tracker.estimate.status in (
+            Status.TRACKING,
+            Status.LOST,
+        )
 
     @property
     def ended(self) -> bool:
         """Whether the person whom the track was about is not in view any more."""
-        return self._tracker is not None and self._tracker.status is Status.NOBODY
+        return self._tracker is not None and self._tracker.estimate.status is Status.NOBODY
 
     def start_in(self, box: Box) -> None:
         """The next image starts the track in a box, px, unless other inputs tell more."""
@@ -136,10 +139,10 @@ class PersonSession(FilterSession):
         if not self.begun:
             return None
         assert self._tracker is not None
-        modes = self._tracker.modes
+        modes = self._tracker.estimate.modes
         result = np.zeros((camera.height, camera.width), dtype=np.bool_)
         for pose in modes.poses[modes.log_weights > -LIKELY]:
-            result |= covered(self._tracker.body, camera, pose)
+            result |= covered(self._tracker.estimate.body, camera, pose)
         return result if shift is None else moved(result, shift)
 
     @property
@@ -148,12 +151,12 @@ class PersonSession(FilterSession):
         if not self.begun:
             return np.inf
         assert self._tracker is not None
-        return float(self._tracker.modes.poses[0, 2])
+        return float(self._tracker.estimate.modes.poses[0, 2])
 
     @property
     def body(self) -> Body:
         """The person, as far as it is known."""
-        return self.start.body if self._tracker is None else self._tracker.body
+        return self.start.body if self._tracker is None else self._tracker.estimate.body
 
     def stale(self, silence: float, answered: int) -> list[Output]:
         """See `TrackingSession`."""

@@ -53,7 +53,7 @@ from hmt_ros.tracking.initialisation import (
 )
 from hmt_ros.tracking.keypoint_evidence import FEWEST_KEYPOINTS, shows_a_part, suffices
 from hmt_ros.tracking.person_shape import looks_like_person
-from hmt_ros.tracking.proposals import PosePrediction
+from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.start_depth import depths_of, moved_to_depth
 from hmt_ros.tracking.subject import Subject
 from hmt_ros.tracking.view import View
@@ -113,28 +113,22 @@ class Shown:
 
     Attributes:
         view: of the image.
-        stamp: of the image, ns.
         model: of a person; a subject's lengths replace the model's.
         body: of the poses of a mixture.
         camera: that sees the person.
         upright: gravity; None: unknown.
         given: subject or mixture that the track starts from; None: the images start it.
         box: (left, top, right, bottom) of the person, px; None: unknown.
-        prediction: by the image, if any.
-        masked: whether the silhouette is a segmenter's.
         observed: makes the observation of the image.
     """
 
     view: View
-    stamp: int
     model: Body
     body: Body
     camera: Camera
     upright: Gravity | None
     given: Subject | GaussianMixture | None
     box: Box | None
-    prediction: PosePrediction | None
-    masked: bool
     observed: Callable[[], Observation]
 
     @property
@@ -146,7 +140,7 @@ class Shown:
 def _from_subject(shown: Shown) -> Beginning:
     subject = shown.given
     assert isinstance(subject, Subject)
-    fresh = shown.stamp - subject.stamp_ns <= SAME_MOMENT_NS
+    fresh = shown.view.stamp - subject.stamp_ns <= SAME_MOMENT_NS
     begun = start_from_keypoints(
         shown.model,
         shown.camera,
@@ -169,18 +163,20 @@ def _from_keypoints(shown: Shown) -> Beginning:
         shown.model, camera, Subject(0, keypoints, {}), upright=shown.upright, depths=depths
     )
     more = [lifted_poses(begun.body, camera, keypoints)]
-    if shown.prediction is not None:
-        more.append(shown.prediction.seen_as(begun.body).means)
+    if shown.view.prediction is not None:
+        more.append(shown.view.prediction.seen_as(begun.body).means)
     poses = [moved_to_depth(begun.body, camera, x, depths) for x in more]
     own = with_reversals(begun.body, begun.poses)
     return Beginning(Source.KEYPOINTS, begun.body, np.concatenate([own, *poses]))
 
 
 def _from_prediction(shown: Shown) -> Beginning:
-    assert shown.prediction is not None
-    body = shown.prediction.body
-    both = _mixture_at(shown.prediction.both_ways(body), body, shown.camera, shown.depths)
-    return Beginning(Source.PREDICTION, body, both)
+    prediction = shown.view.prediction
+    assert prediction is not None
+    both = _mixture_at(
+        prediction.both_ways(prediction.body), prediction.body, shown.camera, shown.depths
+    )
+    return Beginning(Source.PREDICTION, prediction.body, both)
 
 
 def _from_box(shown: Shown) -> Beginning:
@@ -201,8 +197,9 @@ def _from_mask(shown: Shown) -> Beginning | None:
 
 
 def _masked(shown: Shown) -> bool:
-    silhouette = shown.view.silhouette
-    return shown.masked and silhouette is not None and looks_like_person(silhouette)
+    view = shown.view
+    masked = view.mask is not None and view.silhouette is not None
+    return masked and looks_like_person(view.silhouette)
 
 
 class StartKind(NamedTuple):
@@ -221,7 +218,9 @@ class StartKind(NamedTuple):
 
 STARTS = (
     StartKind(
-        lambda x: isinstance(x.given, Subject) and x.box is None and x.stamp >= x.given.stamp_ns,
+        lambda x: (
+            isinstance(x.given, Subject) and x.box is None and x.view.stamp >= x.given.stamp_ns
+        ),
         math.inf,
         _from_subject,
     ),
@@ -229,7 +228,7 @@ STARTS = (
         lambda x: isinstance(x.given, GaussianMixture) and x.box is None, math.inf, _from_mixture
     ),
     StartKind(lambda x: suffices(x.view.keypoints, x.model), 0.0, _from_keypoints),
-    StartKind(lambda x: x.prediction is not None, AT_ONCE, _from_prediction),
+    StartKind(lambda x: x.view.prediction is not None, AT_ONCE, _from_prediction),
     StartKind(lambda x: shows_a_part(x.view.keypoints, x.model), 0.0, _from_keypoints),
     StartKind(lambda x: x.box is not None, math.inf, _from_box),
     StartKind(_masked, 0.0, _from_mask),
@@ -247,7 +246,7 @@ def first_start(shown: Shown, existence: Existence) -> Beginning | None:
         return None
     sure = math.inf if shown.box is not None else kind.sure
     log_odds = existence.log_odds + sure
-    if log_odds < PRESENT_LOG_ODDS or (not sure and existence.llr <= 0.0):
+    if log_odds < PRESENT_LOG_ODDS or (not sure and existence.last.llr <= 0.0):
         return None
     begun = kind.begin(shown)
     if begun is not None:

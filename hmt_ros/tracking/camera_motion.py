@@ -26,6 +26,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.mirror import propagated, turn_jacobians, turned
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds
+from hmt_ros.tracking.classes import ways
 from hmt_ros.tracking.hypotheses import Modes
 
 # Time for which the last known motion of the camera is taken to go on, s.
@@ -139,7 +140,7 @@ class CameraMotion:
         return result
 
     def modes(self, body: Body, modes: Modes) -> Modes:
-        """Modes in the new camera frame: poses, velocities and covariances."""
+        """Modes in the new camera frame: poses, velocities, covariances, soles and ways to face."""
         poses = self.poses(body, modes.poses)
         jacobians = self.jacobians(body, modes.poses, poses)
         count = modes.state_covariances.shape[1] // body.dimension
@@ -150,7 +151,9 @@ class CameraMotion:
         return replace(
             modes,
             poses=poses,
+            back=ways(body, poses, poses[0]),
             expected=self.poses(body, modes.expected),
+            soles=self.points(modes.soles),
             velocities=(jacobians @ modes.velocities[..., None])[..., 0],
             covariances=propagated(jacobians, modes.covariances),
             filtered=propagated(jacobians, modes.filtered),

@@ -14,6 +14,8 @@ in time (`hmt_ros.inference.error_model`), and the errors of images that are clo
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.special import expit, logit
 
@@ -21,11 +23,12 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.ground_terms import FEET, FloorPlane, sole_points
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS, share_of_time
-from hmt_ros.tracking.camera_motion import CameraMotion
+from hmt_ros.inference.markov_chain import MarkovChain
 from hmt_ros.tracking.hypotheses import Modes
 
 # Rates at which a resting foot leaves the floor, and another comes to rest: those of walking, 1/s.
 LEAVES, ENTERS = 1.5, 2.5
+CONTACT = MarkovChain.of_two(ENTERS, LEAVES)
 # How far errors of poses that are long apart move a point that rests, across and along the line of
 # sight, m.
 REST_ACROSS, REST_ALONG = 0.013, 0.033
@@ -36,57 +39,44 @@ FREE_SPEED = 1.0
 REST_HIGH, LIFT = 0.04, 0.25
 
 
-class FootContacts:
-    """Contact of the feet of the modes of a filter."""
+def contacts_of(
+    body: Body, plane: FloorPlane, modes: Modes, before: Modes | None, dt: float, *, still: bool
+) -> Modes:
+    """Modes with their soles, and the probabilities that these rest.
 
-    def __init__(self) -> None:
-        self._probabilities = np.zeros((0, 0))
-        self._points = np.zeros((0, 0, 3))
+    Args:
+        body: of the modes.
+        plane: gravity and floor.
+        modes: of an image.
+        before: modes of the image before, in the same camera frame, where the ancestors are; None:
+            the modes come from nothing before.
+        dt: time since then, s.
+        still: whether the motion of the camera is known; if not, that of a foot is no evidence.
+    """
+    points = sole_points(body, modes.poses)
+    evidence = _height_evidence(plane, points)
+    if before is None:
+        contacts = expit(logit(CONTACT.usual[1]) + evidence)
+        return replace(modes, soles=points, contacts=contacts)
+    rested = before.contacts[modes.ancestors]
+    prior = CONTACT.closed(rested, dt)
+    if still:
+        stayed = rested * np.exp(-LEAVES * dt) / prior
+        moved = _motion_evidence(before.soles[modes.ancestors], points, dt)
+        evidence += np.log1p(stayed * np.expm1(moved))
+    share = share_of_time(dt, ERRORS['image'].time)
+    return replace(modes, soles=points, contacts=expit(logit(prior) + share * evidence))
 
-    def begin(self, body: Body, plane: FloorPlane, modes: Modes) -> None:
-        """Starts with modes that come from nothing before."""
-        self._points = sole_points(body, modes.poses)
-        usual = logit(ENTERS / (ENTERS + LEAVES))
-        self._probabilities = expit(usual + _height_evidence(plane, self._points))
 
-    def update(
-        self, body: Body, plane: FloorPlane, modes: Modes, dt: float, *, still: bool
-    ) -> None:
-        """Takes in the modes of the next image.
+def by_foot(modes: Modes) -> dict[str, float]:
+    """Probability that the heaviest mode rests on a foot, by 'left_foot' and 'right_foot'.
 
-        Args:
-            body: of the modes.
-            plane: gravity and floor.
-            modes: whose ancestors are the modes that were taken in before.
-            dt: time since then, s.
-            still: whether the motion of the camera is known; if not, that of a foot is no evidence.
-        """
-        points = sole_points(body, modes.poses)
-        before = self._probabilities[modes.ancestors]
-        usual = ENTERS / (ENTERS + LEAVES)
-        prior = usual + (before - usual) * np.exp(-(ENTERS + LEAVES) * dt)
-        evidence = _height_evidence(plane, points)
-        if still:
-            stayed = before * np.exp(-LEAVES * dt) / prior
-            moved = _motion_evidence(self._points[modes.ancestors], points, dt)
-            evidence += np.log1p(stayed * np.expm1(moved))
-        share = share_of_time(dt, ERRORS['image'].time)
-        self._probabilities = expit(logit(prior) + share * evidence)
-        self._points = points
-
-    def carry(self, motion: CameraMotion) -> None:
-        """Takes the places of the soles into the camera frame of the next image."""
-        self._points = motion.points(self._points)
-
-    def by_foot(self) -> dict[str, float]:
-        """Probability that the heaviest mode rests on a foot, by 'left_foot' and 'right_foot'.
-
-        Empty before the first image, and for a body without feet.
-        """
-        if not self._probabilities.size:
-            return {}
-        best = self._probabilities[0].reshape(len(FEET), -1).max(1)
-        return {f'{side}_foot': float(p) for side, p in zip(FEET, best, strict=True)}
+    Empty without modes, where the ground is not used, and for a body without feet.
+    """
+    if not modes.contacts.size:
+        return {}
+    best = modes.contacts[0].reshape(len(FEET), -1).max(1)
+    return {f'{side}_foot': float(p) for side, p in zip(FEET, best, strict=True)}
 
 
 def _height_evidence(plane: FloorPlane, points: Array) -> Array:

@@ -34,7 +34,9 @@ image that shows the place empty ends a track: without it r tends to b / (b + l)
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import Enum
+from types import MappingProxyType
 from typing import NamedTuple
 
 import cv2
@@ -42,8 +44,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
-from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds, share_of_time
 from hmt_ros.inference.markov_chain import MarkovChain, of_log_odds, update
 from hmt_ros.tracking.appearance import MOST, Appearance, Motion
@@ -53,8 +53,6 @@ from hmt_ros.tracking.view import View
 # Rates at which somebody comes into an empty view, and leaves it, per second.
 BIRTH, LEAVING = 0.1, 0.2
 CHAIN = MarkovChain.of_two(BIRTH, LEAVING)
-# Whether who comes is who was seen last: another takes the place once in so many seconds, unseen.
-SAME_PERSON = MarkovChain.of_two(0.0, 1.0 / 3600.0)
 # Above the first probability somebody is there, and a new track may start; below the second nobody
 # is, if the image says so. Between them it is undecided.
 PRESENT, ABSENT = 0.85, 0.03
@@ -102,6 +100,31 @@ DOUBTFUL = Cue(5.0, 0.25)
 NOBODY_YET, GIVEN = of_log_odds([-CLEAR.nats, CLEAR.nats])[:, 1].tolist()
 
 
+class Sighting(NamedTuple):
+    """Whom an image shows, by all cues.
+
+    Attributes:
+        said: log likelihood ratios by cue, nats; positive: somebody.
+        seen: whether it shows a filter something to follow: a cue shows somebody, or none shows
+            nobody and the image can be used.
+        hidden: whether others hide most of the person.
+        elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
+            of no use: the track has to search.
+        there: whether it shows the person, or the same as an image that did.
+    """
+
+    said: Mapping[str, float] = MappingProxyType({})
+    seen: bool = False
+    hidden: bool = False
+    elsewhere: bool = False
+    there: bool = True
+
+    @property
+    def llr(self) -> float:
+        """Sum of the cues, nats; positive: it shows somebody."""
+        return sum(self.said.values())
+
+
 class Existence:
     """The probability that a person is in view, image by image.
 
@@ -109,25 +132,17 @@ class Existence:
         probability: before the first image.
 
     Attributes:
-        said: log likelihood ratios of the last image by cue, nats; positive: somebody.
-        seen: whether the last image shows a filter something to follow: a cue shows somebody, or
-            none shows nobody and the image can be used.
-        hidden: whether others hid most of the person in the last image.
-        met: stamp of the last image that showed the person, ns; None: nobody is known.
-        elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
-            of no use: the track has to search.
+        last: what the last image shows.
+        told: when each cue spoke last, ns.
+        appearance: of the person.
     """
 
     def __init__(self, probability: float = NOBODY_YET) -> None:
         self._p = np.array([1.0 - probability, probability])
-        self.said: dict[str, float] = {}
-        self.seen = self.hidden = self.elsewhere = False
-        self.met: int | None = None
+        self.last = Sighting()
+        self.told: dict[str, int] = {}
+        self.appearance = Appearance()
         self._stamps: tuple[int, int] | None = None  # of the first and of the last image
-        # Whether the last image showed the person, or the same as one that did.
-        self._followed = True
-        self._asked: dict[str, int] = {}  # when each cue spoke last
-        self._appearance = Appearance()
         self._counted: NDArray[np.float32] | None = None  # the picture in which keypoints counted
 
     @property
@@ -136,20 +151,10 @@ class Existence:
         return float(self._p[1])
 
     @property
-    def llr(self) -> float:
-        """Sum of the cues of the last image, nats; positive: it shows somebody."""
-        return sum(self.said.values())
-
-    @property
     def log_odds(self) -> float:
         """Of somebody in view, nats."""
         nobody, somebody = np.log(np.maximum(self._p, 1e-300))
         return float(somebody - nobody)
-
-    @property
-    def told(self) -> bool:
-        """Whether any cue has spoken."""
-        return bool(self._asked)
 
     @property
     def somebody(self) -> bool:
@@ -159,59 +164,52 @@ class Existence:
     @property
     def nobody(self) -> bool:
         """Whether nobody is there, and the last image has said so."""
-        return self.probability < ABSENT and self.llr < 0.0
+        return self.probability < ABSENT and self.last.llr < 0.0
 
-    def meet(self) -> None:
-        """Forgets the usual appearance of the person: another one may come."""
-        self._appearance = Appearance()
-
-    def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
-        """Learns the appearance from the last image, in which the person is at a pose (d,)."""
-        self.met = stamp
-        self._appearance.learn(view, stamp, body, camera, pose)
-
-    def look(self, view: View, stamp: int, body: Body, *, waiting: bool = False) -> None:
+    def look(self, view: View, body: Body, *, waiting: bool = False) -> None:
         """Takes the next image.
 
         Args:
-            view: of the image.
-            stamp: of the image, ns; later than the one before.
+            view: of the image, later than the one before.
             body: of the person.
             waiting: whether a track has still to start.
         """
+        stamp = view.stamp
         # Nothing but the image tells, so that its changes are worth a look.
         alone = view.anywhere is None and view.keypoints is None and not waiting
-        motion = self._appearance.motion(view) if alone else NO_MOTION
-        still = motion.still and self._followed
+        motion = self.appearance.motion(view) if alone else NO_MOTION
+        still = motion.still and self.last.there
         if self._stamps is not None and not still:
             self._p = CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
         # After so long a time the person who was seen last may have gone.
-        forgotten = CHAIN.transition(self._appearance.unseen(stamp))[1, 1] < MOST
-        self.hidden = self._appearance.open_to_view(view.others) < 1.0 - MOST
-        cues, usable, apart = self._cues(view, stamp, body)
+        forgotten = CHAIN.transition(self.appearance.unseen(stamp))[1, 1] < MOST
+        hidden = self.appearance.open_to_view(view.others) < 1.0 - MOST
+        cues, usable, apart = self._cues(view, body)
         denied = min((value * cue.nats for value, cue in cues.values()), default=0.0)
         if motion.moved and denied > -0.5 * DOUBTFUL.nats:
             cues['motion'] = 1.0, DOUBTFUL
         if waiting and cues.get('detector', (0.0, CLEAR))[0] > 0.0 and self._is_counted(view):
             del cues['detector']
-        if self.hidden:
+        if hidden:
             cues = {name: cue for name, cue in cues.items() if cue[0] > 0.0}
-        self.said = {
+        said = {
             name: value * cue.nats * share_of_time(self._time_since(name, stamp), cue.tau)
             for name, (value, cue) in cues.items()
         }
-        self._p = update(self._p, [0.0, self.llr])
         values = [value for value, _ in cues.values()]
         shown = any(value > 0.0 for value in values)
-        self._followed = shown or still
-        self.seen = shown or (usable and not any(value < 0.0 for value in values))
-        self.elsewhere = shown and (forgotten or apart)
-        self._asked |= dict.fromkeys(cues, stamp)
+        self.last = Sighting(
+            said,
+            seen=shown or (usable and not any(value < 0.0 for value in values)),
+            hidden=hidden,
+            elsewhere=shown and (forgotten or apart),
+            there=shown or still,
+        )
+        self._p = update(self._p, [0.0, self.last.llr])
+        self.told |= dict.fromkeys(cues, stamp)
         self._stamps = stamp if self._stamps is None else self._stamps[0], stamp
 
-    def _cues(
-        self, view: View, stamp: int, body: Body
-    ) -> tuple[dict[str, tuple[float, Cue]], bool, bool]:
+    def _cues(self, view: View, body: Body) -> tuple[dict[str, tuple[float, Cue]], bool, bool]:
         """Values of the cues by name, from -1, nobody, to 1, and two facts about the image.
 
         Returns:
@@ -220,7 +218,7 @@ class Existence:
         """
         cues, apart = {}, False
         usable = view.anywhere is None
-        found = self._appearance.silhouetted(view, stamp)
+        found = self.appearance.silhouetted(view, view.stamp)
         if found is not None:
             usable = True
             part = PART if found.cut and found.by_place <= 0.0 < found.by_area else 1.0
@@ -231,13 +229,13 @@ class Existence:
             if value > 0.0:
                 part = 1.0 if suffices(view.keypoints, body) else PART
                 cues['detector'] = part * value, CLEAR
-                apart = apart or self._appearance.is_apart(view, stamp)
+                apart = apart or self.appearance.is_apart(view, view.stamp)
             else:
                 cues['detector'] = value, DOUBTFUL
         if view.predicted is not None and (not view.predicted or view.anywhere is None):
             cues['predictor'] = (1.0, CLEAR) if view.predicted else (-1.0, DOUBTFUL)
         if found is None and not any(value > 0.0 for value, _ in cues.values()):
-            colours = self._appearance.colour_evidence(view)
+            colours = self.appearance.colour_evidence(view)
             # Where most of the image has changed, the colours may have, too.
             if colours is not None and (usable or colours[0]):
                 there, part = colours
@@ -266,4 +264,4 @@ class Existence:
         """Time since a cue spoke, s; infinite in the first image."""
         if self._stamps is None:
             return math.inf
-        return seconds(stamp - self._asked.get(cue, self._stamps[0]))
+        return seconds(stamp - self.told.get(cue, self._stamps[0]))

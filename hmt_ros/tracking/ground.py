@@ -268,6 +268,15 @@ class GroundEstimator:
         return self.known.up is not None or self._seen is not None
 
     @property
+    def vertical(self) -> Array | None:
+        """(3,) the vertical, camera frame, as given or as the lines show it; None: unknown."""
+        return self.estimate.up if self.vertical_known else None
+
+    def gravity(self, weight: float) -> Gravity | None:
+        """Gravity for a start, with a factor on its energy; None: it is unknown, or not used."""
+        return Gravity(self.plane, weight) if self.vertical_known and weight > 0 else None
+
+    @property
     def plane(self) -> FloorPlane:
         """Gravity and floor where the person is, for the energy of poses."""
         return self._plane

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+from hmt_ros.body.ground_terms import GroundSettings
 from hmt_ros.experts.lifter import SHIPPED
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.tracking.evaluation_plan import ACCURATE, EvaluationPlan, plan_of
-from hmt_ros.tracking.ground import GroundSettings
-from hmt_ros.tracking.proposals import PROPOSALS
 
 MOTIONS = ('learned', 'random_walk')
+# Names of the proposals, whose classes are in `tracking.proposals`.
+PROPOSALS = ('kjs', 'css', 'ss')
 
 
 @dataclass(frozen=True)

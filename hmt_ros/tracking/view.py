@@ -1,4 +1,4 @@
-"""The view of a person in an image, before a pose is known."""
+"""The view of a person in an image, before a pose is known, and what was given with the image."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Image, Mask
+from hmt_ros.tracking.pose_prediction import PosePrediction
 
 
 class View(NamedTuple):
@@ -28,6 +29,9 @@ class View(NamedTuple):
         unsure: (H, W) pixels of the person or of a shadow; None: none.
         others: (H, W) pixels that somebody else covers; None: none.
         depth: (H, W) depth along the axis of the camera, m; None: unknown.
+        stamp: of the image, ns.
+        mask: (H, W) of a segmenter; None: unknown.
+        prediction: pose hypotheses from an external predictor, if any.
     """
 
     image: Image
@@ -39,3 +43,6 @@ class View(NamedTuple):
     unsure: Mask | None = None
     others: Mask | None = None
     depth: NDArray[np.floating] | None = None
+    stamp: int = 0
+    mask: Mask | None = None
+    prediction: PosePrediction | None = None

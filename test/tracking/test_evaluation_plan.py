@@ -79,7 +79,7 @@ def test_an_image_keeps_to_its_budget(film, human32, camera, keypoints_of, budge
     for i, image in enumerate(images):
         posterior, _ = tracker.step(image, i * FRAME)
         assert posterior is not None
-        spent.append(tracker.evaluations)
+        spent.append(tracker.estimate.evaluations)
         if i > 0:
             assert len(posterior) <= settings.plan.hypotheses
     assert max(spent[1:]) < 1.5 * budget + 10

@@ -94,15 +94,16 @@ def watched(film, human32, camera):
     def watch(views, rate=10.0, pose_of=lambda pose, _: pose, watching=None, first=0):
         if watching is None:
             watching = Existence(GIVEN)
-            watching.learn(views[0], round(first * SECOND / rate), human32, camera, film[0][first])
+            stamp = round(first * SECOND / rate)
+            watching.appearance.learn(views[0], stamp, human32, camera, film[0][first])
         found = []
         for i, view in enumerate(views, first):
             stamp = round(i * SECOND / rate)
-            watching.look(view, stamp, human32)
-            if watching.seen:
+            watching.look(view._replace(stamp=stamp), human32)
+            if watching.last.seen:
                 pose = pose_of(film[0][i % len(film[0])], i)
-                watching.learn(view, stamp, human32, camera, pose)
-            found.append((watching.probability, watching.seen))
+                watching.appearance.learn(view, stamp, human32, camera, pose)
+            found.append((watching.probability, watching.last.seen))
         return np.array([x for x, _ in found]), [x for _, x in found], watching
 
     return watch
@@ -168,17 +169,17 @@ def test_a_wrong_pose_is_not_an_absent_person(film, watched):
         return pose if i < 6 else pose + 0.9 * (np.arange(len(pose)) == 0)
 
     found, seen, watching = watched(full_views(film, 7), pose_of=aside)
-    assert not watching.elsewhere
+    assert not watching.last.elsewhere
     found, seen, watching = watched(full_views(film, 4), pose_of=aside, watching=watching, first=7)
     assert all(seen)
     assert found.min() > PRESENT
-    assert watching.elsewhere
+    assert watching.last.elsewhere
     remnant = [
         view_of(view.image, view.silhouette & (np.arange(240) > 205)[:, None])
         for view in full_views(film, 3)
     ]
     found, *_ = watched(remnant, watching=watching, first=11)
-    assert watching.llr < 0
+    assert watching.last.llr < 0
 
 
 def test_a_part_of_the_person_is_a_person(film, watched):
@@ -210,7 +211,7 @@ def test_images_that_show_nothing_say_nothing(film, watched, kind, background):
     _, _, watching = watched(before)
     r = watching.probability
     found, *_ = watched([view] * 3, watching=watching, first=6)
-    assert watching.llr == 0.0
+    assert watching.last.llr == 0.0
     assert found[-1] == pytest.approx(CHAIN.predict([1 - r, r], 0.3)[1], abs=1e-9)
 
 
@@ -224,7 +225,7 @@ def test_colours_are_asked_where_the_background_is_of_no_use(film, watched):
     assert seen == [True] * 2
     # There they say nothing against the person.
     watched([view_of(empty, everything, changed=1.0)] * 3, watching=watching, first=8)
-    assert watching.llr == 0.0
+    assert watching.last.llr == 0.0
 
 
 def test_colours_decide_where_there_is_no_background(film, watched):
@@ -250,7 +251,7 @@ def test_colours_say_nothing_against_somebody_in_another_scene(film, watched):
     assert found[-1] > PRESENT
     found, seen, _ = watched([View(empty)] * 50, watching=watching, first=65)
     assert not any(seen)
-    assert watching.llr == 0.0
+    assert watching.last.llr == 0.0
     assert found.min() > 5 * ABSENT
 
 
@@ -293,7 +294,7 @@ def test_colours_that_are_the_same_everywhere_say_nothing(film, watched):
     grey = np.full(film[3].shape, 90, np.uint8)
     _, seen, watching = watched([View(grey)] * 20)
     assert all(seen)
-    assert watching.llr == 0.0
+    assert watching.last.llr == 0.0
 
 
 def keypoints(count, confidence, at=(100.0, 100.0)):
@@ -327,20 +328,20 @@ def test_a_detector_alone_can_end_a_track(film, watched, fields):
 def test_a_detector_that_does_not_answer_says_nothing(film, watched):
     grey = np.full(film[3].shape, 90, np.uint8)
     _, _, watching = watched([View(grey), *[View(grey)] * 20])
-    assert watching.llr == 0.0
+    assert watching.last.llr == 0.0
 
 
 def test_keypoints_far_from_the_model_are_somebody_elsewhere(film, watched):
     grey = np.full(film[3].shape, 90, np.uint8)
     _, _, watching = watched([View(grey)] * 2)
     watched([View(grey, keypoints=keypoints(12, 0.9, (160.0, 120.0)))], watching=watching, first=2)
-    assert not watching.elsewhere
+    assert not watching.last.elsewhere
     # In 0.1 s nobody walks 1.2 m.
     far = [View(grey, keypoints=keypoints(12, 0.9, (10.0, 120.0)))]
     watched(far, watching=watching, first=3)
-    assert not watching.elsewhere
+    assert not watching.last.elsewhere
     watched(far, watching=watching, first=13)
-    assert watching.elsewhere
+    assert watching.last.elsewhere
 
 
 @pytest.mark.parametrize('hidden', [0.6, 1.0])
@@ -352,8 +353,8 @@ def test_who_is_hidden_has_not_left(film, watched, hidden):
     others[: round(rows[0] + hidden * (rows[-1] - rows[0])) + 1] = True
     views = empty_views(film, 50, keypoints=NO_KEYPOINTS, others=others)
     found, *_ = watched(views, watching=watching, first=6)
-    assert watching.hidden
-    assert watching.llr == 0.0
+    assert watching.last.hidden
+    assert watching.last.llr == 0.0
     assert not watching.nobody
     assert np.all(np.diff(found) < 0)
     assert found[-1] > 0.3
@@ -366,7 +367,7 @@ def test_a_part_that_others_hide_is_not_missed(film, watched):
     part = [view_of(view.image, view.silhouette & ~others, others=others) for view in views]
     found, seen, watching = watched(part)
     assert all(seen)
-    assert not watching.hidden
+    assert not watching.last.hidden
     assert found.min() > 0.99
 
 
@@ -390,7 +391,7 @@ def test_a_silhouette_at_the_side_of_the_image_takes_longer(film, watched):
         stamps = range(5, 17)
         found = []
         for i, view in zip(stamps, views, strict=True):
-            watching.look(view, i * SECOND // 10, None)
+            watching.look(view._replace(stamp=i * SECOND // 10), None)
             found.append(watching.somebody)
         times.append(0.1 * np.argmax(found))
     assert times[0] == pytest.approx(0.3)
@@ -399,7 +400,7 @@ def test_a_silhouette_at_the_side_of_the_image_takes_longer(film, watched):
 
 def test_llr_has_the_share_of_the_time(film, watched):
     _, _, watching = watched(full_views(film, 3), 10.0)
-    assert watching.llr == pytest.approx(CLEAR.nats * share_of_time(0.1, CLEAR.tau))
+    assert watching.last.llr == pytest.approx(CLEAR.nats * share_of_time(0.1, CLEAR.tau))
 
 
 # What stands still.
@@ -418,7 +419,8 @@ def test_a_detector_says_the_same_of_the_same_picture(waiting, human37, camera, 
         existence = Existence()
         for i, image in enumerate(images):
             noisy = np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).astype(np.uint8)
-            existence.look(View(noisy, keypoints=seen), i * SECOND // 10, human37, waiting=waiting)
+            view = View(noisy, keypoints=seen, stamp=i * SECOND // 10)
+            existence.look(view, human37, waiting=waiting)
         return existence.probability
 
     still = probability(20 * [thing])
@@ -441,14 +443,14 @@ def test_a_person_who_moves_is_there(film, watched):
     found, seen, watching = watched(bare_views(film, range(10)), 5.0)
     assert all(seen)
     assert found.min() > 0.95
-    assert 'motion' in watching.said
+    assert 'motion' in watching.last.said
 
 
 def test_where_nothing_moves_nobody_leaves(film, watched):
     found, _, watching = watched(bare_views(film, [0] * 10), 0.5)
     assert found.min() >= GIVEN
-    assert 'motion' not in watching.said
-    appearance = watching._appearance
+    assert 'motion' not in watching.last.said
+    appearance = watching.appearance
     assert appearance.motion(View(film[1][0])) == Motion(moved=False, still=True)
     # What moves elsewhere may be who has left; what moves everywhere is the camera.
     other = film[1][0].copy()
@@ -466,9 +468,10 @@ def test_a_black_image_is_no_still_one(film, watched):
 
 def test_before_anything_has_spoken_nothing_is_told(film, human32):
     existence = Existence()
-    existence.look(View(film[1][0]), 0, human32, waiting=True)
+    existence.look(View(film[1][0]), human32, waiting=True)
     assert not existence.told
-    existence.look(View(film[1][0], keypoints=NO_KEYPOINTS), SECOND, human32, waiting=True)
+    empty = View(film[1][0], keypoints=NO_KEYPOINTS, stamp=SECOND)
+    existence.look(empty, human32, waiting=True)
     assert existence.told
     assert existence.log_odds == pytest.approx(
         math.log(existence.probability / (1 - existence.probability))

@@ -123,7 +123,8 @@ def test_poses_move_along_their_rays(tall, camera):
 
 def shown(view, stamp, model, camera, given=None, box=None):
     """An image without any other input."""
-    return Shown(view, stamp, model, model, camera, None, given, box, None, False, lambda: None)
+    view = view._replace(stamp=stamp)
+    return Shown(view, model, model, camera, None, given, box, lambda: None)
 
 
 def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
@@ -169,9 +170,9 @@ def tracked(tall, camera, keypoints_of):
             given = {'depth': depth, 'no depth': None, 'holes': np.zeros_like(depth)}
             given['shifted'] = np.roll(depth, 20, axis=1)
             posterior, _ = tracker.step(image, 100 * t * MS, depth=given[name])
-            joints = tracker.body.joint_positions(posterior.means[:1])[0]
+            joints = tracker.estimate.body.joint_positions(posterior.means[:1])[0]
             errors.append(np.linalg.norm(joints - true[t], axis=1).mean())
-        assert tracker.validity.believes(DEPTH) == (name != 'shifted')
+        assert tracker.estimate.validity.believes(DEPTH) == (name != 'shifted')
         found[name] = np.array(errors), posterior
     return found
 

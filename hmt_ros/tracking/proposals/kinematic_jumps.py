@@ -104,7 +104,7 @@ class LimbSearch:
         term = PoseEnergy(self._own, seen, motion, pose, own)
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: plan.refined]]
-        self.posterior.evaluations += len(samples) + plan.refined * s.iterations
+        self.posterior.spent.append(len(samples) + plan.refined * s.iterations)
         return term.minimise(
             best, step_scale=0.4, damping=1.0, max_iterations=s.iterations, tolerance=0.05
         ).x
@@ -183,14 +183,7 @@ class KinematicJumps:
         ).chosen
         poses, members = poses[kept], members[kept]
         # A chain that jumped is expected where it landed, the rest where it was predicted.
-        changed = np.abs(poses - base.x[members]) > 1e-9
-        return Hypotheses(
-            poses,
-            sources.log_weights[members],
-            sources.ancestors[members],
-            np.where(changed, poses, sources.expected[members]),
-            changed | sources.jumped[members],
-        )
+        return sources.proposed(members, poses, np.abs(poses - base.x[members]) > 1e-9)
 
     @cached_property
     def _searches(self) -> dict[str, LimbSearch]:

@@ -377,7 +377,7 @@ def test_options_reach_the_tracker(still, short, tmp_path):
     settings = tracker.settings
     assert (settings.max_hypotheses, settings.evaluation_budget) == (5, 120)
     assert settings.likelihood.edges.weight == 3.0
-    assert (tracker.seed, tracker.body.name) == (7, 'human34')
+    assert (tracker.seed, tracker.estimate.body.name) == (7, 'human34')
 
 
 def test_config_of_the_node_changes_nothing(still, short, tmp_path):
