@@ -25,8 +25,8 @@ from hmt_ros.sessions.handled import HandlingLog, Output
 from hmt_ros.sessions.track_start import TrackStart
 from hmt_ros.tracking import Status, Tracker
 from hmt_ros.tracking.association import moved
-from hmt_ros.tracking.hypotheses import LIKELY
 from hmt_ros.tracking.person_shape import covered
+from hmt_ros.tracking.settings import LIKELY_NATS
 
 BODIES = 'humans/bodies'
 
@@ -141,7 +141,7 @@ class PersonSession(FilterSession):
         assert self._tracker is not None
         modes = self._tracker.estimate.modes
         result = np.zeros((camera.height, camera.width), dtype=np.bool_)
-        for pose in modes.poses[modes.log_weights > -LIKELY]:
+        for pose in modes.poses[modes.log_weights > -LIKELY_NATS]:
             result |= covered(self._tracker.estimate.body, camera, pose)
         return result if shift is None else moved(result, shift)
 

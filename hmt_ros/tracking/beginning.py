@@ -11,7 +11,7 @@
 
 A track starts once
 
-    log odds of existence + sure + log p(distance) >= log odds of PRESENT
+    log odds of existence + sure + log p(distance) >= log odds of PRESENT_PROBABILITY
 
 p(distance) is log-normal, wide, and never a limit: people are seen at 0.4 to 15 m by a lens of 60
 degrees, at distances that grow with the focal length. After a track has ended a silhouette before
@@ -43,7 +43,7 @@ from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.existence import CLEAR, PRESENT, Existence
+from hmt_ros.tracking.existence import CLEAR, Existence
 from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.initialisation import (
     mixture_from_box,
@@ -54,6 +54,7 @@ from hmt_ros.tracking.initialisation import (
 from hmt_ros.tracking.keypoint_evidence import FEWEST_KEYPOINTS, shows_a_part, suffices
 from hmt_ros.tracking.person_shape import looks_like_person
 from hmt_ros.tracking.pose_prediction import PosePrediction
+from hmt_ros.tracking.settings import PRESENT_PROBABILITY
 from hmt_ros.tracking.start_depth import depths_of, moved_to_depth
 from hmt_ros.tracking.subject import Subject
 from hmt_ros.tracking.view import View
@@ -62,7 +63,7 @@ from hmt_ros.tracking.view import View
 NEAREST, FARTHEST, LENS = 0.4, 15.0, math.radians(60.0)
 # What a prediction is sure of by itself, nats: in the first image nothing else has spoken.
 AT_ONCE = 1.5 * CLEAR.nats
-PRESENT_LOG_ODDS = math.log(PRESENT / (1.0 - PRESENT))
+PRESENT_LOG_ODDS = math.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY))
 # A person hardly moves in so long a time, ns.
 SAME_MOMENT_NS = 200_000_000
 # Number of the best poses from keypoints whose reversals in depth are searched, too.

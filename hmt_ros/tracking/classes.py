@@ -42,13 +42,8 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.markov_chain import MarkovChain
 from hmt_ros.tracking.hypotheses import Modes
+from hmt_ros.tracking.settings import FACING_VALID, LEAST_EXCHANGE, MAX_FACING_NATS
 
-# Probability v that the evidence of an image for a facing direction is about the person.
-VALID = 0.9
-# Largest log odds that are counted, nats: those against a way that a start does not contain.
-MOST = 10.0
-# Least probability of an exchange of sides.
-LEAST = 1e-6
 EXCHANGES = MarkovChain(exchange_rates())
 
 
@@ -65,9 +60,9 @@ def ways(body: Body, poses: Array, reference: Array) -> Mask:
 def first_facing(body: Body, poses: Array, log_weights: Array) -> Array:
     """Log odds (N,) of the way that each of poses (N, d) faces at the start of a track."""
     back = ways(body, poses, poses[np.argmax(log_weights)])
-    log_odds = -MOST
+    log_odds = -MAX_FACING_NATS
     if back.any():
-        log_odds = max(float(log_weights[back].max() - log_weights[~back].max()), -MOST)
+        log_odds = max(float(log_weights[back].max() - log_weights[~back].max()), -MAX_FACING_NATS)
     return np.where(back, log_odds, -log_odds)
 
 
@@ -79,7 +74,7 @@ def lost_a_facing(back: Mask, log_weights: Array) -> bool:
         log_weights: (K,) of the modes in the image.
     """
     one_way = not back.any() or back.all()
-    return bool(one_way or log_weights[back].max() > log_weights[~back].max() + MOST)
+    return bool(one_way or log_weights[back].max() > log_weights[~back].max() + MAX_FACING_NATS)
 
 
 def best_of_the_other_way(body: Body, poses: Array, log_weights: Array, least: float) -> list[int]:
@@ -138,7 +133,7 @@ def weigh_ways(
     on, off = followed & ~back, followed & back
     if on.any() and off.any():
         log_odds += believed(float(evidence[on].min() - evidence[off].min()))
-    log_odds = float(np.clip(log_odds, -MOST, MOST))
+    log_odds = float(np.clip(log_odds, -MAX_FACING_NATS, MAX_FACING_NATS))
     if back.all():
         # All modes went over: the track is as sure of this way as it was of the other one.
         log_odds = abs(log_odds)
@@ -165,7 +160,7 @@ def log_turns(body: Body, first: Array, last: Array, dt: float) -> Array:
 
 def believed(evidence: float) -> float:
     """Evidence for a facing direction, bounded as an image may show something else, (3)."""
-    valid, other = np.log(VALID), np.log1p(-VALID)
+    valid, other = np.log(FACING_VALID), np.log1p(-FACING_VALID)
     return float(np.logaddexp(valid + evidence, other) - np.logaddexp(valid, other + evidence))
 
 
@@ -174,7 +169,7 @@ def believed(evidence: float) -> float:
 
 def predicted_exchanges(exchanges: Array, dt: float) -> Array:
     """Log probabilities (K, E) of exchanges of sides a time dt, s, later, (4)."""
-    return np.log(np.maximum(EXCHANGES.predict(np.exp(exchanges), dt), LEAST))
+    return np.log(np.maximum(EXCHANGES.predict(np.exp(exchanges), dt), LEAST_EXCHANGE))
 
 
 def known_exchanges(exchanges: Array) -> Array:

@@ -28,7 +28,7 @@ An image that has changed for the most part is no evidence: a covered lens, a fl
 colours of a track are no evidence against somebody when the camera has moved: they may have been
 those of a thing. For a person hidden by others, only evidence for the person counts. So only an
 image that shows the place empty ends a track: without it r tends to b / (b + l), which is far above
-`ABSENT`.
+`ABSENT_PROBABILITY`.
 """
 
 from __future__ import annotations
@@ -39,33 +39,25 @@ from enum import Enum
 from types import MappingProxyType
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
+from hmt_ros.image.still_picture import StillPicture
 from hmt_ros.inference.error_model import seconds, share_of_time
 from hmt_ros.inference.markov_chain import MarkovChain, of_log_odds, update
 from hmt_ros.tracking.appearance import MOST, Appearance, Motion
 from hmt_ros.tracking.keypoint_evidence import keypoint_evidence, suffices
+from hmt_ros.tracking.settings import (
+    ABSENT_PROBABILITY,
+    EXISTENCE_CUES,
+    PART_FRACTION,
+    PRESENT_PROBABILITY,
+    RATES,
+)
 from hmt_ros.tracking.view import View
 
-# Rates at which somebody comes into an empty view, and leaves it, per second.
-BIRTH, LEAVING = 0.1, 0.2
-CHAIN = MarkovChain.of_two(BIRTH, LEAVING)
-# Above the first probability somebody is there, and a new track may start; below the second nobody
-# is, if the image says so. Between them it is undecided.
-PRESENT, ABSENT = 0.85, 0.03
-# Fraction of a cue that is left to a silhouette which a side of the image may cut, and to keypoints
-# of a part of a person.
-PART = 0.6
-
-
+CHAIN = MarkovChain.of_two(*RATES['existence'])
 NO_MOTION = Motion(moved=False, still=False)
-# Blur of images that are compared, px; least change of a pixel that noise does not make, grey
-# levels; share of the pixels around keypoints that change when a person breathes or sways within
-# tenths of a second (0.003 and more on ten clips of people, 0 on a table); least contrast.
-BLUR, CHANGED, MOVING, CONTRAST = 1.5, 10.0, 0.002, 4.0
 
 
 class Status(Enum):
@@ -89,11 +81,7 @@ class Cue(NamedTuple):
     tau: float
 
 
-# A clear image is wrong in 1 of 3,000 cases, by some lasting cause that is not modelled. A detector
-# misses a badly visible person in about 1 of 100 images, for longer.
-CLEAR = Cue(8.0, 0.2)
-DOUBTFUL = Cue(5.0, 0.25)
-
+CLEAR, DOUBTFUL = (Cue(*EXISTENCE_CUES[name]) for name in ('clear', 'doubtful'))
 
 # Probability before the first image, as after one clear image of nobody; a given start counts like
 # one clear image of somebody.
@@ -107,6 +95,8 @@ class Sighting(NamedTuple):
         said: log likelihood ratios by cue, nats; positive: somebody.
         seen: whether it shows a filter something to follow: a cue shows somebody, or none shows
             nobody and the image can be used.
+        blank: whether nothing is there to fit modes to, as others hide most of the person or as the
+            silhouette is that of nobody.
         hidden: whether others hide most of the person.
         elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
             of no use: the track has to search.
@@ -115,6 +105,7 @@ class Sighting(NamedTuple):
 
     said: Mapping[str, float] = MappingProxyType({})
     seen: bool = False
+    blank: bool = False
     hidden: bool = False
     elsewhere: bool = False
     there: bool = True
@@ -143,7 +134,7 @@ class Existence:
         self.told: dict[str, int] = {}
         self.appearance = Appearance()
         self._stamps: tuple[int, int] | None = None  # of the first and of the last image
-        self._counted: NDArray[np.float32] | None = None  # the picture in which keypoints counted
+        self._still = StillPicture()
 
     @property
     def probability(self) -> float:
@@ -159,12 +150,12 @@ class Existence:
     @property
     def somebody(self) -> bool:
         """Whether a person is there."""
-        return self.probability >= PRESENT
+        return self.probability >= PRESENT_PROBABILITY
 
     @property
     def nobody(self) -> bool:
         """Whether nobody is there, and the last image has said so."""
-        return self.probability < ABSENT and self.last.llr < 0.0
+        return self.probability < ABSENT_PROBABILITY and self.last.llr < 0.0
 
     def look(self, view: View, body: Body, *, waiting: bool = False) -> None:
         """Takes the next image.
@@ -188,7 +179,8 @@ class Existence:
         denied = min((value * cue.nats for value, cue in cues.values()), default=0.0)
         if motion.moved and denied > -0.5 * DOUBTFUL.nats:
             cues['motion'] = 1.0, DOUBTFUL
-        if waiting and cues.get('detector', (0.0, CLEAR))[0] > 0.0 and self._is_counted(view):
+        detected = cues.get('detector', (0.0, CLEAR))[0] > 0.0
+        if waiting and detected and self._still.shows_again(view.image, view.keypoints):
             del cues['detector']
         if hidden:
             cues = {name: cue for name, cue in cues.items() if cue[0] > 0.0}
@@ -198,9 +190,11 @@ class Existence:
         }
         values = [value for value, _ in cues.values()]
         shown = any(value > 0.0 for value in values)
+        seen = shown or (usable and not any(value < 0.0 for value in values))
         self.last = Sighting(
             said,
-            seen=shown or (usable and not any(value < 0.0 for value in values)),
+            seen=seen,
+            blank=not seen and (hidden or view.silhouette is not None),
             hidden=hidden,
             elsewhere=shown and (forgotten or apart),
             there=shown or still,
@@ -221,13 +215,13 @@ class Existence:
         found = self.appearance.silhouetted(view, view.stamp)
         if found is not None:
             usable = True
-            part = PART if found.cut and found.by_place <= 0.0 < found.by_area else 1.0
+            part = PART_FRACTION if found.cut and found.by_place <= 0.0 < found.by_area else 1.0
             cues['silhouette'] = part * found.evidence, CLEAR
             apart = found.by_place < 0.0 < found.by_area
         if view.keypoints is not None:
             value = keypoint_evidence(view.keypoints, body)
             if value > 0.0:
-                part = 1.0 if suffices(view.keypoints, body) else PART
+                part = 1.0 if suffices(view.keypoints, body) else PART_FRACTION
                 cues['detector'] = part * value, CLEAR
                 apart = apart or self.appearance.is_apart(view, view.stamp)
             else:
@@ -242,23 +236,6 @@ class Existence:
                 nats = part * DOUBTFUL.nats
                 cues['colours'] = 1.0 if there else -1.0, DOUBTFUL._replace(nats=nats)
         return cues, usable, apart
-
-    def _is_counted(self, view: View) -> bool:
-        """Whether keypoints lie on the picture in which they were counted last; else it counts."""
-        assert view.keypoints is not None
-        grey = cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY)
-        picture = cv2.GaussianBlur(grey, (0, 0), BLUR).astype(np.float32)
-        before, (height, width) = self._counted, grey.shape[:2]
-        if before is not None and before.shape == picture.shape:
-            pixels = view.keypoints.pixels[view.keypoints.seen]
-            left, top = np.clip(np.floor(pixels.min(0)), 0, [width - 1, height - 1]).astype(int)
-            right, bottom = np.clip(np.ceil(pixels.max(0)) + 1, 1, [width, height]).astype(int)
-            here = (slice(top, max(bottom, top + 1)), slice(left, max(right, left + 1)))
-            changed = np.abs(picture[here] - before[here]) > CHANGED
-            if picture[here].std() > CONTRAST and changed.mean() < MOVING:
-                return True
-        self._counted = picture
-        return False
 
     def _time_since(self, cue: str, stamp: int) -> float:
         """Time since a cue spoke, s; infinite in the first image."""

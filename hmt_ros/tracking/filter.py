@@ -62,17 +62,10 @@ from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
 from hmt_ros.tracking.proposals import proposals_of
 from hmt_ros.tracking.proposals.keypoint_poses import KeypointHistory
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
-from hmt_ros.tracking.settings import TrackerSettings
+from hmt_ros.tracking.settings import FIRST_SHAPE_FITS, POSTURE_BITS, SHAPE_MODES, TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.validity import ByKeypoints
 from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_origins
-
-# How often the shape is fitted to the first image.
-FIRST_FITS = 3
-# Number of the heaviest modes that the shape is estimated from.
-SHAPED = 4
-# Bits of an identity below the number of the posture of unseen limbs.
-OF_POSTURE = 20
 
 
 class Judged(NamedTuple):
@@ -202,8 +195,8 @@ class MixtureFilter:
             return solved.x
 
         found = settle(poses, 3 * self.settings.iterations)
-        for _ in range(FIRST_FITS):
-            if not self._fit_shape(seen, ERRORS['shape'].independent / FIRST_FITS):
+        for _ in range(FIRST_SHAPE_FITS):
+            if not self._fit_shape(seen, ERRORS['shape'].independent / FIRST_SHAPE_FITS):
                 break
             found = settle(found, self.settings.iterations)
         return self._judge(observation)
@@ -369,7 +362,7 @@ class MixtureFilter:
                 poses=spread.means,
                 covariances=spread.covariances,
                 log_weights=np.log(spread.weights),
-                identities=modes.identities[self._sources] + (postures << OF_POSTURE),
+                identities=modes.identities[self._sources] + (postures << POSTURE_BITS),
             )
         if modes.origins.shape[1]:
             share = weights / np.bincount(before, weights)[before]
@@ -412,9 +405,9 @@ class MixtureFilter:
             return False
         if observation.outline is None and observation.keypoints is None:
             return False
-        best = slice(SHAPED)
+        best = slice(SHAPE_MODES)
         poses, weights = self.modes.poses, np.exp(self.modes.log_weights[best])
-        gradients, covariances = self.posterior.given_way(poses, observation)
+        gradients, covariances = self.posterior.fit(poses, observation).given_way()
         body = self.shape.update(
             self.posterior.likelihood,
             observation,

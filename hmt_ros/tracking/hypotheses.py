@@ -23,10 +23,6 @@ from hmt_ros.inference.mixture import GaussianMixture
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# Modes whose log weight is less than that of the heaviest by at most this, nats, show places where
-# the person may be.
-LIKELY = 4.0
-
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:

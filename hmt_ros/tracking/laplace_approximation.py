@@ -93,7 +93,7 @@ def posterior_modes(
     if measured:
         alone = fit.lasting(solved.free, dt)
         covariances = TOGETHER * alone + shape.considered(
-            posterior.likelihood, observation, poses, posterior.given_way(poses, observation)[1]
+            posterior.likelihood, observation, poses, fit.given_way()[1]
         )
     if states is None:
         velocities = np.zeros_like(poses)

@@ -28,14 +28,7 @@ from hmt_ros.inference.energy import Derivatives, Energy, Quadratic
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking.classes import known_exchanges
 from hmt_ros.tracking.ground import GroundEstimator
-from hmt_ros.tracking.settings import TrackerSettings
-
-# Gain by a step below which a minimum is found, nats.
-TOLERANCE = 0.02
-# Largest standard deviation of a mode: where an image shows nothing, rad or m.
-WIDEST = 2.0
-# Standard deviation of a variable that rests on its limit, rad or m: 3 degrees.
-AT_LIMIT = 0.05
+from hmt_ros.tracking.settings import LIMIT_SIGMA, MAX_SIGMA, MINIMUM_TOLERANCE, TrackerSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +52,18 @@ class ImageFit:
     outline_costs: Array
     free: Mask
     covariances: Array
+
+    def given_way(self) -> tuple[Array, Array]:
+        """Response of the poses to other changes.
+
+        Returns:
+            Gradients (K, d) of the energy of the image and of the prior of the body, 0 for
+            variables that rest on a limit, and inverse Hessians (K, d, d), in which they do not
+            move.
+        """
+        gradient = self.energy.derivatives()[0]
+        moving = self.free[:, :, None] & self.free[:, None, :]
+        return gradient * self.free, self.covariances * moving
 
     def lasting(self, free: Mask, dt: float) -> Array:
         """Covariances (K, d, d) that an image alone leaves, whose errors last.
@@ -170,7 +175,7 @@ class Posterior:
             step_scale=self._step_scale,
             damping=1.0,
             max_iterations=iterations,
-            tolerance=TOLERANCE,
+            tolerance=MINIMUM_TOLERANCE,
         )
 
     def fit(self, poses: Array, observation: Observation, lifted_share: float = 1.0) -> ImageFit:
@@ -198,18 +203,6 @@ class Posterior:
         )
         self._last_fit = (poses, observation, share, fit)
         return fit
-
-    def given_way(self, poses: Array, observation: Observation) -> tuple[Array, Array]:
-        """Response of poses (K, d) to other changes, without the motion prior.
-
-        Returns:
-            Gradients (K, d) of the energy of the image and of the prior of the body, 0 for
-            variables that rest on a limit, and inverse Hessians (K, d, d), in which they do not
-            move.
-        """
-        fit = self.fit(poses, observation)
-        gradient, free = fit.energy.derivatives()[0], fit.free
-        return gradient * free, fit.covariances * (free[:, :, None] & free[:, None, :])
 
     def evidence(
         self, poses: Array, observation: Observation, exchanges: Array, dt: float
@@ -248,14 +241,14 @@ def step_scale(body: Body) -> Array:
 def free_covariances(hessians: Array, free: Mask) -> Array:
     """Inverses (K, d, d) of Hessians (K, d, d) on the free variables (K, d).
 
-    A variable at its limit has the deviation `AT_LIMIT`, and none one above `WIDEST`.
+    A variable at its limit has the deviation `LIMIT_SIGMA`, and none one above `MAX_SIGMA`.
     """
     h = hessians.copy()
     rows, dofs = np.nonzero(~free)
     h[rows, dofs, :] = 0.0
     h[rows, :, dofs] = 0.0
-    h[rows, dofs, dofs] = AT_LIMIT**-2.0
+    h[rows, dofs, dofs] = LIMIT_SIGMA**-2.0
     diagonal = np.arange(h.shape[1])
-    h[:, diagonal, diagonal] += WIDEST**-2.0
+    h[:, diagonal, diagonal] += MAX_SIGMA**-2.0
     result = np.linalg.inv(0.5 * (h + h.transpose(0, 2, 1)))
     return 0.5 * (result + result.transpose(0, 2, 1))

@@ -32,10 +32,11 @@ from hmt_ros.tracking.ground import Ground
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.laplace_approximation import Likelihood
 from hmt_ros.tracking.prediction import Forecaster
+from hmt_ros.tracking.settings import RATES
 from hmt_ros.tracking.validity import Validity
 
-# Whether who comes is who was seen last: another takes the place once in so many seconds, unseen.
-SAME_PERSON = MarkovChain.of_two(0.0, 1.0 / 3600.0)
+# Whether who comes is who was seen last.
+SAME_PERSON = MarkovChain.of_two(*RATES['same person'])
 
 
 @dataclass

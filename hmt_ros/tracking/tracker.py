@@ -50,22 +50,17 @@ from hmt_ros.tracking.ground import (
     KnownGround,
     unit_vector,
 )
-from hmt_ros.tracking.hypotheses import LIKELY
 from hmt_ros.tracking.initialisation import check_box
 from hmt_ros.tracking.laplace_approximation import likelihood_modes
-from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE, Misfit, of_depth_at_best
+from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE, of_depth_at_best
 from hmt_ros.tracking.observer import Observer
 from hmt_ros.tracking.pose_prediction import PosePrediction
-from hmt_ros.tracking.settings import TrackerSettings
+from hmt_ros.tracking.settings import LIKELY_NATS, RESTING_SHARE, TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes
-from hmt_ros.tracking.start_depth import depths_of
 from hmt_ros.tracking.subject import Subject
 from hmt_ros.tracking.track_state import Estimate, TrackState, no_likelihood
-from hmt_ros.tracking.validity import DEPTH, ENOUGH, Validity
+from hmt_ros.tracking.validity import DEPTH, Validity
 from hmt_ros.tracking.view import View
-
-# Share of the time for which somebody stands on both feet, where contact is unknown.
-RESTING = 0.3
 
 
 class Tracker:
@@ -197,39 +192,19 @@ class Tracker:
                 a prediction of a body with other degrees of freedom.
         """
         predicted = False if nobody_predicted else True if prediction is not None else None
-        given = View(
-            image,
-            keypoints=keypoints,
-            predicted=predicted,
-            others=others,
-            depth=depth,
-            stamp=stamp,
-            mask=mask,
-            prediction=prediction,
-        )
+        given = View(image, stamp, keypoints, prediction, mask, predicted, others, depth)
         self._observer.check(given, self._track.body, self._state.stamp)
-        self._track.spent.clear()
-        self._move_camera(stamp)
-        view, observation, foreseen = self._observe(given), None, False
-        if self._state.is_somebody_else(stamp):
-            # Whoever comes now is somebody else, of whom nothing is known.
-            self._drop_track(replace(self._state, ended=True, met=None), self.model)
-        if self._state.begun:
-            existence = self._state.existence
-            existence.look(view, self._track.person)
-            sighting = existence.last
-            if existence.nobody:
-                self._drop_track(replace(self._state, ended=True))
-            elif sighting.seen or not (sighting.hidden or view.silhouette is not None):
-                observation = self._propagate(view)
-            else:
-                # Nothing is there to fit modes to.
-                foreseen = True
-        else:
+        view, observation = self._observe(given), None
+        self._believe(view)
+        if not self._state.begun:
             observation = self._start(view)
+        elif self._state.existence.nobody:
+            self._drop_track(replace(self._state, ended=True))
+        elif not self._state.existence.last.blank:
+            observation = self._propagate(view)
         if observation is not None:
             self._learn(view)
-        return self._publish(stamp, observation, foreseen=foreseen)
+        return self._publish(stamp, observation)
 
     def set_gravity(
         self, up: ArrayLike, camera_height: float | None = None, up_sigma: float = GIVEN_UP_SIGMA
@@ -282,6 +257,8 @@ class Tracker:
     def _observe(self, given: View) -> View:
         """The view of an image, after what it shows of the ground and of the scene."""
         ground, silhouettes = self._ground, self.silhouettes
+        self._track.spent.clear()
+        self._move_camera(given.stamp)
         if self.settings.ground.on:
             ground.look(given.image, self.camera, given.stamp)
             upside_down = ground.reversed
@@ -325,6 +302,27 @@ class Tracker:
         said = [one for one in opinions if one is not None]
         return replace(keypoints, lifted=pooled(said)) if said else keypoints
 
+    # Believe.
+
+    def _believe(self, view: View) -> None:
+        """Updates the beliefs that somebody is there, and that it is who was seen last."""
+        if self._state.is_somebody_else(view.stamp):
+            # Of whoever comes now nothing is known.
+            self._drop_track(replace(self._state, ended=True, met=None), self.model)
+        state = self._state
+        if not (state.begun or state.ended or view.mask is not None):
+            # A background may still be learned: its silhouettes are no start.
+            view = view._replace(anywhere=None, silhouette=None)
+        state.existence.look(view, self._track.person, waiting=not state.begun)
+
+    def _judge(self, judged: Judged, depths: ImageMap | None, dt: float) -> None:
+        """Updates the beliefs in modes and cues of an image, dt s after the one before."""
+        validity, track = self._state.validity, self._track
+        validity.update(judged.misfits, dt, judged.alone)
+        if depths is not None:
+            pose = track.modes.poses[0]
+            validity.update_depths(of_depth_at_best(track.body, self.camera, pose, depths), dt)
+
     # Propagate, start or end.
 
     def _propagate(self, view: View) -> Observation:
@@ -344,20 +342,8 @@ class Tracker:
         else:
             state.validity.search()
             judged, dt = track.begin_anew(poses, observation), np.inf
-        self._believe(judged, observation.depths, dt)
+        self._judge(judged, observation.depths, dt)
         return believed
-
-    def _believe(self, judged: Judged, depths: ImageMap | None, dt: float) -> None:
-        """Takes in how far the modes explain an image, dt s after the one before."""
-        self._state.validity.update(judged.misfits, dt, judged.alone)
-        self._judge_depths(self._track.body, self._track.modes.poses[0], depths, dt)
-
-    def _judge_depths(self, body: Body, pose: Array, depths: ImageMap | None, dt: float) -> None:
-        """Takes in the misfit of depths, if there are some, to a body at a pose (d,)."""
-        if depths is not None:
-            share = of_depth_at_best(body, self.camera, pose, depths)
-            whole = Misfit(np.array([share]), np.array([ENOUGH]))
-            self._state.validity.update({DEPTH: whole}, dt)
 
     def _search(self, observation: Observation, prediction: PosePrediction | None) -> Array | None:
         """See `poses_to_search`."""
@@ -366,32 +352,25 @@ class Tracker:
 
     def _start(self, view: View) -> Observation | None:
         """Starts a track, if it starts at this image; returns the observation it started with."""
-        state = self._state
-        # Before the first track a background may still be learned: its silhouettes are no start.
-        known = view.mask is not None or state.ended
-        looked = view if known else view._replace(anywhere=None, silhouette=None)
-        state.existence.look(looked, self._track.person, waiting=True)
-        somebody = state.existence.somebody and state.existence.last.llr > 0.0
+        state, existence = self._state, self._state.existence
+        somebody = existence.somebody and existence.last.llr > 0.0
         if state.ended and self._box is None:
-            observation = self._arrival(view) if somebody else None
+            # Somebody comes into view after another track has ended.
+            observation = self._observer.observation(view, None, state.validity)
+            poses = self._search(observation, view.prediction) if somebody else None
+            if poses is None:
+                return None
+            magnification = self.camera.magnification(float(np.median(poses[:, 2])))
+            near = replace(observation, magnification=magnification)
+            self._begin(near, Beginning(Source.ARRIVAL, self._track.body, poses))
         else:
-            observation = self._given_start(view, somebody=somebody)
-        if observation is None:
-            return None
+            begun = self._given_start(view, somebody=somebody)
+            if begun is None:
+                return None
+            observation = begun
         self.track_id += 1
         self._box, state.ended = None, False
         return replace(observation, beliefs=state.validity.beliefs)
-
-    def _arrival(self, view: View) -> Observation | None:
-        """Starts a track of somebody who has come into view after another track has ended."""
-        observation = self._observer.observation(view, None, self._state.validity)
-        poses = self._search(observation, view.prediction)
-        if poses is None:
-            return None
-        magnification = self.camera.magnification(float(np.median(poses[:, 2])))
-        near = replace(observation, magnification=magnification)
-        self._begin(near, Beginning(Source.ARRIVAL, self._track.body, poses))
-        return observation
 
     def _given_start(self, view: View, *, somebody: bool) -> Observation | None:
         """Starts a track from what was given, or from an image, if it suffices.
@@ -428,7 +407,11 @@ class Tracker:
                 silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
             if silhouettes.doubted:
                 view = view._replace(silhouette=None, anywhere=None, unsure=None)
-            self._judge_depths(beginning.body, beginning.best[0], depths_of(view.depth), np.inf)
+            if shown.depths is not None:
+                share = of_depth_at_best(
+                    beginning.body, self.camera, beginning.best[0], shown.depths
+                )
+                self._state.validity.update_depths(share, np.inf)
         for _ in range(2):
             pose = beginning.best[0]
             observation = self._observer.observation(view, pose, self._state.validity)
@@ -446,7 +429,7 @@ class Tracker:
         """Starts the modes of a track."""
         self._started_from = beginning.source
         judged = self._track.begin(beginning.body, beginning.start, observation, beginning.clicked)
-        self._believe(judged, observation.depths, np.inf)
+        self._judge(judged, observation.depths, np.inf)
 
     def _new_track(self, body: Body) -> MixtureFilter:
         return MixtureFilter(
@@ -477,12 +460,12 @@ class Tracker:
         told = any(shown[cue] and state.validity.believes(cue) for cue in shown)
         if view.mask is None and told and not state.validity.lost:
             # Something else than silhouettes says where the person is.
-            likely = modes.poses[modes.log_weights > -LIKELY]
+            likely = modes.poses[modes.log_weights > -LIKELY_NATS]
             self.silhouettes.complete(view.image, track.person, self.camera, likely)
         dt = state.age(view.stamp)
         if self.settings.ground.on:
             contacts = by_foot(modes) if self._ground.still else {}
-            resting = min(contacts.values(), default=RESTING)
+            resting = min(contacts.values(), default=RESTING_SHARE)
             self._ground.update(track.person, modes, resting, dt)
         # The motion takes in one image after another, so each with its own covariance alone.
         found = modes.mixture
@@ -494,17 +477,16 @@ class Tracker:
             self._meet(view)
 
     def _publish(
-        self, stamp: int, observation: Observation | None, *, foreseen: bool
+        self, stamp: int, observation: Observation | None
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """What `step` returns, and the estimate.
 
         Args:
             stamp: of the image, ns.
             observation: that the modes were fitted to; None: they were not.
-            foreseen: whether there is a track, of which the image shows nothing.
         """
         state, track = self._state, self._track
-        state.stamp = stamp
+        state.stamp, foreseen = stamp, state.begun and observation is None
         if foreseen:
             track.point.expect(track.person, track.dynamics, state.age(stamp))
             observation = Observation()

@@ -17,8 +17,6 @@ from hmt_ros.body.mirror import (
     root_rotations,
 )
 from hmt_ros.tracking.classes import (
-    MOST,
-    VALID,
     believed,
     first_facing,
     log_turns,
@@ -26,6 +24,7 @@ from hmt_ros.tracking.classes import (
     weigh_ways,
 )
 from hmt_ros.tracking.hypotheses import Modes
+from hmt_ros.tracking.settings import FACING_VALID, MAX_FACING_NATS
 from hmt_ros.tracking.weighting import Continuity
 
 DT = 0.1
@@ -78,7 +77,7 @@ def weighed(body, modes, predicted, poses, transitions, before, evidence, follow
     return log_weights, begun(body, poses, facing)
 
 
-def begun(body, poses, facing=None, log_odds=-MOST):
+def begun(body, poses, facing=None, log_odds=-MAX_FACING_NATS):
     """Modes, the first of which leads; log odds that the person faces the other way."""
     back = ways(body, poses, poses[0])
     if facing is None:
@@ -153,11 +152,14 @@ def test_one_image_says_only_as_much_as_it_may_be_believed():
     """Either it speaks of the person, with the probability v, or it says the opposite by chance."""
     for evidence in (-5.0, -0.3, 0.0, 0.3, 2.0):
         ratio = np.exp(evidence)
-        wanted = np.log((VALID * ratio + 1.0 - VALID) / (VALID + (1.0 - VALID) * ratio))
+        wanted = np.log(
+            (FACING_VALID * ratio + 1.0 - FACING_VALID)
+            / (FACING_VALID + (1.0 - FACING_VALID) * ratio)
+        )
         assert believed(evidence) == pytest.approx(wanted)
         assert believed(-evidence) == pytest.approx(-believed(evidence))
-    assert believed(1e6) == pytest.approx(logit(VALID))
-    assert believed(-np.inf) == pytest.approx(-logit(VALID))
+    assert believed(1e6) == pytest.approx(logit(FACING_VALID))
+    assert believed(-np.inf) == pytest.approx(-logit(FACING_VALID))
 
 
 def test_a_flash_does_not_turn_a_track_about(human32, both, weigh):
@@ -169,10 +171,10 @@ def test_odds_are_bounded(human32, both, weigh):
     modes = begun(human32, both)
     for _ in range(20):
         log_weights, modes = weigh(modes, [0.0, 1e6])
-        assert -MOST <= log_odds_of(modes) <= MOST
+        assert -MAX_FACING_NATS <= log_odds_of(modes) <= MAX_FACING_NATS
     # The chain forgets as fast as images tell, where they are certain.
     assert log_odds_of(modes) == pytest.approx(
-        REVERSALS.after(log_odds_of(modes), DT) - logit(VALID), abs=0.1
+        REVERSALS.after(log_odds_of(modes), DT) - logit(FACING_VALID), abs=0.1
     )
     assert np.isfinite(log_weights).all()
 
@@ -227,8 +229,10 @@ def test_a_person_who_turns_away_leads_the_track_along(human32, both, turned):
 def test_a_start_says_which_way(human32, both):
     facing = first_facing(human32, both, np.log([0.8, 0.2]))
     assert facing == pytest.approx(np.log([4.0, 0.25]))
-    assert first_facing(human32, both[:1], np.zeros(1)) == pytest.approx([MOST])
-    assert first_facing(human32, both, np.array([0.0, -1e9])) == pytest.approx([MOST, -MOST])
+    assert first_facing(human32, both[:1], np.zeros(1)) == pytest.approx([MAX_FACING_NATS])
+    assert first_facing(human32, both, np.array([0.0, -1e9])) == pytest.approx(
+        [MAX_FACING_NATS, -MAX_FACING_NATS]
+    )
 
 
 def test_the_only_way_that_is_left_leads(human32, both, weigh):
@@ -248,4 +252,4 @@ def test_a_body_without_a_trunk_is_left_alone(both):
         Trunkless(), modes, both, both, np.zeros((2, 2)), before, [9.0, 0.0], KNOWN, DT
     )
     assert found is before
-    assert log_odds_of(modes) == -MOST
+    assert log_odds_of(modes) == -MAX_FACING_NATS

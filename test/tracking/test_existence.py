@@ -14,13 +14,12 @@ from hmt_ros.inference.markov_chain import update
 from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.appearance import Motion
 from hmt_ros.tracking.existence import (
-    ABSENT,
     CHAIN,
     CLEAR,
     GIVEN,
-    PRESENT,
     Existence,
 )
+from hmt_ros.tracking.settings import ABSENT_PROBABILITY, PRESENT_PROBABILITY
 from hmt_ros.tracking.view import View
 
 SECOND = 1_000_000_000
@@ -33,7 +32,7 @@ NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 def test_without_an_image_nobody_is_not_said():
     """However long it lasts: r stays far above the limit."""
     for dt in (1.0, 1e3, 1e9):
-        assert CHAIN.predict([1 - GIVEN, GIVEN], dt)[1] > 5 * ABSENT
+        assert CHAIN.predict([1 - GIVEN, GIVEN], dt)[1] > 5 * ABSENT_PROBABILITY
 
 
 def test_against_the_bernoulli_filter_of_stone_soup():
@@ -110,7 +109,8 @@ def watched(film, human32, camera):
 
 
 def view_of(image, mask, **fields):
-    return View(image, mask, mask, fields.pop('changed', mask.mean()), **fields)
+    changed = fields.pop('changed', mask.mean())
+    return View(image, silhouette=mask, anywhere=mask, changed=changed, **fields)
 
 
 def full_views(film, count=6, **fields):
@@ -132,19 +132,19 @@ def test_an_empty_scene_ends_it_within_half_a_second(film, watched, rate):
     assert not any(seen)
     assert watching.nobody
     # After the last image of the person, which is one before the first.
-    assert 0.3 <= (1 + np.argmax(found < ABSENT)) / rate <= 0.5
+    assert 0.3 <= (1 + np.argmax(found < ABSENT_PROBABILITY)) / rate <= 0.5
     # Who comes is there within 0.3 s.
     found, seen, _ = watched(full_views(film, 10), rate, watching=watching, first=26)
-    assert 0.1 <= np.argmax(found > PRESENT) / rate <= 0.34
+    assert 0.1 <= np.argmax(found > PRESENT_PROBABILITY) / rate <= 0.34
 
 
 @pytest.mark.parametrize('rate', [2.7, 1.0])
 def test_at_low_rates_one_image_or_two_suffice(film, watched, rate):
     _, _, watching = watched(full_views(film), rate)
     found, *_ = watched(empty_views(film, 2), rate, watching=watching, first=6)
-    assert found[-1] < ABSENT
+    assert found[-1] < ABSENT_PROBABILITY
     found, *_ = watched(full_views(film, 2), rate, watching=watching, first=8)
-    assert found[-1] > PRESENT
+    assert found[-1] > PRESENT_PROBABILITY
 
 
 @pytest.mark.parametrize('share', [0.36, 0.2])
@@ -157,7 +157,7 @@ def test_clothes_in_the_colours_of_the_room(film, watched, share):
     ]
     found, seen, watching = watched(views)
     assert all(seen)
-    assert found.min() > PRESENT
+    assert found.min() > PRESENT_PROBABILITY
     _, seen, _ = watched(empty_views(film, 3), watching=watching, first=10)
     assert not any(seen)
 
@@ -172,7 +172,7 @@ def test_a_wrong_pose_is_not_an_absent_person(film, watched):
     assert not watching.last.elsewhere
     found, seen, watching = watched(full_views(film, 4), pose_of=aside, watching=watching, first=7)
     assert all(seen)
-    assert found.min() > PRESENT
+    assert found.min() > PRESENT_PROBABILITY
     assert watching.last.elsewhere
     remnant = [
         view_of(view.image, view.silhouette & (np.arange(240) > 205)[:, None])
@@ -232,11 +232,11 @@ def test_colours_decide_where_there_is_no_background(film, watched):
     _, images, _, empty = film
     found, seen, watching = watched([View(image) for image in images[:8]])
     assert seen == [True] * 8
-    assert found.min() > PRESENT
+    assert found.min() > PRESENT_PROBABILITY
     found, seen, _ = watched([View(empty)] * 20, watching=watching, first=8)
     assert not any(seen)
     assert watching.nobody
-    assert 0.4 < 0.1 * (1 + np.argmax(found < ABSENT)) < 2.0
+    assert 0.4 < 0.1 * (1 + np.argmax(found < ABSENT_PROBABILITY)) < 2.0
 
 
 def test_colours_say_nothing_against_somebody_in_another_scene(film, watched):
@@ -248,11 +248,11 @@ def test_colours_say_nothing_against_somebody_in_another_scene(film, watched):
         aside, watching=watching, first=60,
         pose_of=lambda pose, _: pose + 90 / 330 * pose[2] * (np.arange(len(pose)) == 0),
     )  # fmt: skip
-    assert found[-1] > PRESENT
+    assert found[-1] > PRESENT_PROBABILITY
     found, seen, _ = watched([View(empty)] * 50, watching=watching, first=65)
     assert not any(seen)
     assert watching.last.llr == 0.0
-    assert found.min() > 5 * ABSENT
+    assert found.min() > 5 * ABSENT_PROBABILITY
 
 
 @pytest.mark.parametrize('rate', [10.0, 5.0, 2.7])
@@ -276,7 +276,7 @@ def test_a_thing_that_was_taken_for_somebody_leaves_the_image(film, watched, rat
     found, seen, _ = watched(turned * 3, rate, watching=watching, first=2 * len(before))
     assert not any(seen)  # it is not what was learned
     assert not watching.somebody
-    assert found.min() > 5 * ABSENT
+    assert found.min() > 5 * ABSENT_PROBABILITY
 
 
 def test_who_turns_about_may_have_other_colours(film, watched):
@@ -287,7 +287,7 @@ def test_who_turns_about_may_have_other_colours(film, watched):
     back[masks[7]] = 255, 40, 10
     found, *_ = watched([View(back)] * 30, watching=watching, first=8)
     assert not watching.nobody
-    assert found.min() > 5 * ABSENT
+    assert found.min() > 5 * ABSENT_PROBABILITY
 
 
 def test_colours_that_are_the_same_everywhere_say_nothing(film, watched):
@@ -311,7 +311,7 @@ def test_a_failed_detector_does_not_end_a_track_with_a_silhouette(film, watched)
         views = full_views(film, 10, keypoints=NO_KEYPOINTS)
         found, seen, _ = watched(views, rate)
         assert all(seen)
-        assert found.min() > PRESENT
+        assert found.min() > PRESENT_PROBABILITY
 
 
 @pytest.mark.parametrize('fields', [{'keypoints': NO_KEYPOINTS}, {'predicted': False}])
@@ -322,7 +322,7 @@ def test_a_detector_alone_can_end_a_track(film, watched, fields):
         views = [View(grey, **fields)] * 40
         found, seen, _ = watched(views, rate, watching=watching, first=2)
         assert not any(seen)
-        assert 0.5 <= (1 + np.argmax(found < ABSENT)) / rate <= 1.1
+        assert 0.5 <= (1 + np.argmax(found < ABSENT_PROBABILITY)) / rate <= 1.1
 
 
 def test_a_detector_that_does_not_answer_says_nothing(film, watched):
@@ -375,7 +375,7 @@ def test_the_first_image_of_somebody_leaves_it_open(film, watched):
     """A second one shortly after does not."""
     found, *_ = watched(full_views(film, 3), watching=Existence())
     assert found[0] == pytest.approx(0.5)
-    assert found[1] > PRESENT
+    assert found[1] > PRESENT_PROBABILITY
 
 
 def test_a_silhouette_at_the_side_of_the_image_takes_longer(film, watched):
@@ -426,9 +426,9 @@ def test_a_detector_says_the_same_of_the_same_picture(waiting, human37, camera, 
     still = probability(20 * [thing])
     moving = probability([np.roll(thing, 3 * i, axis=1) for i in range(20)])
     blank = probability(20 * [np.zeros_like(thing)])
-    assert moving > PRESENT
-    assert blank > PRESENT
-    assert (still > PRESENT) != waiting
+    assert moving > PRESENT_PROBABILITY
+    assert blank > PRESENT_PROBABILITY
+    assert (still > PRESENT_PROBABILITY) != waiting
 
 
 # Without any other cue.
@@ -463,7 +463,7 @@ def test_where_nothing_moves_nobody_leaves(film, watched):
 def test_a_black_image_is_no_still_one(film, watched):
     black = View(np.zeros_like(film[1][0]))
     found, *_ = watched([View(film[1][0]), *[black] * 5], 1.0)
-    assert found[-1] < PRESENT
+    assert found[-1] < PRESENT_PROBABILITY
 
 
 def test_before_anything_has_spoken_nothing_is_told(film, human32):

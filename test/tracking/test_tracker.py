@@ -28,7 +28,8 @@ from hmt_ros.tracking import (
     TrackerSettings,
 )
 from hmt_ros.tracking.misfit import KEYPOINTS
-from hmt_ros.tracking.posterior import WIDEST, free_covariances
+from hmt_ros.tracking.posterior import free_covariances
+from hmt_ros.tracking.settings import MAX_SIGMA
 from hmt_ros.tracking.validity import UNDECIDED
 
 ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
@@ -187,7 +188,7 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     lower, upper = human32.lower + 1e-6, human32.upper - 1e-6
     for k, precision in zip(order, np.linalg.inv(likelihood.covariances), strict=True):
         inside = (posterior.means[k] > lower) & (posterior.means[k] < upper)
-        wanted = energy.hessian[k] + WIDEST**-2.0 * np.eye(len(inside))
+        wanted = energy.hessian[k] + MAX_SIGMA**-2.0 * np.eye(len(inside))
         both = np.ix_(inside, inside)
         assert inside.sum() > len(inside) / 2
         assert np.allclose(precision[both], wanted[both], rtol=1e-6, atol=1e-3)

@@ -32,10 +32,11 @@ from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Derivatives, Student
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking.evaluation_plan import EvaluationPlan
-from hmt_ros.tracking.hypotheses import LIKELY, Hypotheses
+from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.selection import choose_hypotheses
+from hmt_ros.tracking.settings import LIKELY_NATS
 
 # Modes have the same trunk when its joints are nowhere further apart, m.
 SAME_TRUNK = 0.06
@@ -145,7 +146,7 @@ class KinematicJumps:
         prior = search.rated(base.x, base.value)
         groups = self._groups(base)
         for group in groups[: plan.groups]:
-            likely = prior[group].max() > prior.max() - LIKELY
+            likely = prior[group].max() > prior.max() - LIKELY_NATS
             products = LimbProducts.of(
                 body,
                 base.x[group],

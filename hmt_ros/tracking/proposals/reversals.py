@@ -19,9 +19,7 @@ from hmt_ros.tracking.classes import lost_a_facing
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
-
-# Newton steps from the reversal of a mode to its optimum, before candidates are compared.
-ITERATIONS = 8
+from hmt_ros.tracking.settings import REVERSAL_ITERATIONS
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,5 +42,5 @@ class Reversals:
         best = np.argsort(-log_weights, kind='stable')[:1]
         turned = reverse_depth(self.posterior.body, base.x[best])
         term = self.posterior.of_image(search.observation)
-        moved = self.posterior.minimise(term, turned, ITERATIONS).x
+        moved = self.posterior.minimise(term, turned, REVERSAL_ITERATIONS).x
         return sources.proposed(best, moved, np.ones(moved.shape, dtype=np.bool_))
