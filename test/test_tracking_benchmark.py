@@ -6,6 +6,7 @@ import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -333,7 +334,7 @@ def test_gravity_is_given_with_each_image(clip):
     told = []
 
     class Listener:
-        status = Status.WAITING
+        estimate = SimpleNamespace(status=Status.WAITING)
 
         def set_gravity(self, up):
             told.append(up)

@@ -198,9 +198,8 @@ def _from_mask(shown: Shown) -> Beginning | None:
 
 
 def _masked(shown: Shown) -> bool:
-    view = shown.view
-    masked = view.mask is not None and view.silhouette is not None
-    return masked and looks_like_person(view.silhouette)
+    silhouette, mask = shown.view.silhouette, shown.view.mask
+    return mask is not None and silhouette is not None and looks_like_person(silhouette)
 
 
 class StartKind(NamedTuple):

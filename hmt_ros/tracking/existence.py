@@ -180,7 +180,8 @@ class Existence:
         if motion.moved and denied > -0.5 * DOUBTFUL.nats:
             cues['motion'] = 1.0, DOUBTFUL
         detected = cues.get('detector', (0.0, CLEAR))[0] > 0.0
-        if waiting and detected and self._still.shows_again(view.image, view.keypoints):
+        keypoints = view.keypoints if waiting and detected else None
+        if keypoints is not None and self._still.shows_again(view.image, keypoints):
             del cues['detector']
         if hidden:
             cues = {name: cue for name, cue in cues.items() if cue[0] > 0.0}

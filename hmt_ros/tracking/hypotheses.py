@@ -70,7 +70,7 @@ class Hypotheses:
         """
         if expected is None:
             expected = np.where(jumped, poses, self.expected[rows])
-        anew = jumped.all(1)[:, None]
+        anew = np.all(jumped, axis=1, keepdims=True)
         return Hypotheses(
             poses,
             self.log_weights[rows],

@@ -60,20 +60,20 @@ class LimbSearch:
     posterior: Posterior
     chain: str
 
-    def __post_init__(self) -> None:
-        p = self.posterior
-        segments = set(p.body.skeleton.chains[self.chain])
-        parts = range(len(p.body.flesh.parts))
-        own = tuple(i for i in parts if p.body.flesh.parts[i].segment in segments)
-        rest = tuple(i for i in parts if i not in own)
-        for name, traced, occluders in (('_own', own, None), ('_rest', rest, rest)):
-            likelihood = replace(p.likelihood, parts=traced, occluders=occluders)
-            object.__setattr__(self, name, likelihood)
-        object.__setattr__(self, 'dofs', p.body.skeleton.chain_dofs[self.chain])
+    @cached_property
+    def dofs(self) -> Index:
+        """Degrees of freedom of the limb."""
+        return np.asarray(self.posterior.body.skeleton.chain_dofs[self.chain])
 
-    _own: ImageLikelihood = None  # type: ignore[assignment]
-    _rest: ImageLikelihood = None  # type: ignore[assignment]
-    dofs: Index = None  # type: ignore[assignment]
+    @cached_property
+    def _likelihoods(self) -> tuple[ImageLikelihood, ImageLikelihood]:
+        """Those of the limb, and of the rest of the body without the limb."""
+        body, whole = self.posterior.body, self.posterior.likelihood
+        segments = set(body.skeleton.chains[self.chain])
+        of_limb = [part.segment in segments for part in body.flesh.parts]
+        own = tuple(i for i, ours in enumerate(of_limb) if ours)
+        rest = tuple(i for i, ours in enumerate(of_limb) if not ours)
+        return replace(whole, parts=own), replace(whole, parts=rest, occluders=rest)
 
     def find(
         self,
@@ -96,13 +96,14 @@ class LimbSearch:
         s = self.posterior.settings.search
         block = covariance[np.ix_(own, own)]
         samples = self._draw(pose[own], block, plan.samples, rng)
-        others = self._rest.energies(
+        of_limb, of_rest = self._likelihoods
+        others = of_rest.energies(
             forward(body.skeleton, pose[None]), observation, derivatives=False
         )
-        seen = self._own.seen(observation, explained=others.costs)
+        seen = of_limb.seen(observation, explained=others.costs)
         seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
         motion = Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS)
-        term = PoseEnergy(self._own, seen, motion, pose, own)
+        term = PoseEnergy(of_limb, seen, motion, pose, own)
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: plan.refined]]
         self.posterior.spent.append(len(samples) + plan.refined * s.iterations)
