@@ -14,13 +14,13 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_frames, sensed_depth
 from hmt_ros.rendering.scene import Scene
-from hmt_ros.tracking import Subject, Tracker, TrackerSettings
+from hmt_ros.tracking import Subject, Tracker
 from hmt_ros.tracking.beginning import Shown, first_start
 from hmt_ros.tracking.existence import Existence
-from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.initialisation import start_from_keypoints
+from hmt_ros.tracking.misfit import of_depth_at_best
 from hmt_ros.tracking.start_depth import depths_of, joint_depths, moved_to_depth
-from hmt_ros.tracking.validity import DEPTH
+from hmt_ros.tracking.validity import DEPTH, Validity
 from hmt_ros.tracking.view import View
 
 STATURE, AWAY = 1.9, 3.5
@@ -206,7 +206,12 @@ def test_depth_that_is_not_registered_does_no_harm(tracked):
 def test_the_belief_comes_back(tall, camera):
     body, poses, _, depths, _ = tall
     shifted = np.roll(depths[0], 20, axis=1)
-    track = MixtureFilter(body, camera, TrackerSettings(), 0)
+    validity = Validity()
+
+    def see(pose, depth, dt):
+        if (shown := depths_of(depth)) is not None:
+            validity.update_depths(of_depth_at_best(body, camera, pose, shown), dt)
+
     wrong = poses[0] * np.where(np.arange(body.dimension) < 3, 1.1, 1.0)
     for depth, pose, believed in (
         (None, wrong, True),
@@ -216,9 +221,9 @@ def test_the_belief_comes_back(tall, camera):
         *[(depths[0], wrong, None)] * 10,
         (depths[0], wrong, True),
     ):
-        track.validity.predict(0.1)
-        track.check_depths(body, pose, depths_of(depth), 0.1)
-        assert believed is None or track.validity.believes(DEPTH) == believed
+        validity.predict(0.1)
+        see(pose, depth, 0.1)
+        assert believed is None or validity.believes(DEPTH) == believed
     # One image does not change that.
-    track.check_depths(body, wrong, depths_of(shifted), 1.0 / 30.0)
-    assert track.validity.believes(DEPTH)
+    see(wrong, shifted, 1.0 / 30.0)
+    assert validity.believes(DEPTH)
