@@ -41,13 +41,13 @@ from benchmarks.machine import description
 from benchmarks.runs import in_processes
 from hmt_ros.app.replay.options import NodeParameters
 from hmt_ros.app.replay.tracks import OfflineTrack
+from hmt_ros.body.keep_out import Capsules
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.image_inputs import KEYPOINTS
 from hmt_ros.sessions.track_messages import TOPICS
-from hmt_ros.tracking.keep_out import Capsules
 from msg_tools import RosbagsMessages
 from msg_tools.files.array_file import read_archive
 from msg_tools.messages.cdr import deserialise

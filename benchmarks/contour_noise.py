@@ -35,13 +35,13 @@ from benchmarks.tracking_oracle import (
 )
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.shape import ShapeSpace
+from hmt_ros.body.shape import GROWTH_SIGMAS, ShapeSpace
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
-from hmt_ros.tracking.shape_estimation import SPREAD, ShapeEstimate
+from hmt_ros.tracking.shape_estimation import ShapeEstimate
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -132,11 +132,12 @@ def posed(folder: Path, every: int = EVERY) -> Posed:
 def fitted_growth(clips: Sequence[Posed]) -> Array:
     """How the groups of parts grow (G, 5) to fit the true silhouettes; poses are held.
 
-    Levenberg-Marquardt, with a Gaussian prior of the deviations `SPREAD`. The gradient is that of
-    differences: derivatives do not see which points of the contour come to light or are covered.
+    Levenberg-Marquardt, with a Gaussian prior of the deviations `GROWTH_SIGMAS`. The gradient is
+    that of differences: derivatives do not see which points of the contour come to light or are
+    covered.
     """
     groups = len(ShapeSpace(clips[0].body).groups)
-    spread = np.tile(np.array([*SPREAD.values()]), groups)
+    spread = np.tile(np.array([*GROWTH_SIGMAS.values()]), groups)
     growth, damping = np.zeros(len(spread)), 0.1
     least, (gradient, curvature) = energy_of(clips, growth), derivatives_of(clips, growth)
     for _ in range(MOST_STEPS):
@@ -157,7 +158,7 @@ def fitted_growth(clips: Sequence[Posed]) -> Array:
 
 def energy_of(clips: Sequence[Posed], growth: Array) -> float:
     """Energy of growth (G * 5,): of the true silhouettes of all clips, and of the prior."""
-    spread = np.tile(np.array([*SPREAD.values()]), len(growth) // len(SPREAD))
+    spread = np.tile(np.array([*GROWTH_SIGMAS.values()]), len(growth) // len(GROWTH_SIGMAS))
     result = 0.5 * float(((growth / spread) ** 2).sum())
     for clip in clips:
         body = grown(clip.body, growth)
@@ -170,7 +171,7 @@ def energy_of(clips: Sequence[Posed], growth: Array) -> float:
 
 def derivatives_of(clips: Sequence[Posed], growth: Array) -> tuple[Array, Array]:
     """Gradient (G * 5,), by central differences, and Gauss-Newton Hessian of the energy."""
-    spread = np.tile(np.array([*SPREAD.values()]), len(growth) // len(SPREAD))
+    spread = np.tile(np.array([*GROWTH_SIGMAS.values()]), len(growth) // len(GROWTH_SIGMAS))
     gradient, curvature = np.empty(len(growth)), np.diag(spread**-2.0)
     for i, step in enumerate(DIFFERENCE * np.diag(spread)):
         rise = energy_of(clips, growth + step) - energy_of(clips, growth - step)

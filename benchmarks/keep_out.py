@@ -22,7 +22,7 @@ from benchmarks.machine import description
 from benchmarks.runs import BOTH, GIVEN, IMAGES, in_processes, true_joints
 from benchmarks.smoothing_clips import tracked
 from benchmarks.tracking_means import GROUPS, group_of
-from hmt_ros.tracking.keep_out import MARGIN, Capsules, keep_out_capsules
+from hmt_ros.body.keep_out import MARGIN, Capsules, keep_out_capsules
 from msg_tools.messages.headers import SECOND_NS
 
 PROBABILITIES = (0.9, 0.95, 0.99, 0.997)

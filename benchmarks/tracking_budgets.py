@@ -17,10 +17,11 @@ from benchmarks.clips import table
 from benchmarks.runs import INPUTS, KEYPOINTS, USUAL_RATE, Record, Run, run_all
 from benchmarks.tracking_means import GROUPS, OF_CHOSEN, group_of
 from benchmarks.tracking_scores import interval, scores_of
-from hmt_ros.tracking.evaluation_plan import ACCURATE, LIVE
+from hmt_ros.sessions.filter_parameters import LIVE_BUDGET
+from hmt_ros.tracking.settings import ACCURATE_BUDGET
 
 Array = NDArray[Any]
-PROFILES = {'accurate': ACCURATE, 'live': LIVE}
+PROFILES = {'accurate': ACCURATE_BUDGET, 'live': LIVE_BUDGET}
 SMALLER = (150, 80, 40)
 # Images that start a track: their cost is not that of a step.
 STARTING = 2
@@ -59,7 +60,9 @@ def budgets(runs: Sequence[Run], processes: int = 0) -> list[dict[str, Any]]:
 
 def _with(budget: int, one: Run) -> Run:
     """The run with a budget. The usual budget changes no setting: records of usual runs serve."""
-    return one if budget == ACCURATE else replace(one, changes=(('evaluation_budget', budget),))
+    return (
+        one if budget == ACCURATE_BUDGET else replace(one, changes=(('evaluation_budget', budget),))
+    )
 
 
 def _row(clips: dict[str, list[Record]]) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import description
 from benchmarks.runs import BOTH, KEYPOINTS, in_processes, keypoints_only, new_tracker
 from hmt_ros.body import load_body
+from hmt_ros.body.keep_out import keep_out_capsules
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, joint_mixtures
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.calibration import (
@@ -33,7 +34,6 @@ from hmt_ros.inference.calibration import (
     stratified_samples,
 )
 from hmt_ros.tracking import TrackerSettings
-from hmt_ros.tracking.keep_out import keep_out_capsules
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -38,8 +38,8 @@ from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_moti
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.evaluation_plan import ACCURATE
 from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
+from hmt_ros.tracking.settings import ACCURATE_BUDGET
 
 Array = NDArray[np.float64]
 
@@ -263,7 +263,7 @@ def filmed(motion: str, seed: int, images: int) -> Film:
 
 def tracked(film: Film, count: int, seed: int) -> dict[str, float]:
     """Errors of a track in which so many limbs are searched an image."""
-    settings = TrackerSettings(searched_chains=count, evaluation_budget=4 * ACCURATE)
+    settings = TrackerSettings(searched_chains=count, evaluation_budget=4 * ACCURATE_BUDGET)
     background = BackgroundModel.from_image(film.empty)
     tracker = Tracker(film.body, film.camera, settings, background, seed)
     tracker.reset(film.subject)

@@ -19,6 +19,7 @@ from benchmarks import BENCHMARKS
 from hmt_ros.app import COMMANDS
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import Scores
+from hmt_ros.image.subject import parse_subject
 from hmt_ros.sessions import (
     bme_session,
     hri_session,
@@ -36,7 +37,6 @@ from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from hmt_ros.tracking.subject import parse_subject
 from msg_tools import typestore
 
 ROOT = Path(__file__).resolve().parents[1]

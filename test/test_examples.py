@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.body import load_body
+from hmt_ros.body.keep_out import keep_out_capsules
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking.keep_out import keep_out_capsules
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message

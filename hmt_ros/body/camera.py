@@ -10,6 +10,7 @@ to the person's right (left in the image), y towards the camera, z up.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -20,6 +21,15 @@ from hmt_ros.inference.arrays import Array
 
 # Number of coefficients of each model of sensor_msgs/distortion_models.
 DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
+
+# Axes of a camera, in rows: right, down and ahead.
+AXES = np.eye(3)
+AXES.setflags(write=False)
+# Against gravity, for an upright camera.
+IMAGE_UP = np.array([0.0, -1.0, 0.0])
+IMAGE_UP.setflags(write=False)
+# Distances between which a lens of so many degrees sees 95 % of people, m.
+NEAREST_PERSON, FARTHEST_PERSON, USUAL_LENS = 0.4, 15.0, np.radians(60.0)
 
 NEAR = 0.01  # least depth of a point that has an image, m
 # Least part of the vertical across the optical axis by which a camera has a roll.
@@ -279,6 +289,18 @@ def shortest_turn(start: Array, end: Array) -> Array:
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     result: Array = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
     return result
+
+
+def log_prior_of_distance(camera: Camera, distance: float) -> float:
+    """How usual it is that a camera sees a person at a distance, m, in nats below the most usual.
+
+    Log-normal, and wide: it is a prior, and limits nothing.
+    """
+    lens = camera.fx / (0.5 * camera.width / math.tan(0.5 * USUAL_LENS))
+    middle = math.sqrt(NEAREST_PERSON * FARTHEST_PERSON)
+    # Two standard deviations on either side.
+    sigma = math.log(FARTHEST_PERSON / NEAREST_PERSON) / 4.0
+    return -0.5 * (math.log(max(distance, 1e-3) / (lens * middle)) / sigma) ** 2
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,11 @@ from hmt_ros.body.body import GROWTH, Body
 from hmt_ros.body.kinematics import Frames, origin_length_jacobians, placing_of
 from hmt_ros.inference.arrays import Array, Mask
 
+# Standard deviations over people and clothes, by kind of growth: logarithms, m.
+GROWTH_SIGMAS = dict(zip(GROWTH, (0.2, 0.2, 0.02, 0.02, 0.02), strict=True))
+# Smallest standard deviation of a length, m: none is known better.
+MIN_LENGTH_SIGMA = 0.008
+
 
 class ShapeSpace:
     """The variables of the shape of a body.
@@ -59,6 +64,18 @@ class ShapeSpace:
         """Names of the variables, (P,)."""
         grown = (f'{group}_{kind}' for group in self.groups for kind in GROWTH)
         return (*self.body.skeleton.length_names, *grown)
+
+    @property
+    def prior(self) -> tuple[Array, Array]:
+        """Standard deviations over people (P,) and covariance of this person (P, P)."""
+        lengths = np.maximum(self.body.length_sigma, MIN_LENGTH_SIGMA)
+        unknown = lengths**2 - np.diagonal(self.body.length_covariance)
+        grown = np.tile(np.array(list(GROWTH_SIGMAS.values())), len(self.groups))
+        sigmas = np.concatenate([lengths, grown])
+        covariance = np.diag(sigmas**2)
+        own = slice(0, self.lengths)
+        covariance[own, own] = self.body.length_covariance + np.diag(unknown)
+        return sigmas, covariance
 
     def moved(self, change: Array) -> Body:
         """The body with a changed shape, (P,): lengths in m, growth as in `GROWTH`."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 
@@ -126,13 +126,14 @@ TOGETHER = 0.29
 # of experts, beside a weight of their own. `shape` is the evidence of images on lengths and flesh:
 # different poses are independent evidence on these, but not on clothes. Its constant share was
 # chosen on clips that are shown back and forth for 45 s: 0.03, 0.12 and 0.3 were tried.
+_IMAGE, _KEYPOINTS = CueErrors(0.15, 0.019), CueErrors(0.35, 0.053)
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     {
-        'image': CueErrors(0.15, 0.019),
-        'keypoints': CueErrors(0.35, 0.053),
+        'image': _IMAGE,
+        'keypoints': _KEYPOINTS,
         'lifted': CueErrors(1.0, 0.067),
-        'prior': CueErrors(0.15, 0.019),
-        'shape': CueErrors(0.35, 0.053, 0.12),
+        'prior': _IMAGE,
+        'shape': replace(_KEYPOINTS, constant=0.12),
     }
 )
 # Factor on the depths of experts where they are counted like keypoints: the ratio of the

@@ -16,8 +16,8 @@ import numpy as np
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.handled import Fault
 from hmt_ros.sessions.transform_buffer import Transform, TransformBuffer, TransformError
-from hmt_ros.tracking.camera_motion import LONGEST_GUESS
 from hmt_ros.tracking.ground import KnownGround
+from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
 
 # A vector that is shorter has no direction.
 _SHORTEST = 1e-6
@@ -143,7 +143,7 @@ class CameraFrames:
             text = (
                 f'no transform from {camera_frame!r} to fixed_frame {name!r} at the image of '
                 f'{stamp_ns} ns: {error}; the camera is taken to go on as before, and after '
-                f'{LONGEST_GUESS} s its motion is unknown'
+                f'{MAX_EXTRAPOLATION_TIME} s its motion is unknown'
             )
             return [(Fault.NO_CAMERA_POSE, text)]
         return []

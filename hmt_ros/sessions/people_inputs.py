@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body
+from hmt_ros.image.keypoint_evidence import FEWEST_KEYPOINTS
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.tracking.association import Sighting
-from hmt_ros.tracking.keypoint_evidence import FEWEST_KEYPOINTS
 from msg_tools import MessageError
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,

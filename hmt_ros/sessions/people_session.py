@@ -24,6 +24,7 @@ import numpy as np
 
 from hmt_ros.body import Camera
 from hmt_ros.image.background import BackgroundModel, SceneWatch
+from hmt_ros.image.silhouettes import Silhouettes, region_of
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_session import CAMERA_MOVED, WaitingImage
@@ -52,7 +53,6 @@ from hmt_ros.tracking.association import (
     unknown_area,
 )
 from hmt_ros.tracking.camera_motion import CameraPose
-from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,
     PEOPLE_2D,

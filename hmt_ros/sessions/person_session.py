@@ -15,6 +15,7 @@ import numpy as np
 from hmt_ros.body import Body, Camera
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box
+from hmt_ros.image.person_shape import covered
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
@@ -25,7 +26,6 @@ from hmt_ros.sessions.handled import HandlingLog, Output
 from hmt_ros.sessions.track_start import TrackStart
 from hmt_ros.tracking import Status, Tracker
 from hmt_ros.tracking.association import moved
-from hmt_ros.tracking.person_shape import covered
 from hmt_ros.tracking.settings import LIKELY_NATS
 
 BODIES = 'humans/bodies'

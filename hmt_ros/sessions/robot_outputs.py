@@ -16,10 +16,10 @@ from functools import cached_property
 import numpy as np
 
 from hmt_ros.body import Body
+from hmt_ros.body.keep_out import Capsules, keep_out_capsules, reach_after
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.focal_length import with_depth_error
-from hmt_ros.tracking.keep_out import Capsules, keep_out_capsules, reach_after
 from hmt_ros.tracking.prediction import Forecaster
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keep_out import KeepOut, KeepOutState

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.keep_out import keep_out_capsules
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.terms.depth import usable_depths
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.tracking import KnownGround, Subject, Tracker
-from hmt_ros.tracking.keep_out import keep_out_capsules
 from msg_tools import RosbagsMessages
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message

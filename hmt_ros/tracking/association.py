@@ -1,185 +1,23 @@
-"""Assignment of the people whom a detector sees in an image to the people who are tracked.
+"""The same names as `hmt_ros.image.association`, for modules that import them from here."""
 
-    cost(i, j) = median_k |u_ik + v_i dt - p_jk| / s_i        over the joints k that both have
+from hmt_ros.image.association import (
+    GATE,
+    ImageTrack,
+    Sighting,
+    assigned,
+    grown,
+    hull,
+    moved,
+    unknown_area,
+)
 
-u_i are the joints of person i where they were last seen, v_i is the velocity of the person in the
-image, s_i the size of the person, and p_j are the joints of detection j; where they have no joints
-in common the middles of their boxes count. A pair is possible below a cost that grows with the time
-for which the person was not seen. The assignment minimises the sum of costs; a person without a
-detection has the cost of the worst possible pair.
-
-The nearer of two people hides the farther one. For the farther one all pixels of the nearer one are
-unknown; for the nearer one only those that the farther one covers beside it.
-"""
-
-from __future__ import annotations
-
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-
-import cv2
-import numpy as np
-from scipy.optimize import linear_sum_assignment
-
-from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.inference.arrays import Array, Mask
-from hmt_ros.inference.error_model import seconds
-
-# Cost below which a pair is possible from one image to the next, in sizes of the person; it doubles
-# within `GOES_ON`.
-GATE = 0.4
-# Time for which a person is taken to go on as before, and to keep the size though less is seen now,
-# s, and the time constant of the velocity.
-GOES_ON = 1.0
-MEMORY = 0.25
-# Margin around the area of a person, or around the hull of keypoints, that is masked for others, as
-# a fraction of the height: the radius of a limb.
-MARGIN = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """Where somebody is in an image.
-
-    Attributes:
-        joints: pixels (2,) of the visible joints, by name.
-        corners: (2, 2) left top and right bottom of the box around the person, px.
-    """
-
-    joints: dict[str, Array]
-    corners: Array
-
-    @classmethod
-    def of(cls, keypoints: Keypoints, corners: Array) -> Sighting:
-        """A sighting from keypoints, maybe none, and a box."""
-        seen = np.flatnonzero(keypoints.seen)
-        return cls({keypoints.names[i]: keypoints.pixels[i] for i in seen}, corners)
-
-    @property
-    def middle(self) -> Array:
-        """(2,) of the box, px."""
-        return np.asarray(self.corners.mean(0))
-
-    @property
-    def size(self) -> float:
-        """Diagonal of the box, px; 1 at least."""
-        return max(float(np.hypot(*(self.corners[1] - self.corners[0]))), 1.0)
-
-    def shifts_to(self, other: Sighting) -> Array:
-        """Shifts (n, 2) of the common joints to another sighting; without any, of the middle."""
-        common = [name for name in self.joints if name in other.joints]
-        if not common:
-            return np.asarray((other.middle - self.middle)[None])
-        return np.array([other.joints[name] - self.joints[name] for name in common])
-
-
-class ImageTrack:
-    """Where a person was last seen in the images, and how fast the person moves there.
-
-    Args:
-        sighting: the first.
-        stamp: of its image, ns.
-
-    Attributes:
-        sighting: the last one.
-        stamp: of its image, ns.
-        velocity: (2,) px/s.
-        size: of the person, px; it does not shrink at once when a part is hidden for a while.
-    """
-
-    def __init__(self, sighting: Sighting, stamp: int) -> None:
-        self.sighting, self.stamp = sighting, stamp
-        self.velocity = np.zeros(2)
-        self.size = sighting.size
-        self._known_for = 0.0
-
-    def update(self, sighting: Sighting, stamp: int) -> None:
-        """Takes the next sighting, of a later image."""
-        dt = seconds(stamp - self.stamp)
-        moved = np.median(self.sighting.shifts_to(sighting), axis=0)
-        self._known_for += dt
-        # At first the mean over all sightings, later that over the last moments.
-        gain = min(dt / min(self._known_for, MEMORY), 1.0)
-        self.velocity += gain * (moved / dt - self.velocity)
-        self.size = max(sighting.size, self.size * math.exp(-dt / GOES_ON))
-        self.sighting, self.stamp = sighting, stamp
-
-    def shift(self, stamp: int) -> Array:
-        """Way (2,) that the person is expected to have moved since then, px."""
-        dt = min(seconds(stamp - self.stamp), GOES_ON)
-        return np.asarray(dt * self.velocity)
-
-    def cost(self, sighting: Sighting, stamp: int) -> float:
-        """Distance of a sighting from where the person is expected, in sizes of the person."""
-        off = self.sighting.shifts_to(sighting) - self.shift(stamp)
-        return float(np.median(np.hypot(*off.T))) / self.size
-
-    def gate(self, stamp: int) -> float:
-        """Cost from which a sighting is of somebody else."""
-        return GATE * (1.0 + min(seconds(stamp - self.stamp) / GOES_ON, 1.0))
-
-
-def assigned(
-    tracks: Sequence[ImageTrack], sightings: Sequence[Sighting], stamp: int
-) -> dict[int, int]:
-    """Number of the sighting in an image by number of the track, for tracks that have one."""
-    if not tracks or not sightings:
-        return {}
-    costs = np.array([[track.cost(each, stamp) for each in sightings] for track in tracks])
-    gates = np.array([track.gate(stamp) for track in tracks])[:, None]
-    # An impossible pair costs the same as no pair.
-    rows, columns = linear_sum_assignment(np.where(costs < gates, costs, gates))
-    return {
-        int(row): int(column)
-        for row, column in zip(rows, columns, strict=True)
-        if costs[row, column] < gates[row, 0]
-    }
-
-
-def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) -> Mask | None:
-    """Pixels (H, W) without evidence about a person; None: there are none.
-
-    Args:
-        mine: (H, W) that the person covers.
-        nearer, farther: areas of the people before and behind the person.
-    """
-    result = np.zeros_like(mine)
-    for area in nearer:
-        result |= area
-    for area in farther:
-        result |= area & ~mine
-    return result if result.any() else None
-
-
-def hull(sighting: Sighting, shape: tuple[int, ...]) -> Mask:
-    """Pixels (H, W) within the joints of somebody, or within the box, with a margin."""
-    joints = np.array(list(sighting.joints.values()))
-    if len(joints) < 3:
-        (left, top), (right, bottom) = sighting.corners.tolist()
-        joints = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
-    limit = 4.0 * max(shape)
-    points = np.clip(joints, -limit, limit).round().astype(np.int32)
-    mask = np.zeros(shape[:2], dtype=np.uint8)
-    cv2.fillConvexPoly(mask, cv2.convexHull(points), 1)
-    return grown(mask.view(np.bool_))
-
-
-def grown(area: Mask) -> Mask:
-    """An area (H, W) with a margin."""
-    pixels = area.view(np.uint8)
-    size = max(round(MARGIN * cv2.boundingRect(pixels)[3]), 1)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
-    return np.asarray(cv2.dilate(pixels, kernel), dtype=np.uint8) > 0
-
-
-def moved(area: Mask, shift: Array) -> Mask:
-    """An area (H, W) moved by a shift (2,) of whole pixels."""
-    height, width = area.shape
-    dx, dy = (int(x) for x in np.clip(np.rint(shift), -max(area.shape), max(area.shape)))
-    result = np.zeros_like(area)
-    if abs(dx) < width and abs(dy) < height:
-        rows = slice(max(dy, 0), height + min(dy, 0)), slice(max(-dy, 0), height + min(-dy, 0))
-        columns = slice(max(dx, 0), width + min(dx, 0)), slice(max(-dx, 0), width + min(-dx, 0))
-        result[rows[0], columns[0]] = area[rows[1], columns[1]]
-    return result
+__all__ = [
+    'GATE',
+    'ImageTrack',
+    'Sighting',
+    'assigned',
+    'grown',
+    'hull',
+    'moved',
+    'unknown_area',
+]

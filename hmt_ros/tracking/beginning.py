@@ -33,15 +33,20 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera import Camera, log_prior_of_distance
 from hmt_ros.body.mirror import reverse_depth
 from hmt_ros.experts.lifted_fit import KNOWN_SIZE, poses_of
 from hmt_ros.experts.lifter import landmark_rays
+from hmt_ros.image.joint_depths import depths_of, moved_to_depth
+from hmt_ros.image.keypoint_evidence import FEWEST_KEYPOINTS, shows_a_part, suffices
 from hmt_ros.image.observation import Box, Observation
+from hmt_ros.image.person_shape import looks_like_person
 from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.subject import Subject
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.existence import CLEAR, Existence
 from hmt_ros.tracking.ground import Gravity
@@ -51,23 +56,15 @@ from hmt_ros.tracking.initialisation import (
     poses_from_outline,
     start_from_keypoints,
 )
-from hmt_ros.tracking.keypoint_evidence import FEWEST_KEYPOINTS, shows_a_part, suffices
-from hmt_ros.tracking.person_shape import looks_like_person
 from hmt_ros.tracking.pose_prediction import PosePrediction
-from hmt_ros.tracking.settings import PRESENT_PROBABILITY
-from hmt_ros.tracking.start_depth import depths_of, moved_to_depth
-from hmt_ros.tracking.subject import Subject
+from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOMENT
 from hmt_ros.tracking.view import View
 
-# Distances at which a lens of so many degrees sees 95 % of people, m.
-NEAREST, FARTHEST, LENS = 0.4, 15.0, math.radians(60.0)
 # What a prediction is sure of by itself, nats: in the first image nothing else has spoken.
 AT_ONCE = 1.5 * CLEAR.nats
 PRESENT_LOG_ODDS = math.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY))
-# A person hardly moves in so long a time, ns.
-SAME_MOMENT_NS = 200_000_000
-# Number of the best poses from keypoints whose reversals in depth are searched, too.
-REVERSED = 24
+# Share of the best poses from keypoints whose reversals in depth are searched, too.
+REVERSED = MAX_STARTS // 4
 
 
 class Source(Enum):
@@ -141,7 +138,7 @@ class Shown:
 def _from_subject(shown: Shown) -> Beginning:
     subject = shown.given
     assert isinstance(subject, Subject)
-    fresh = shown.view.stamp - subject.stamp_ns <= SAME_MOMENT_NS
+    fresh = seconds(shown.view.stamp - subject.stamp_ns) <= SAME_MOMENT
     begun = start_from_keypoints(
         shown.model,
         shown.camera,
@@ -252,16 +249,6 @@ def first_start(shown: Shown, existence: Existence) -> Beginning | None:
     if begun is not None:
         log_odds += log_prior_of_distance(shown.camera, float(begun.best[0, 2]))
     return begun if log_odds >= PRESENT_LOG_ODDS else None
-
-
-def log_prior_of_distance(camera: Camera, distance: float) -> float:
-    """How usual it is that a camera sees a person at a distance, m, in nats below the most usual.
-
-    Log-normal, and wide: it is a prior, and limits nothing.
-    """
-    lens = camera.fx / (0.5 * camera.width / math.tan(0.5 * LENS))
-    middle, sigma = math.sqrt(NEAREST * FARTHEST), math.log(FARTHEST / NEAREST) / 4.0
-    return -0.5 * (math.log(max(distance, 1e-3) / (lens * middle)) / sigma) ** 2
 
 
 def lifted_poses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:

@@ -15,72 +15,19 @@ and means of velocities and covariances of states follow with this Jacobian.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera_pose import CameraPose
 from hmt_ros.body.mirror import propagated, turn_jacobians, turned
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds
 from hmt_ros.tracking.classes import ways
 from hmt_ros.tracking.hypotheses import Modes
+from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
 
-# Time for which the last known motion of the camera is taken to go on, s.
-LONGEST_GUESS = 0.5
-# Most that the entries of R R' differ from those of the identity.
-NOT_ORTHOGONAL = 1e-3
-# Shift of the still scene, px, above which a background belongs to another view.
-SHIFTED = 2.0
-# Distance of people and of the scene, where it is unknown, m.
-USUAL_DISTANCE = 3.0
-
-
-class CameraPose(NamedTuple):
-    """Pose of the camera optical frame in a frame that stands still: p_fixed = C p + c.
-
-    Attributes:
-        rotation: C (3, 3).
-        position: c (3,), m.
-    """
-
-    rotation: Array
-    position: Array
-
-    @classmethod
-    def of(cls, position: ArrayLike, rotation: ArrayLike) -> CameraPose:
-        """A pose from position (3,), m, and rotation (3, 3).
-
-        Raises:
-            ValueError: other shapes, numbers that are not finite, or no rotation.
-        """
-        place, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
-        if place.shape != (3,) or not np.isfinite(place).all():
-            raise ValueError(
-                f'the position of the camera must be three finite numbers, saw {place.tolist()}'
-            )
-        if (
-            turn.shape != (3, 3)
-            or not np.abs(turn @ turn.T - np.eye(3)).max() < NOT_ORTHOGONAL
-            or np.linalg.det(turn) < 0
-        ):
-            raise ValueError(
-                f'the rotation of the camera must be a rotation matrix (3, 3), saw {turn.tolist()}'
-            )
-        return cls(turn, place)
-
-    def equals(self, other: CameraPose) -> bool:
-        """Whether the other pose has the very same numbers."""
-        return all(np.array_equal(a, b) for a, b in zip(self, other, strict=True))
-
-    def shift(self, other: CameraPose, camera: Camera) -> float:
-        """About how far the images of still points are apart from the two poses, px."""
-        angle = Rotation.from_matrix(self.rotation.T @ other.rotation).magnitude()
-        apart = float(np.linalg.norm(self.position - other.position))
-        return float(max(camera.fx, camera.fy) * (angle + apart / USUAL_DISTANCE))
+__all__ = ['CameraMotion', 'CameraPath', 'CameraPose']
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +112,8 @@ class CameraPath:
     """The poses of the camera at the images, given for most of them.
 
     Where an image has none, the camera is taken to go on as between the last two poses that were
-    given, for `LONGEST_GUESS` at most; after that its motion is unknown until the next one is
-    given. A guess does not count against a later pose: the pose at the image before is then
+    given, for `MAX_EXTRAPOLATION_TIME` at most; after that its motion is unknown until the next one
+    is given. A guess does not count against a later pose: the pose at the image before is then
     interpolated.
 
     Attributes:
@@ -193,7 +140,9 @@ class CameraPath:
             if not before:
                 return None
             return CameraMotion.between(_pose_at(before[0], (stamp, pose), last), pose)
-        self.known = len(self._given) == 2 and seconds(stamp - self._given[-1][0]) <= LONGEST_GUESS
+        self.known = (
+            len(self._given) == 2 and seconds(stamp - self._given[-1][0]) <= MAX_EXTRAPOLATION_TIME
+        )
         if not self.known:
             return None
         first, second = self._given
@@ -209,7 +158,4 @@ def _pose_at(
         return b
     if stamp == start:
         return a
-    share = (stamp - start) / (end - start)
-    turn = Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec()
-    rotation = a.rotation @ Rotation.from_rotvec(share * turn).as_matrix()
-    return CameraPose(rotation, a.position + share * (b.position - a.position))
+    return a.towards(b, (stamp - start) / (end - start))

@@ -26,6 +26,7 @@ from hmt_ros.image.unseen_limbs import UnseenLimbs
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.inference.motion_states import PredictedStates
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.classes import (
     best_of_the_other_way,
@@ -53,7 +54,6 @@ from hmt_ros.tracking.misfit import (
     of_keypoints,
     of_silhouette,
 )
-from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.pose_prediction import PosePrediction

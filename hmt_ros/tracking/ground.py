@@ -20,47 +20,35 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera, roll, shortest_turn
+from hmt_ros.body.camera import AXES, IMAGE_UP, Camera, roll, shortest_turn
+from hmt_ros.body.camera_pose import USUAL_DISTANCE
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm, masses, soles
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import turned
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.vertical_lines import Vertical, seen_vertical
 from hmt_ros.inference.arrays import Array, Image
-from hmt_ros.tracking.camera_motion import USUAL_DISTANCE, CameraMotion
+from hmt_ros.inference.error_model import seconds
+from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
+from hmt_ros.tracking.settings import (
+    AXIS_SIGMA,
+    GIVEN_UP_SIGMA,
+    HEAD_DOWN_IMAGES,
+    LEVEL_QUANTILE,
+    LEVEL_SIGMA,
+    LEVEL_TIME,
+    LOOK_NATS,
+    MEASURED_SIGMA,
+    RIGHT_VERTICAL_NATS,
+    TURN_NOISE,
+    UP_DRIFT,
+    UP_SIGMA,
+    UPRIGHT_CONCENTRATION,
+    VERTICAL_TIME,
+)
 
-__all__ = ['Ground', 'GroundEstimator', 'GroundSettings', 'KnownGround']
-
-# Standard deviations of a direction whose own is not told, rad, and of a measured height, m.
-GIVEN_UP_SIGMA, GIVEN_HEIGHT_SIGMA = np.radians(2.0), 0.02
-# The y axis of an image points down; how far the direction of gravity is from it, and at most, rad.
-IMAGE_UP = np.array([0.0, -1.0, 0.0])
-UP_SIGMA, MOST_TILT = np.radians(15.0), np.radians(35.0)
-# Deviation of the axis of a standing body from the vertical, across and along the line of sight,
-# rad, and the time for which its error lasts, s. That of the vertical never undercuts the first.
-AXIS_SIGMA, AXIS_DEPTH_SIGMA, AXIS_TIME = np.radians(4.0), np.radians(9.0), 1.0
-# How fast the vertical is forgotten, rad/sqrt(s).
-UP_DRIFT = np.radians(1.0)
-# Time over which the lowest sole is followed, s; its quantile that is the floor; deviations of the
-# floor from it, and of the first image, m.
-LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
-LEVEL_SIGMA, FIRST_LEVEL_SIGMA = 0.04, 0.10
-# Change of a given direction of gravity that no noise of a sensor makes: the camera turns, rad.
-TURNED = 0.003
-# Time from one look at the lines of the scene to the next, s.
-LOOK_TIME = 1.0
-# Number of images from the start on that show a person head down by a given vertical, above which
-# it is the wrong way round though it points up in the image: handstands are shorter.
-HEAD_DOWN = 30.0
-# Cosine between trunk and vertical in an image from which it is upright or head down.
-HEAD_UP = 0.7
-# Log odds that a given vertical is wrong: before any image, for a camera that is about upright and
-# for another; most that one look at lines says. What somebody who lies says at most: some do, and
-# few stand on their head, who says twice that.
-WRONG, ONE_LOOK, LYING = (-3.5, -2.5), 2.0, 3.5
-# Concentration of the axes of people who do not lie about the vertical.
-STANDING = 8.0
+__all__ = ['GIVEN_UP_SIGMA', 'Ground', 'GroundEstimator', 'GroundSettings', 'KnownGround']
 
 
 @dataclass(frozen=True)
@@ -117,7 +105,7 @@ def unit_vector(up: ArrayLike) -> Array:
         ValueError: another shape, or a length that is not 1 within 1 %.
     """
     vector = np.array(up, dtype=np.float64)
-    length = float(np.linalg.norm(vector)) if vector.shape == (3,) else np.nan
+    length = float(np.linalg.norm(vector)) if vector.shape == IMAGE_UP.shape else np.nan
     if not abs(length - 1.0) < 0.01:
         raise ValueError(
             f'up must be a unit vector (3,) against gravity in the camera frame, saw {vector}'
@@ -135,14 +123,14 @@ class GroundEstimator:
     given one, which the lines of the scene (`image.vertical_lines`) refine. Without one it is that
     of the lines; where they show none, it is near the vertical of the image, and near the axis of a
     body that stands, from the middle of the feet to the centre of mass. Errors of that
-    axis last, so its images count as one per `AXIS_TIME`, and the deviation never goes below
+    axis last, so its images count as one per `VERTICAL_TIME`, and the deviation never goes below
     `AXIS_SIGMA`.
 
     Lines that show another vertical, and a person who lies by it, make a given one doubtful. It may
     be the wrong way round, as an accelerometer at rest measures gravity: where keypoints show the
     person head down, from the first image on where it points down in the image, else for
-    `HEAD_DOWN` images, its opposite is used. A jump of the vertical of the lines alone is believed
-    when the next look shows it too.
+    `HEAD_DOWN_IMAGES` images, its opposite is used. A jump of the vertical of the lines alone is
+    believed when the next look shows it too.
 
     Args:
         known: gravity and floor without the images; None: unknown.
@@ -172,7 +160,7 @@ class GroundEstimator:
 
     def reset(self) -> None:
         """Forgets the estimates from a track."""
-        self._mean, self._covariance = IMAGE_UP, np.eye(3) * UP_SIGMA**2
+        self._mean, self._covariance = IMAGE_UP, AXES * UP_SIGMA**2
         self._levels: deque[tuple[float, float]] = deque()
         self._time = 0.0
         self._distance = USUAL_DISTANCE
@@ -204,7 +192,7 @@ class GroundEstimator:
     ) -> None:
         """Takes a newer direction (3,) against gravity, camera frame, and height of the camera."""
         before, unit = self.known.up, unit_vector(up)
-        self.turning = before is not None and float(np.linalg.norm(unit - before)) > TURNED
+        self.turning = before is not None and float(np.linalg.norm(unit - before)) > TURN_NOISE
         height = self.known.camera_height if camera_height is None else camera_height
         self.known = KnownGround(unit, height, up_sigma)
         self._conclude()
@@ -215,7 +203,7 @@ class GroundEstimator:
         up = self.known.up
         if up is None:
             return False
-        return self._by_keypoints < (0.0 if up @ IMAGE_UP < 0.0 else -HEAD_DOWN)
+        return self._by_keypoints < (0.0 if up @ IMAGE_UP < 0.0 else -HEAD_DOWN_IMAGES)
 
     @property
     def contradicted(self) -> bool:
@@ -223,12 +211,15 @@ class GroundEstimator:
         given = self._given
         if given is None:
             return False
-        return WRONG[int(given @ IMAGE_UP < 0.5)] + self._by_lines + self._by_person > 0.0
+        # A camera that hangs or lies is more often given the wrong one.
+        upright = bool(given @ IMAGE_UP >= 0.5)
+        prior = -RIGHT_VERTICAL_NATS if upright else 1.0 - RIGHT_VERTICAL_NATS
+        return prior + self._by_lines + self._by_person > 0.0
 
     @property
     def level(self) -> Array:
         """(3, 3) from an upright camera's axes to the camera's, as far as the vertical is known."""
-        return roll(self.estimate.up) if self.vertical_known else np.eye(3)
+        return roll(self.estimate.up) if self.vertical_known else AXES.copy()
 
     @property
     def _given(self) -> Array | None:
@@ -240,16 +231,16 @@ class GroundEstimator:
         """Takes in which way up a detector sees the person, by names of our joints."""
         if self.known.up is not None:
             trunk = keypoints.trunk
-            cosine = float(trunk @ self.known.up[:2]) / max(float(np.linalg.norm(trunk)), 1e-9)
-            self._by_keypoints += cosine if abs(cosine) > HEAD_UP else 0.0
+            length = max(float(np.linalg.norm(trunk)), np.finfo(np.float64).eps)
+            self._by_keypoints += float(trunk @ self.known.up[:2]) / length
             self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
         """Takes in the lines of an image, if it is time to; a stamp is in ns."""
-        if self._looked is not None and 0 <= stamp - self._looked < 1e9 * LOOK_TIME:
+        if self._looked is not None and 0 <= seconds(stamp - self._looked) < VERTICAL_TIME:
             return
         self._looked, given = stamp, self._given
-        found = seen_vertical(image, camera, np.eye(3) if given is None else roll(given))
+        found = seen_vertical(image, camera, AXES if given is None else roll(given))
         if found is None:
             return
         again, before = self._missed, self._seen
@@ -258,8 +249,8 @@ class GroundEstimator:
             self._seen, self._missed = found, False
         if given is not None:
             said = -np.log(found.agreement(given, self.known.up_sigma))
-            said = np.clip(said, -ONE_LOOK, ONE_LOOK)
-            self._by_lines = float(np.clip(self._by_lines + said, -ONE_LOOK, 2.0 * ONE_LOOK))
+            said = np.clip(said, -LOOK_NATS, LOOK_NATS)
+            self._by_lines = float(np.clip(self._by_lines + said, -LOOK_NATS, 2.0 * LOOK_NATS))
         self._conclude()
 
     @property
@@ -304,11 +295,13 @@ class GroundEstimator:
             axis = axes / np.linalg.norm(axes, axis=0) @ weights
             if self._given is not None:
                 cosine = float(axis @ self._given)
-                stands = 2.0 * STANDING * np.exp(STANDING * (cosine - 1.0))
-                lies = np.exp(-LYING * (1.0 + max(-cosine, 0.0)))
-                said = -np.log(stands + lies) * min(dt / AXIS_TIME, 1.0)
-                most = LYING * (1.0 + max(-cosine, 0.0))
-                self._by_person = float(np.clip(self._by_person + said, -LYING, most))
+                stands = (
+                    2.0 * UPRIGHT_CONCENTRATION * np.exp(UPRIGHT_CONCENTRATION * (cosine - 1.0))
+                )
+                lies = np.exp(-RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0)))
+                said = -np.log(stands + lies) * min(dt / VERTICAL_TIME, 1.0)
+                most = RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0))
+                self._by_person = float(np.clip(self._by_person + said, -RIGHT_VERTICAL_NATS, most))
             elif self._seen is None:
                 self._follow_axis(axis, place, resting, dt)
                 self._conclude()
@@ -327,17 +320,18 @@ class GroundEstimator:
             return
         ray = place / np.linalg.norm(place)
         along = np.outer(ray, ray)
-        error = AXIS_SIGMA**2 * (np.eye(3) - along) + AXIS_DEPTH_SIGMA**2 * along
-        error = error * max(AXIS_TIME / (resting * dt), 1.0)
-        covariance = self._covariance + UP_DRIFT**2 * dt * np.eye(3)
+        error = AXIS_SIGMA**2 * (AXES - along) + (2.0 * AXIS_SIGMA) ** 2 * along
+        error = error * max(VERTICAL_TIME / (resting * dt), 1.0)
+        covariance = self._covariance + UP_DRIFT**2 * dt * AXES
         gain = covariance @ np.linalg.inv(covariance + error)
         mean = self._mean + gain @ (axis / length - self._mean)
         mean = mean / np.linalg.norm(mean)
         angle = float(np.arccos(np.clip(mean @ IMAGE_UP, -1.0, 1.0)))
-        if angle > MOST_TILT:
+        most = 2.0 * UP_SIGMA
+        if angle > most:
             aside = mean - IMAGE_UP * (mean @ IMAGE_UP)
             aside = aside / np.linalg.norm(aside)
-            mean = np.cos(MOST_TILT) * IMAGE_UP + np.sin(MOST_TILT) * aside
+            mean = np.cos(most) * IMAGE_UP + np.sin(most) * aside
         self._mean = mean
         values, vectors = np.linalg.eigh(covariance - gain @ covariance)
         values = np.clip(values, AXIS_SIGMA**2, UP_SIGMA**2)
@@ -350,12 +344,12 @@ class GroundEstimator:
         elif given is not None:
             seen = Vertical(given, known.up_sigma)
         if seen is None:
-            seen = Vertical(self._mean, float(np.sqrt(self._covariance.trace() / 3.0)))
+            seen = Vertical(self._mean, float(np.sqrt(self._covariance.trace() / len(self._mean))))
         up, up_sigma = seen.up, seen.sigma
         tracked, tracked_sigma = self._tracked_level()
         height, sigma = tracked, tracked_sigma
         if known.camera_height is not None:
-            height, sigma = known.camera_height, GIVEN_HEIGHT_SIGMA
+            height, sigma = known.camera_height, 2.0 * MEASURED_SIGMA
         self.estimate = Ground(up, up_sigma, height, sigma)
         # An error of the vertical lifts the floor where the person is.
         measured = known.camera_height is not None
@@ -371,7 +365,7 @@ class GroundEstimator:
             return None, np.inf
         levels = np.array([level for _, level in self._levels])
         low, high = np.quantile(levels, [0.5, LEVEL_QUANTILE])
-        few = FIRST_LEVEL_SIGMA / np.sqrt(len(levels))
+        few = 2.0 * LEVEL_SIGMA / np.sqrt(len(levels))
         return float(high), float(np.sqrt(LEVEL_SIGMA**2 + (high - low) ** 2 + few**2))
 
 

@@ -18,15 +18,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera import AXES, Camera
 from hmt_ros.body.ground_terms import without_root_lean
 from hmt_ros.body.kinematics import directed_derivatives, forward, joint_length_jacobians
 from hmt_ros.body.model_file import held
 from hmt_ros.flips.interpretation_tree import distinct_poses, enumerate_flips
+from hmt_ros.image.joint_depths import MIN_JOINTS, JointDepths, joint_depths
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Box, Observation
-from hmt_ros.image.pose_energy import PoseEnergy
+from hmt_ros.image.pose_energy import DAMPING, MAX_ITERATIONS, TOLERANCE, PoseEnergy, scale_of
 from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.subject import Subject
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import NOT_EXCHANGED, Keypoints, KeypointTerm
@@ -37,22 +39,20 @@ from hmt_ros.inference.energy import Derivatives, EnergyFunction, Quadratic
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.misfit import of_depth
-from hmt_ros.tracking.start_depth import FEWEST, JointDepths, joint_depths
-from hmt_ros.tracking.subject import Subject
+from hmt_ros.tracking.settings import (
+    BOX_SIGMA,
+    GATE_SIGMAS,
+    HEADINGS,
+    MAX_STARTS,
+    MEASURED_SIGMA,
+    START_DISTANCE,
+)
 from hmt_ros.tracking.validity import UNDECIDED
 
-# Standard deviation of a length that was measured on the person, and of the stature, which also has
-# a skull and a heel that are not the model's, m.
-MEASURED, STATURE_MEASURED = 0.01, 0.02
-# A stature this many standard deviations from the usual one is not believed.
-MOST_UNUSUAL = 4.0
-HEADINGS = 8
+# Standard deviation of a measured stature, m: it has a skull and a heel that are not the model's.
+STATURE_SIGMA = 2.0 * MEASURED_SIGMA
 NO_POSE = 'no pose of the body explains the keypoints: are they in the image?'
 LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
-# Axis of the camera, along which depths are measured.
-AXIS = np.array([0.0, 0.0, 1.0])
-# Standard deviation of the place of a person in a given box, as a share of the distance.
-BOX_SIGMA = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +62,10 @@ class Start:
     Attributes:
         body: with the person's lengths.
         poses: (M, d) distinct poses, best first.
-        energies: (M,) of joints and soft prior.
-        hessians: (M, d, d).
     """
 
     body: Body
     poses: Array
-    energies: Array
-    hessians: Array
 
 
 def start_from_keypoints(
@@ -127,7 +123,7 @@ def _start(
     spread = np.linalg.inv(fits.hessian[best[0]])[d:, d:]
     body = replace(body, length_covariance=0.5 * (spread + spread.T))
     solved = _with_flips(body, camera, keypoints, prior_weight, upright, depths, fits.x[:, :d])
-    return Start(body, solved.x, solved.value, solved.hessian)
+    return Start(body, solved.x)
 
 
 def _with_flips(
@@ -153,14 +149,14 @@ def _with_flips(
     terms = (*likelihood.seen(observation, exchanges=NOT_EXCHANGED), *likelihood.priors)
     energy = PoseEnergy(likelihood, terms if upright is None else (*terms, upright.term(body)))
 
-    heads = _distinct(_solve(energy, guesses, body), body, 4)
+    heads = _distinct(energy.minimise(guesses), body, HEADINGS // 2)
     if len(heads.x) == 0:
         raise ValueError(NO_POSE)
     trees = [enumerate_flips(body, heads.x, c)[0] for c in (*body.chains, *body.chain_pairs)]
     flips = np.concatenate([heads.x, *trees])
     raw = energy.energy(flips, derivatives=Derivatives.NONE).value
-    keep = np.argsort(raw, kind='stable')[:192]
-    solved = _distinct(_solve(energy, flips[keep], body), body, 96)
+    keep = np.argsort(raw, kind='stable')[: 2 * MAX_STARTS]
+    solved = _distinct(energy.minimise(flips[keep]), body, MAX_STARTS)
     return solved[np.argsort(solved.value, kind='stable')]
 
 
@@ -248,7 +244,7 @@ def _poses_between(body: Body, low: Array, high: Array) -> Array:
     result[:, body.dof_names.index('root_z')] = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
     heights = (body.joint_positions(result) @ body.level)[..., 1]
     top, bottom = heights.min(1), heights.max(1)
-    depth = (bottom - top) / max(high[1] - low[1], 1e-3)
+    depth = (bottom - top) / max(high[1] - low[1], np.finfo(np.float64).eps)
     result[:, :3] = depth[:, None] * np.append(middle, 1.0)
     result[:, 1] -= 0.5 * (top + bottom)
     result[:, :3] = result[:, :3] @ body.level.T
@@ -267,10 +263,10 @@ def _sized(body: Body, subject: Subject) -> Body:
         scaled = {x: body.segment_lengths[x] * factor for x in names if x not in known}
         body = body.with_segment_lengths({**scaled, **known})
     rows = [np.eye(len(names))[[name in known for name in names]]]
-    sigma = [MEASURED] * len(known)
+    sigma = [MEASURED_SIGMA] * len(known)
     if subject.stature is not None:
         rows.append(body.stature_rates[None])
-        sigma.append(STATURE_MEASURED)
+        sigma.append(STATURE_SIGMA)
     covariance = held(body.length_covariance, np.concatenate(rows), sigma)
     return replace(body, length_covariance=covariance)
 
@@ -279,8 +275,8 @@ def _is_a_stature(body: Body, lengths: Array) -> bool:
     """Whether lengths (L,) make a stature that people have."""
     rates = body.stature_rates
     change = float(rates @ (lengths - body.skeleton.lengths))
-    variance = float(rates @ body.length_covariance @ rates) + STATURE_MEASURED**2
-    return abs(change) <= MOST_UNUSUAL * math.sqrt(variance)
+    variance = float(rates @ body.length_covariance @ rates) + STATURE_SIGMA**2
+    return abs(change) <= GATE_SIGMAS * math.sqrt(variance)
 
 
 def _fit_with_lengths(
@@ -323,7 +319,7 @@ def _fit_with_lengths(
             cost, pull, curvature = measured.residuals(far[:, 2])
             joints = np.concatenate([joints, measured.joints])
             places = np.concatenate([places, far])
-            directions = np.concatenate([directions, np.tile(AXIS, (len(far), 1))])
+            directions = np.concatenate([directions, np.tile(AXES[2], (len(far), 1))])
             lengthened = joint_length_jacobians(own, poses[i : i + 1])[0][joints]
             jacobian = np.concatenate(
                 [
@@ -362,26 +358,18 @@ def _fit_with_lengths(
         ],
         axis=1,
     )
-    lower = np.concatenate([body.lower, np.minimum(default - 5 * sigma, 0.5 * default)])
-    upper = np.concatenate([body.upper, np.maximum(default + 5 * sigma, 2.0 * default)])
-    positive = (
-        skeleton.length_names.index('shoulder_rise')
-        if 'shoulder_rise' in skeleton.length_names
-        else None
-    )
-    lower[d:] = np.where(
-        np.arange(count) == positive, default - 5 * sigma, np.maximum(lower[d:], 0.02)
-    )
-    scale = np.concatenate([np.where(skeleton.dof_is_rotation, 0.4, 0.3), np.full(count, 0.05)])
+    reach = 5.0 * sigma
+    # A length that varies by more than itself may be negative.
+    least = np.where(sigma < default, np.finfo(np.float64).eps, -np.inf)
     return minimise(
         EnergyFunction(energy),
         starts,
-        lower,
-        upper,
-        step_scale=scale,
-        damping=10.0,
-        max_iterations=80,
-        tolerance=1e-3,
+        np.concatenate([body.lower, np.maximum(np.minimum(default - reach, 0.5 * default), least)]),
+        np.concatenate([body.upper, np.maximum(default + reach, 2.0 * default)]),
+        step_scale=np.concatenate([scale_of(body), np.full(count, 0.05)]),
+        damping=10.0 * DAMPING,
+        max_iterations=2 * MAX_ITERATIONS,
+        tolerance=TOLERANCE,
     )
 
 
@@ -406,8 +394,8 @@ def _first_guesses(
     spread = np.linalg.norm((joints - joints.mean(0))[:, :2], axis=1).mean()
     if not extent > 0:
         raise ValueError('the keypoints all lie on one point')
-    depth = float(np.clip(spread / extent, 0.5, 40.0))
-    if len(measured.depths) >= FEWEST:
+    depth = float(np.clip(spread / extent, body.lower[2], body.upper[2]))
+    if len(measured.depths) >= MIN_JOINTS:
         depth = float(np.median(measured.depths))
     middle = rays.mean(0) * depth
     result = np.tile(pose, (HEADINGS, 1))
@@ -420,19 +408,9 @@ def _first_guesses(
     return result
 
 
-def _solve(energy: PoseEnergy, poses: Array, body: Body) -> Minimum:
-    return energy.minimise(
-        poses,
-        step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
-        damping=1.0,
-        max_iterations=40,
-        tolerance=1e-3,
-    )
-
-
 def _distinct(solved: Minimum, body: Body, count: int) -> Minimum:
-    """The best minima whose joints differ by more than 3 cm somewhere."""
+    """The best minima whose joints differ by more than `START_DISTANCE` somewhere."""
     order = np.argsort(solved.value, kind='stable')
     order = order[np.isfinite(solved.value[order])]
-    distinct = distinct_poses(body.joint_positions(solved.x[order]), 0.03, count)
+    distinct = distinct_poses(body.joint_positions(solved.x[order]), START_DISTANCE, count)
     return solved[order[distinct.kept]]

@@ -32,14 +32,15 @@ from hmt_ros.inference.error_model import (
 )
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.inference.motion_states import PredictedStates, fused
 from hmt_ros.tracking.hypotheses import Modes, Optimised
-from hmt_ros.tracking.motion_states import PredictedStates, fused
 from hmt_ros.tracking.posterior import ImageFit, Posterior, free_covariances
+from hmt_ros.tracking.settings import GATE_SIGMAS
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.weighting import at_least, normalised
 
-# No mode of a likelihood is lighter, nats: exp(-690) = 1e-300 is a number still.
-LEAST_LOG_WEIGHT = -690.0
+# Smallest log weight of a mode of a likelihood, nats: its exponential is a number still.
+MIN_LOG_WEIGHT = np.log(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +128,7 @@ def likelihood_modes(
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
     parabola; its minimum and curvature make a component, its depth and its volume the weight, of at
-    least `LEAST_LOG_WEIGHT`. Nothing is discounted, except that one pair (s, tau) stands for
+    least `MIN_LOG_WEIGHT`. Nothing is discounted, except that one pair (s, tau) stands for
     keypoints and experts: their information per second is the same as in the filter.
 
     Args:
@@ -141,11 +142,11 @@ def likelihood_modes(
     covariances = fit.covariances
     gradient = np.where(fit.free, fit.energy.derivatives()[0], 0.0)
     step = -np.einsum('kij,kj->ki', covariances, gradient)
-    limit = 5.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
+    limit = GATE_SIGMAS * np.sqrt(np.einsum('kii->ki', modes.covariances))
     step = np.clip(step, -limit, limit)
     means = np.clip(poses + step, body.lower, body.upper)
     volumes = 0.5 * np.linalg.slogdet(covariances)[1]
-    weights = np.exp(at_least(normalised(volumes - fit.energy.value), LEAST_LOG_WEIGHT))
+    weights = np.exp(at_least(normalised(volumes - fit.energy.value), MIN_LOG_WEIGHT))
     mixture = GaussianMixture(weights, means, covariances).sorted()
     seen = PoseEnergy(posterior.likelihood, posterior.likelihood.seen(observation))
     values = -seen.energy(mixture.means, derivatives=Derivatives.NONE).value

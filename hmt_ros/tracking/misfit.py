@@ -1,8 +1,8 @@
 """Share of each cue of an image that no mode explains, from 0 to 1.
 
     silhouette   visible points of the model outside it
-    outline      samples of the silhouette's outline that are further than 4 sigmas from the model's
-    keypoints    those of a group that are further than 4 sigmas from their landmarks
+    outline      samples of the silhouette's outline further than `GATE_SIGMAS` from the model's
+    keypoints    those of a group further than `GATE_SIGMAS` from their landmarks
     depth        energy of the visible surface, as a share of the largest that there is
 
 Clothes in the colours of the scene are no foreground where the person is, nor is the person in the
@@ -19,6 +19,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
+from hmt_ros.image.joint_depths import moved_to_depth
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.sampling import ImageMap
@@ -27,13 +28,10 @@ from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import EXCHANGED, KeypointTerm
 from hmt_ros.inference.arrays import Array, Mask
-from hmt_ros.tracking.start_depth import moved_to_depth
+from hmt_ros.tracking.settings import GATE_SIGMAS
 
 # Keys of the misfits. That of the silhouette's outline is evidence about the track alone.
 SILHOUETTE, OUTLINE, KEYPOINTS = 'silhouette', 'outline', 'keypoints'
-# A sample of the outline or a keypoint further away than this from where it should be is
-# unexplained, in sigmas.
-UNEXPLAINED = 4.0
 
 
 class Misfit(NamedTuple):
@@ -116,7 +114,7 @@ def of_outline(costs: Array, term: TermSettings, belief: float) -> float:
     if costs.size == 0:
         return 0.0
     most = 0.5 * belief * term.weight / costs.shape[1] * term.scale**2
-    limit = UNEXPLAINED**2 / (UNEXPLAINED**2 + term.scale**2)
+    limit = GATE_SIGMAS**2 / (GATE_SIGMAS**2 + term.scale**2)
     return float((costs > limit * most).mean(1).min())
 
 
@@ -147,7 +145,7 @@ def of_keypoints(term: KeypointTerm, poses: Array) -> Misfit:
     counts = np.bincount(groups, minlength=count).astype(np.float64)
     if len(groups) == 0:
         return Misfit(np.zeros(count), counts)
-    missed = ~(term.distances(forward(term.skeleton, poses)) < UNEXPLAINED)
+    missed = ~(term.distances(forward(term.skeleton, poses)) < GATE_SIGMAS)
     best = missed[missed.mean(1).argmin()]
     found = np.bincount(groups, weights=best, minlength=count)
     return Misfit(found / np.maximum(counts, 1.0), counts)

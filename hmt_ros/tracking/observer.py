@@ -14,13 +14,13 @@ from dataclasses import replace
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.person_shape import raster_step
+from hmt_ros.image.silhouettes import Silhouettes, region_of
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.tracking.misfit import SILHOUETTE
-from hmt_ros.tracking.person_shape import raster_step
 from hmt_ros.tracking.settings import TrackerSettings
-from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 from hmt_ros.tracking.validity import Validity
 from hmt_ros.tracking.view import View
 

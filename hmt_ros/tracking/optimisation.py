@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
+from hmt_ros.inference.motion_states import PredictedStates
 from hmt_ros.tracking.evaluation_plan import EvaluationPlan
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, Optimised
-from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.weighting import Continuity

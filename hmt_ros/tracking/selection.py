@@ -18,6 +18,7 @@ from numba import njit
 
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.reduction import leaders
+from hmt_ros.tracking.settings import MAX_JOINT_DISTANCE
 
 
 class Kept(NamedTuple):
@@ -39,8 +40,8 @@ def choose_hypotheses(
     log_weights: Array,
     count: int,
     *,
-    same: float = 0.02,
-    cap: float = 0.3,
+    same: float,
+    cap: float = MAX_JOINT_DISTANCE,
     first: Sequence[int] = (),
 ) -> Kept:
     """The hypotheses to keep.
@@ -87,14 +88,14 @@ def _choose(joints, weights, count, same, cap, first):  # type: ignore[no-untype
     n, j = joints.shape[0], joints.shape[1]
     # One row a coordinate, so that the innermost loops run along memory; single precision is
     # micrometres here.
-    rows = np.ascontiguousarray(joints.reshape(n, 3 * j).T).astype(np.float32)
+    rows = np.ascontiguousarray(joints.transpose(1, 2, 0)).astype(np.float32)
     distance = np.empty((n, n), np.float32)
     cap, same = np.float32(cap), np.float32(same)
     for a in range(n):
         total = distance[a]
         total[:] = 0.0
         for k in range(j):
-            xs, ys, zs = rows[3 * k], rows[3 * k + 1], rows[3 * k + 2]
+            xs, ys, zs = rows[k, 0], rows[k, 1], rows[k, 2]
             xa, ya, za = xs[a], ys[a], zs[a]
             for b in range(n):
                 x, y, z = xa - xs[b], ya - ys[b], za - zs[b]

@@ -1,4 +1,10 @@
-"""How poses are tracked: all settings of a tracker."""
+"""How poses are tracked: the settings of a tracker, and the numbers of its model.
+
+Settings are what users choose. The numbers below are the same for all of them. Each has its unit
+and its source: `Physical` follows from people or from sensors, `Chosen` was set by hand, by tracked
+clips. Numbers of a concept of a lower layer stand with it: the person in `body`, silhouettes,
+colours and keypoints in `image`, errors of cues in `inference.error_model`.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +13,114 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 
+import numpy as np
+
 from hmt_ros.body.ground_terms import GroundSettings
 from hmt_ros.experts.lifter import SHIPPED
 from hmt_ros.image.likelihood import LikelihoodSettings
-from hmt_ros.tracking.evaluation_plan import ACCURATE, EvaluationPlan, plan_of
 
 MOTIONS = ('learned', 'random_walk')
 # Names of the proposals, whose classes are in `tracking.proposals`.
 PROPOSALS = ('kjs', 'css', 'ss')
+
+# --- Search
+
+# Evaluations of an image, where more hardly help. Source: benchmarks/tracking_budgets.py.
+ACCURATE_BUDGET = 400
+# Ratio of the squared motion of the heaviest mode to the expected one above which an image is
+# surprising: the motion prior is wider than most motions. Chosen.
+SURPRISING_RATIO = 0.3
+# Factor on the budget of a surprising image. Chosen.
+SURPRISING_FACTOR = 4
+# Distance of joints up to which two trunks, and two configurations of a limb, are the same, m.
+# Chosen.
+SAME_TRUNK_DISTANCE, SAME_LIMB_DISTANCE = 0.06, 0.08
+# Degrees of freedom of the Student prior that keeps a limb near its prediction. Chosen.
+LIMB_TAILS = 4.0
+# Factor on the deviations of the body's prior where configurations of a limb are drawn from it.
+# Chosen.
+PRIOR_STRETCH = 1.3
+# Largest distance that a joint counts with where hypotheses are selected, m. Chosen.
+MAX_JOINT_DISTANCE = 0.3
+
+# --- Weights and modes
+
+# Mean squared distance by which joints leave their prediction, m^2/s, and degrees of freedom of its
+# tails: modes tremble, and limbs are found where they were not looked for. Chosen.
+TRANSITION_SPREAD, TRANSITION_TAILS = 0.01, 2.0
+# A mode ends where all its continuations are less likely than exp(-c); c in nats. Chosen.
+END_NATS = 5.0
+# Standard deviations beyond which a measurement is not explained, and a value not believed. Chosen.
+GATE_SIGMAS = 4.0
+
+# --- Start of a track
+
+# Standard deviation of a length that was measured on the person, m: a tape. Physical.
+MEASURED_SIGMA = 0.01
+# Standard deviation of the place of a person in a given box, as a fraction of the distance. Chosen.
+BOX_SIGMA = 0.15
+# Headings from which a pose is fitted. Chosen.
+HEADINGS = 8
+# Maximum number of poses that a track starts from. Chosen.
+MAX_STARTS = 96
+# Distance of some joint from which two starts are distinct, m. Chosen.
+START_DISTANCE = 0.03
+# Time in which a person hardly moves, s. Chosen.
+SAME_MOMENT = 0.2
+
+# --- Shape of the person
+
+# Largest change by one image, and in all, in standard deviations over people. Chosen.
+MAX_SHAPE_STEP, MAX_SHAPE_CHANGE = 0.5, 3.0
+# Change from which the person is rebuilt with the estimate, in standard deviations over people
+# (2 mm of a length): whatever depends on a shape is rebuilt with it. Chosen.
+REBUILDING_CHANGE = 0.1
+# Largest change of an angle that gives way while the shape is estimated, rad. Chosen.
+MAX_ANGLE_SHIFT = 0.2
+
+# --- Gravity and floor
+
+# Standard deviation of a given direction of gravity whose own is unknown, rad: how well a camera is
+# mounted. Physical.
+GIVEN_UP_SIGMA = np.radians(2.0)
+# Standard deviation of gravity from the y axis of an image, rad: how people hold cameras. Chosen.
+UP_SIGMA = np.radians(15.0)
+# Deviation of the axis of a standing body from the vertical, rad; along the line of sight it is
+# twice as large. That of the vertical never undercuts it. Chosen.
+AXIS_SIGMA = np.radians(4.0)
+# Time for which an error of the vertical lasts, by the axis of a body and by the lines of the
+# scene, s. Chosen.
+VERTICAL_TIME = 1.0
+# How fast the vertical is forgotten, rad/sqrt(s). Chosen.
+UP_DRIFT = np.radians(1.0)
+# Time over which the lowest sole is followed, s, and its quantile that is the floor. Chosen.
+LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
+# Deviation of the floor from that quantile, m; that of one image is twice as large. Chosen.
+LEVEL_SIGMA = 0.04
+# Change of a given direction of gravity that no noise of a sensor makes: the camera turns, rad.
+# Physical.
+TURN_NOISE = 0.003
+# Images from the start on that show a person head down by a given vertical, counted by the cosine
+# between trunk and vertical, above which it is the wrong way round though it points up in the
+# image: handstands are shorter. Chosen.
+HEAD_DOWN_IMAGES = 30.0
+# Log odds against a given vertical before any image, for a camera that is about upright, nats; as
+# much is the most that somebody who lies says: some do. Chosen.
+RIGHT_VERTICAL_NATS = 3.5
+# Largest log odds that one look at the lines of the scene says, nats. Chosen.
+LOOK_NATS = 2.0
+# Concentration of the axes of people who do not lie about the vertical. Chosen.
+UPRIGHT_CONCENTRATION = 8.0
+
+# --- Camera and appearance
+
+# Time for which the last known motion of the camera is taken to go on, s. Chosen.
+MAX_EXTRAPOLATION_TIME = 0.5
+# More than this fraction of an image, or of a person, is most of it.
+MAJORITY = 0.5
+# Fraction of the usual value at which a silhouette is no evidence; at 0 it says that somebody is
+# absent, at twice this fraction present. Chosen.
+UNDECIDED_FRACTION = 0.25
 
 
 @dataclass(frozen=True)
@@ -33,6 +139,46 @@ class LimbSearchSettings:
     stretch: float = 2.5
     refined: int = 3
     iterations: int = 6
+
+
+@dataclass(frozen=True)
+class EvaluationPlan:
+    """Sizes of the search in an image, counted in evaluations: results do not depend on speed.
+
+        budget B    predictions descend    limbs and trunks are rated    candidates descend
+        share       about B / 8            at most 2 B / 3                about B / 5
+
+    Where limbs are searched for as well, at most 2 B / 5 are rated. The rest goes to covariances
+    and shape of the modes and to the likelihood alone. Settings bound each part; a budget below
+    them takes from all parts.
+
+    Attributes:
+        hypotheses: maximum number of modes that are kept, K.
+        candidates: maximum number of hypotheses that are fully optimised.
+        iterations: number of Newton steps on the predictions, and on the candidates.
+        groups: maximum number of groups of modes with a trunk of their own that are searched.
+        rated: maximum number of poses that are rated, all groups together, where limbs are
+            searched for.
+        rated_alone: the same without limb search.
+        alternatives: maximum number of configurations of a limb.
+        combinations: maximum number of combinations on each trunk.
+        searched_chains: number of limbs searched in each group.
+        samples, refined: number of samples that a limb draws, and of the best that are refined.
+        surprising: whether the image is surprising.
+    """
+
+    hypotheses: int
+    candidates: int
+    iterations: int
+    groups: int
+    rated: int
+    rated_alone: int
+    alternatives: int
+    combinations: int
+    searched_chains: int
+    samples: int
+    refined: int
+    surprising: bool
 
 
 @dataclass(frozen=True)
@@ -71,7 +217,7 @@ class TrackerSettings:
         ground: settings of what is known of gravity and floor.
     """
 
-    evaluation_budget: int = ACCURATE
+    evaluation_budget: int = ACCURATE_BUDGET
     max_hypotheses: int = 8
     hypothesis_merge_distance: float = 0.02
     proposals: str = 'kjs'
@@ -94,7 +240,7 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         if self.proposals not in PROPOSALS:
-            raise ValueError(f'proposals must be one of {tuple(PROPOSALS)}, saw {self.proposals!r}')
+            raise ValueError(f'proposals must be one of {PROPOSALS}, saw {self.proposals!r}')
         if self.motion not in MOTIONS:
             raise ValueError(f'motion must be one of {MOTIONS}, saw {self.motion!r}')
         for name in (
@@ -116,12 +262,36 @@ class TrackerSettings:
     @cached_property
     def plan(self) -> EvaluationPlan:
         """Allocation of the evaluations of an image."""
-        return plan_of(self)
+        return self._planned(self.evaluation_budget)
 
     @cached_property
     def thorough_plan(self) -> EvaluationPlan:
         """The same for a surprising image; as many modes are kept."""
-        return replace(plan_of(self, surprising=True), hypotheses=self.plan.hypotheses)
+        plan = self._planned(SURPRISING_FACTOR * self.evaluation_budget)
+        return replace(plan, hypotheses=self.plan.hypotheses, surprising=True)
+
+    def _planned(self, budget: int) -> EvaluationPlan:
+        """The plan that keeps to an evaluation budget, and to the bounds of the settings."""
+        hypotheses = min(self.max_hypotheses, max(budget // 25, 1))
+        limbs, eighth = budget // 65, max(budget // 8, 1)
+        searched = max(round(budget / ACCURATE_BUDGET), 1)
+        return EvaluationPlan(
+            hypotheses=hypotheses,
+            candidates=max(min(self.candidates, budget // 40), hypotheses),
+            iterations=min(self.iterations, max(budget // 60, 1)),
+            groups=min(3, max(limbs, 1)),
+            rated=2 * budget // 5,
+            rated_alone=2 * budget // 3,
+            alternatives=min(self.alternatives, max(limbs, 2)),
+            combinations=min(self.combinations, eighth),
+            # With less than a quarter no limb is searched.
+            searched_chains=min(self.searched_chains, searched)
+            if SURPRISING_FACTOR * budget >= ACCURATE_BUDGET
+            else 0,
+            samples=min(self.search.samples, eighth),
+            refined=min(self.search.refined, max(limbs // 2, 1)),
+            surprising=False,
+        )
 
 
 # --- Beliefs of a track

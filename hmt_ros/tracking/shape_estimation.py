@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_ros.body.body import GROWTH, Body
+from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import ShapeSpace
 from hmt_ros.image.likelihood import ImageLikelihood
@@ -28,18 +28,12 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.residuals import RECORDED
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
-
-# Standard deviations over people and clothes, by kind of growth: logarithms, m.
-SPREAD = dict(zip(GROWTH, (0.2, 0.2, 0.02, 0.02, 0.02), strict=True))
-# Least standard deviation of a length, m: none is known better.
-LEAST_LENGTH_SIGMA = 0.008
-# Largest change by one image, and in all, in standard deviations over people.
-LARGEST_STEP, LARGEST = 0.5, 3.0
-# The person stays as it was until the estimate is so far from it, in standard deviations over
-# people (2 mm of a length): whatever depends on a shape has to be rebuilt with it.
-NOTICED = 0.1
-# An angle gives way by this much at most while the shape is estimated, rad.
-LARGEST_SHIFT = 0.2
+from hmt_ros.tracking.settings import (
+    MAX_ANGLE_SHIFT,
+    MAX_SHAPE_CHANGE,
+    MAX_SHAPE_STEP,
+    REBUILDING_CHANGE,
+)
 
 
 class Linearised(NamedTuple):
@@ -65,27 +59,18 @@ class ShapeEstimate:
 
     Attributes:
         covariance: (P, P) of the shape.
-        images: number of images that have been used.
     """
 
     def __init__(self, body: Body) -> None:
         self._space = ShapeSpace(body)
-        count = len(self._space.groups)
-        lengths = np.maximum(body.length_sigma, LEAST_LENGTH_SIGMA)
-        unknown = lengths**2 - np.diagonal(body.length_covariance)
-        grown = np.tile(np.array(list(SPREAD.values())), count)
-        self._spread = np.concatenate([lengths, grown])
-        self.covariance = np.diag(self._spread**2)
-        own = slice(0, self._space.lengths)
-        self.covariance[own, own] = body.length_covariance + np.diag(unknown)
-        self._prior = self.covariance
+        self._spread, self._prior = self._space.prior
+        self.covariance = self._prior
         size = self._space.size
         self._information, self._vector = np.zeros((size, size)), np.zeros(size)
         self._count = 0.0
         self._offset = np.zeros(size)
         # The offset of the person, who follows the estimate in steps.
         self._taken = self._offset
-        self.images = 0
         self._seen: Observation | None = None
         self._known: tuple[Array, Linearised] | None = None
 
@@ -93,13 +78,6 @@ class ShapeEstimate:
     def body(self) -> Body:
         """The person."""
         return self._space.body
-
-    @property
-    def deviations(self) -> dict[str, tuple[float, float]]:
-        """Difference from the start and standard deviation, by the name of the variable."""
-        sigma = np.sqrt(np.diagonal(self.covariance))
-        rows = zip(self._space.names, self._offset, sigma, strict=True)
-        return {name: (float(x), float(s)) for name, x, s in rows}
 
     def update(
         self,
@@ -143,14 +121,13 @@ class ShapeEstimate:
         self.covariance = 0.5 * (after + after.T)
         move = believed * (self.covariance @ self._vector) - self._offset
         furthest = np.abs(move / self._spread).max()
-        move *= min(1.0, LARGEST_STEP / max(float(furthest), 1e-12))
-        limit = LARGEST * self._spread
+        move *= MAX_SHAPE_STEP / max(float(furthest), MAX_SHAPE_STEP)
+        limit = MAX_SHAPE_CHANGE * self._spread
         self._offset = np.clip(self._offset + move, -limit, limit)
         ahead = self._offset - self._taken
-        if np.abs(ahead / self._spread).max() > NOTICED:
+        if np.abs(ahead / self._spread).max() > REBUILDING_CHANGE:
             self._space, self._taken = ShapeSpace(self._space.moved(ahead)), self._offset
             self._known = None
-        self.images += 1
         return self._space.body
 
     def considered(
@@ -196,12 +173,11 @@ class ShapeEstimate:
         The root goes where it then is best: an image does not tell the size of a person from the
         distance, and a root that was held back would.
         """
-        if np.abs(shift).max(initial=0.0) <= LARGEST_SHIFT:
+        if np.abs(shift).max(initial=0.0) <= MAX_ANGLE_SHIFT:
             return shift
         turns = self._space.body.skeleton.dof_is_rotation
-        excess = shift[turns] * (
-            1.0 - min(1.0, LARGEST_SHIFT / max(float(np.abs(shift[turns]).max()), 1e-12))
-        )
+        most = max(float(np.abs(shift[turns]).max()), MAX_ANGLE_SHIFT)
+        excess = shift[turns] * (1.0 - MAX_ANGLE_SHIFT / most)
         result = shift.copy()
         result[turns] -= excess
         # Angles that rest on a limit have no variance.

@@ -26,6 +26,8 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.lifted_poses import pooled
 from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.silhouettes import Silhouettes
+from hmt_ros.image.subject import Subject
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.error_model import TOGETHER, seconds
@@ -56,8 +58,6 @@ from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE, of_depth_at_best
 from hmt_ros.tracking.observer import Observer
 from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.settings import LIKELY_NATS, RESTING_SHARE, TrackerSettings
-from hmt_ros.tracking.silhouettes import Silhouettes
-from hmt_ros.tracking.subject import Subject
 from hmt_ros.tracking.track_state import Estimate, TrackState, no_likelihood
 from hmt_ros.tracking.validity import DEPTH, Validity
 from hmt_ros.tracking.view import View

@@ -25,12 +25,7 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.inference.arrays import Array, Index
-
-# Mean squared distance q by which joints leave their prediction, m^2/s, and the degrees of freedom
-# nu of its tails: modes tremble, and limbs are found where they were not looked for.
-SPREAD, TAILS = 0.01, 2.0
-# c, nats: a mode ends where all its continuations are less likely than exp(-c).
-ENDS = 5.0
+from hmt_ros.tracking.settings import END_NATS, TRANSITION_SPREAD, TRANSITION_TAILS
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +53,8 @@ class Continuity:
         joints = self.body.relative_joints(poses)
         a, b = (x.reshape(len(x), -1) for x in (self._joints, joints))
         squares = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * a @ b.T
-        ratio = np.maximum(squares, 0.0) / (joints.shape[1] * SPREAD * self.dt)
-        return np.asarray(-0.5 * TAILS * np.log1p(ratio / TAILS))
+        ratio = np.maximum(squares, 0.0) / (joints.shape[1] * TRANSITION_SPREAD * self.dt)
+        return np.asarray(-0.5 * TRANSITION_TAILS * np.log1p(ratio / TRANSITION_TAILS))
 
     def rated(self, poses: Array) -> Array:
         """log sum_k w_k t(x_n, x_k), (N,), of poses (N, d): how well each alone goes on."""
@@ -74,7 +69,7 @@ class Continuity:
         Args:
             transitions: (K, N) of these hypotheses; see `log_transitions`.
         """
-        total = np.logaddexp(np.logaddexp.reduce(transitions, axis=1), -ENDS)
+        total = np.logaddexp(np.logaddexp.reduce(transitions, axis=1), -END_NATS)
         return np.asarray((self.log_weights - total)[:, None] + transitions)
 
 

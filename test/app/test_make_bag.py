@@ -9,9 +9,9 @@ import pytest
 from hmt_ros.app.make_bag import main
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
+from hmt_ros.image.subject import read_subject
 from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.sessions.transform_buffer import TransformBuffer
-from hmt_ros.tracking.subject import read_subject
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.images import decode_depth, decode_image

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmt_ros.body import Camera
-from hmt_ros.body.camera import LEAST_UNFOLDED, unfolded_share
+from hmt_ros.body.camera import (
+    FARTHEST_PERSON,
+    LEAST_UNFOLDED,
+    NEAREST_PERSON,
+    USUAL_LENS,
+    log_prior_of_distance,
+    unfolded_share,
+)
 
 LENSES = {
     'none': ('plumb_bob', ()),
@@ -193,3 +202,16 @@ def test_scaled_camera_sees_the_same_through_larger_pixels():
     assert Camera(900, 900, 640, 360, 1280, 720).scaled(853, 480).width == 853
     with pytest.raises(ValueError, match='640x480 pixels, which have another shape than 640x360'):
         camera.scaled(640, 360)
+
+
+def test_distances_that_people_and_cameras_have():
+    """Log-normal with 95 % between the limits, which a longer lens moves away; never a limit."""
+    focal = 320.0 / np.tan(0.5 * USUAL_LENS)
+    usual = Camera(focal, focal, 319.5, 239.5, 640, 480)
+    far = replace(usual, fx=3.0 * focal, fy=3.0 * focal)
+    middle = np.sqrt(NEAREST_PERSON * FARTHEST_PERSON)
+    assert log_prior_of_distance(usual, middle) == pytest.approx(0.0)
+    for limit in (NEAREST_PERSON, FARTHEST_PERSON):
+        assert log_prior_of_distance(usual, limit) == pytest.approx(-2.0)
+        assert log_prior_of_distance(far, 3.0 * limit) == pytest.approx(-2.0)
+    assert -6.0 < log_prior_of_distance(usual, 50.0) < -5.0

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
+from hmt_ros.body.keep_out import Capsules, reach_after
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame
 from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
 from hmt_ros.sessions.transform_buffer import Transform
-from hmt_ros.tracking.keep_out import Capsules, reach_after
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keep_out import KeepOutState
 from msg_tools.messages.pose_mixtures import MixtureKind, TrackState

@@ -9,26 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.body.camera import Camera, Viewpoint
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.mirror import left_directions
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.empty_scene import UNSEEN
+from hmt_ros.image.keypoint_evidence import suffices
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking import Status, Tracker, TrackerSettings
-from hmt_ros.tracking.beginning import (
-    FARTHEST,
-    LENS,
-    NEAREST,
-    STARTS,
-    Source,
-    log_prior_of_distance,
-    with_reversals,
-)
-from hmt_ros.tracking.keypoint_evidence import suffices
+from hmt_ros.tracking.beginning import STARTS, Source, with_reversals
 from hmt_ros.tracking.pose_prediction import PosePrediction
 
 FRAME = 100_000_000  # ns
@@ -247,17 +239,7 @@ def test_keypoints_of_a_detector_start_a_track(human37, name):
     assert abs(depth) < 2.5 * sigma
 
 
-def test_distances_that_people_and_cameras_have():
-    """Log-normal with 95 % between the limits, which a longer lens moves away; never a limit."""
-    focal = 320.0 / np.tan(0.5 * LENS)
-    usual = Camera(focal, focal, 319.5, 239.5, 640, 480)
-    far = replace(usual, fx=3.0 * focal, fy=3.0 * focal)
-    middle = np.sqrt(NEAREST * FARTHEST)
-    assert log_prior_of_distance(usual, middle) == pytest.approx(0.0)
-    for limit in (NEAREST, FARTHEST):
-        assert log_prior_of_distance(usual, limit) == pytest.approx(-2.0)
-        assert log_prior_of_distance(far, 3.0 * limit) == pytest.approx(-2.0)
-    assert -6.0 < log_prior_of_distance(usual, 50.0) < -5.0
+def test_no_start_is_less_sure_than_existence():
     assert all(kind.sure >= 0.0 for kind in STARTS)
 
 

@@ -18,12 +18,13 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings
-from hmt_ros.tracking.camera_motion import LONGEST_GUESS, CameraMotion, CameraPath, CameraPose
+from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath, CameraPose
 from hmt_ros.tracking.contact import by_foot, contacts_of
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.prediction import dynamics_of, predicted_states
+from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
 
 FRAME = 100_000_000  # ns
 UP = np.array([0.0, -1.0, 0.0])
@@ -209,7 +210,7 @@ def test_a_path_interpolates_and_goes_on():
     for i in range(7, 11):
         path.advance(i * FRAME, None)
     assert path.known
-    assert path.advance(int((6 + 10 * LONGEST_GUESS) * FRAME) + FRAME, None) is None
+    assert path.advance(int((6 + 10 * MAX_EXTRAPOLATION_TIME) * FRAME) + FRAME, None) is None
     assert not path.known
 
 

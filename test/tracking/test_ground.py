@@ -20,9 +20,10 @@ from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.contact import by_foot, contacts_of
-from hmt_ros.tracking.ground import AXIS_SIGMA, UP_SIGMA, GroundEstimator
+from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
+from hmt_ros.tracking.settings import AXIS_SIGMA, UP_SIGMA
 from test.image.drawn_rooms import ROOM_CAMERA, drawn, room, turn
 
 RATE = 30.0

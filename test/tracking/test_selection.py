@@ -50,7 +50,7 @@ def shares(log_weights):
 @pytest.mark.parametrize('count', [1, 3, 6])
 def test_choice_is_greedy_on_the_expected_distance(seed, count):
     joints, log_weights = hypotheses(14, seed)
-    kept = choose_hypotheses(joints, log_weights, count)
+    kept = choose_hypotheses(joints, log_weights, count, same=0.02)
     assert list(kept.chosen) == greedy(joints, shares(log_weights), count)
 
 
@@ -59,7 +59,7 @@ def test_choice_is_near_the_best_of_all_subsets(seed):
     """Given the first, three more gain at least 1 - 1/e of what the best three would."""
     joints, log_weights = hypotheses(10, seed)
     weights = shares(log_weights)
-    kept = choose_hypotheses(joints, log_weights, 4)
+    kept = choose_hypotheses(joints, log_weights, 4, same=0.02)
     first = int(np.argmax(weights))
     base = objective(joints, weights, [first])
     best = min(
@@ -78,7 +78,7 @@ def test_well_separated_groups_are_each_kept_once():
     joints[..., 0] = heap[:, None]
     joints += 0.002 * rng.normal(size=joints.shape)
     log_weights = rng.normal(0, 2.0, 21)
-    kept = choose_hypotheses(joints, log_weights, 8)
+    kept = choose_hypotheses(joints, log_weights, 8, same=0.02)
     assert sorted(heap[kept.chosen]) == [0, 1, 2]
     assert np.array_equal(heap[kept.chosen][kept.owner], heap)
     for k, chosen in enumerate(kept.chosen):
@@ -87,11 +87,11 @@ def test_well_separated_groups_are_each_kept_once():
 
 def test_copies_are_not_kept():
     joints, log_weights = hypotheses(5, 1)
-    assert len(choose_hypotheses(joints, log_weights, 5).chosen) == 5
+    assert len(choose_hypotheses(joints, log_weights, 5, same=0.02).chosen) == 5
     copies = np.concatenate([joints] * 4)
     rng = np.random.default_rng(2)
     copies += 0.004 * rng.normal(size=copies.shape)
-    kept = choose_hypotheses(copies, np.tile(log_weights, 4), 20)
+    kept = choose_hypotheses(copies, np.tile(log_weights, 4), 20, same=0.02)
     assert sorted(kept.chosen % 5) == [0, 1, 2, 3, 4]
     wanted = log_weights[kept.chosen % 5] + np.log(4)
     assert np.allclose(kept.log_weights, wanted, atol=1e-12)
@@ -107,7 +107,7 @@ def test_a_wider_tolerance_merges_more():
 @pytest.mark.parametrize('seed', range(4))
 def test_weights_go_to_the_nearest_that_is_kept(seed):
     joints, log_weights = hypotheses(25, seed, spread=0.1)
-    kept = choose_hypotheses(joints, log_weights, 5)
+    kept = choose_hypotheses(joints, log_weights, 5, same=0.02)
     for i, owner in enumerate(kept.owner):
         gaps = [distance(joints[i], joints[c]) for c in kept.chosen]
         assert gaps[owner] == pytest.approx(min(min(gaps), CAP), abs=1e-12)
@@ -119,8 +119,8 @@ def test_weights_go_to_the_nearest_that_is_kept(seed):
 
 def test_scale_of_weights_does_not_matter():
     joints, log_weights = hypotheses(20, 4)
-    first = choose_hypotheses(joints, log_weights, 6)
-    second = choose_hypotheses(joints, log_weights - 5000.0, 6)
+    first = choose_hypotheses(joints, log_weights, 6, same=0.02)
+    second = choose_hypotheses(joints, log_weights - 5000.0, 6, same=0.02)
     assert np.array_equal(first.chosen, second.chosen)
     assert np.allclose(first.log_weights, second.log_weights + 5000.0, atol=1e-9)
 
@@ -130,7 +130,7 @@ def test_an_unlikely_hypothesis_far_away_beats_a_likely_one_nearby():
     joints = np.zeros((3, 2, 3))
     joints[1, :, 0], joints[2, :, 0] = 0.03, 0.30
     weights = np.array([0.5, 0.4, 0.1])
-    kept = choose_hypotheses(joints, np.log(weights), 2)
+    kept = choose_hypotheses(joints, np.log(weights), 2, same=0.02)
     assert list(kept.chosen) == [0, 2]
     assert np.allclose(np.exp(kept.log_weights), [0.9, 0.1])
 
@@ -138,9 +138,9 @@ def test_an_unlikely_hypothesis_far_away_beats_a_likely_one_nearby():
 def test_what_is_chosen_first_is_kept_after_the_heaviest():
     joints, log_weights = hypotheses(12, 6)
     heaviest, *_, lightest = np.argsort(-log_weights)
-    kept = choose_hypotheses(joints, log_weights, 4, first=[lightest])
+    kept = choose_hypotheses(joints, log_weights, 4, same=0.02, first=[lightest])
     assert list(kept.chosen[:2]) == [heaviest, lightest]
-    alone = choose_hypotheses(joints, log_weights, 1, first=[lightest])
+    alone = choose_hypotheses(joints, log_weights, 1, same=0.02, first=[lightest])
     assert list(alone.chosen) == [heaviest]
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
+from hmt_ros.body.shape import MIN_LENGTH_SIGMA
+from hmt_ros.image.subject import Subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
-from hmt_ros.tracking.shape_estimation import LEAST_LENGTH_SIGMA, ShapeEstimate
-from hmt_ros.tracking.subject import Subject
+from hmt_ros.tracking.shape_estimation import ShapeEstimate
 
 
 @pytest.mark.parametrize('size', [1.0, 0.05])
@@ -23,7 +24,7 @@ def test_an_estimate_starts_with_the_covariance_of_the_lengths(size):
     found = covariance[:count, :count]
     off = ~np.eye(count, dtype=bool)
     assert np.allclose(found[off], body.length_covariance[off])
-    wanted = np.maximum(body.length_sigma, LEAST_LENGTH_SIGMA)
+    wanted = np.maximum(body.length_sigma, MIN_LENGTH_SIGMA)
     assert np.allclose(np.sqrt(np.diagonal(found)), wanted)
     assert np.linalg.eigvalsh(covariance).min() > 0
     assert not covariance[:count, count:].any()

@@ -8,11 +8,11 @@ import pytest
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.ground_terms import GroundSettings
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.silhouettes import Silhouettes
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_frames, render_silhouettes
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Status, Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.silhouettes import Silhouettes
 from test.tracking.test_tracker import best_error, in_bytes
 
 FRAME = 100_000_000
@@ -102,7 +102,6 @@ def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, huma
         silhouettes.learn(images[i % 4], i * FRAME)
     assert silhouettes.known == 'known'
     silhouettes.check(images[4], human32, camera, poses[4:5])
-    assert silhouettes.share < 0.05
     assert silhouettes.doubted
     assert silhouettes.silhouette(images[4], 21 * FRAME, None, None) is None
     assert silhouettes.known == 'forgotten, 0% known again'
@@ -113,7 +112,6 @@ def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, huma
     # Once, from the image on in which the person has left.
     assert doubted == sorted(doubted, reverse=True)
     assert 10 < doubted.index(False) < 31
-    assert silhouettes.share > 0.9
     mask = render_silhouettes(human32, poses[-1:], camera)[0]
     found = silhouettes.silhouette(images[-1], 60 * FRAME, None, None).foreground
     wanted = BackgroundModel.from_image(empty).silhouette(images[-1])
@@ -134,7 +132,6 @@ def test_backgrounds_that_are_not_doubted(crossing, human32, camera):
     for i in range(21):
         known.learn(empty, i * FRAME)
     known.check(images[0], human32, camera, poses[:1])
-    assert known.share > 0.9
     assert known.silhouette(images[0], 21 * FRAME, None, None).foreground.any()
     far = poses[:1].copy()
     far[:, 2] = -3.0

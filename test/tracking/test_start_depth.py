@@ -8,6 +8,7 @@ import pytest
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.joint_depths import depths_of, joint_depths, moved_to_depth
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
@@ -19,7 +20,6 @@ from hmt_ros.tracking.beginning import Shown, first_start
 from hmt_ros.tracking.existence import Existence
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.misfit import of_depth_at_best
-from hmt_ros.tracking.start_depth import depths_of, joint_depths, moved_to_depth
 from hmt_ros.tracking.validity import DEPTH, Validity
 from hmt_ros.tracking.view import View
 

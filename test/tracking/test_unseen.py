@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_ros.body.keep_out import keep_out_capsules
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import LaggedWeights, Tracker, TrackerSettings
-from hmt_ros.tracking.keep_out import keep_out_capsules
 
 STEP = 100_000_000  # ns
 CUT, WHOLE = 6, 3  # images

@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 
 from hmt_ros.body.mirror import reverse_depth
-from hmt_ros.tracking.weighting import (
-    ENDS,
-    SPREAD,
-    TAILS,
-    Continuity,
-    at_least,
-    normalised,
-    pooled_origins,
-)
+from hmt_ros.tracking.settings import END_NATS, TRANSITION_SPREAD, TRANSITION_TAILS
+from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_origins
 
 DT = 0.1
 
@@ -40,13 +33,15 @@ def log_transition(body, pose, expected, dt):
     for p, q in zip(a, b):
         total += sum(((p[i] - a[0][i]) - (q[i] - b[0][i])) ** 2 for i in range(3))
     distance = total / len(a)
-    return -TAILS / 2 * np.log(1 + distance / (TAILS * SPREAD * dt))
+    return (
+        -TRANSITION_TAILS / 2 * np.log(1 + distance / (TRANSITION_TAILS * TRANSITION_SPREAD * dt))
+    )
 
 
 def transition(body, pose, expected, all_poses, dt):
     """p(x_k | x_j), equation (2)."""
     every = [np.exp(log_transition(body, x, expected, dt)) for x in all_poses]
-    return np.exp(log_transition(body, pose, expected, dt)) / (sum(every) + np.exp(-ENDS))
+    return np.exp(log_transition(body, pose, expected, dt)) / (sum(every) + np.exp(-END_NATS))
 
 
 def log_priors(continuity, poses):
@@ -112,14 +107,14 @@ def test_a_mode_without_continuation_ends(human32, poses_near):
     both = np.concatenate([near, far])
     dt = 1e-4
     apart = log_transition(human32, near[0], far[0], dt)
-    assert apart < -ENDS - 1.0
+    assert apart < -END_NATS - 1.0
     continuity = Continuity(human32, both, np.log([0.5, 0.5]), dt)
     left = np.exp(log_priors(continuity, near))
-    stayed = 1.0 / (1.0 + np.exp(-ENDS))
-    crossed = np.exp(apart) / (np.exp(apart) + np.exp(-ENDS))
+    stayed = 1.0 / (1.0 + np.exp(-END_NATS))
+    crossed = np.exp(apart) / (np.exp(apart) + np.exp(-END_NATS))
     assert left == pytest.approx(0.5 * (stayed + crossed), rel=1e-6)
     # Of the mode that has no continuation, most is lost.
-    assert crossed < np.exp(apart + ENDS) < 0.3
+    assert crossed < np.exp(apart + END_NATS) < 0.3
     # With one for each, nearly nothing is.
     assert np.exp(log_priors(continuity, both)).sum() > 0.98
 

@@ -22,7 +22,7 @@ from hmt_ros.sessions.image_inputs import (
 from hmt_ros.sessions.parameter_file import read_parameter_file
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from hmt_ros.tracking.evaluation_plan import ACCURATE
+from hmt_ros.tracking.settings import ACCURATE_BUDGET
 from msg_tools import BagReader
 from msg_tools.files.error_line import error_line
 from msg_tools.files.plain_yaml import load_plain_yaml
@@ -197,7 +197,7 @@ def _tracking_values(options: ReplayOptions, recorded: RecordedInput, node: str)
         values.setdefault('gravity_frame', recorded.upright_frame)
     values.setdefault('fixed_frame', recorded.upright_frame)
     values['image_transport'] = recorded.transport
-    values.setdefault('evaluation_budget', ACCURATE)
+    values.setdefault('evaluation_budget', ACCURATE_BUDGET)
     return values
 
 

@@ -31,21 +31,18 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Derivatives, Student
 from hmt_ros.inference.error_model import ERRORS
-from hmt_ros.tracking.evaluation_plan import EvaluationPlan
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.selection import choose_hypotheses
-from hmt_ros.tracking.settings import LIKELY_NATS
-
-# Modes have the same trunk when its joints are nowhere further apart, m.
-SAME_TRUNK = 0.06
-# Configurations of a limb are distinct when some joint is further apart, m.
-DISTINCT = 0.08
-# Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
-TAILS = 4.0
-# Factor on the standard deviations of the body's prior where samples are drawn from it.
-WIDE = 1.3
+from hmt_ros.tracking.settings import (
+    LIKELY_NATS,
+    LIMB_TAILS,
+    PRIOR_STRETCH,
+    SAME_LIMB_DISTANCE,
+    SAME_TRUNK_DISTANCE,
+    EvaluationPlan,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,14 +99,12 @@ class LimbSearch:
         )
         seen = of_limb.seen(observation, explained=others.costs)
         seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
-        motion = Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS)
+        motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
         term = PoseEnergy(of_limb, seen, motion, pose, own)
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: plan.refined]]
         self.posterior.spent.append(len(samples) + plan.refined * s.iterations)
-        return term.minimise(
-            best, step_scale=0.4, damping=1.0, max_iterations=s.iterations, tolerance=0.05
-        ).x
+        return term.minimise(best, max_iterations=s.iterations, tolerance=0.05).x
 
     def _draw(self, angles: Array, block: Array, n: int, rng: np.random.Generator) -> Array:
         """N samples from the mode, from it stretched, and from the body's prior: a third each."""
@@ -118,7 +113,7 @@ class LimbSearch:
         near = noise @ np.linalg.cholesky(block).T
         near[n // 3 :] *= search.stretch
         result = angles + near
-        wide = body.prior_mean[own] + WIDE * body.prior_sigma[own] * noise
+        wide = body.prior_mean[own] + PRIOR_STRETCH * body.prior_sigma[own] * noise
         result[2 * n // 3 :] = wide[2 * n // 3 :]
         result[0] = angles
         return np.clip(result, body.lower[own], body.upper[own])
@@ -155,7 +150,7 @@ class KinematicJumps:
                 if likely
                 else {},
                 price['limb_flip'],
-                apart=DISTINCT,
+                apart=SAME_LIMB_DISTANCE,
                 most=plan.alternatives,
             ).at_most(left)
             alone = products.alone
@@ -185,7 +180,8 @@ class KinematicJumps:
         ).chosen
         poses, members = poses[kept], members[kept]
         # A chain that jumped is expected where it landed, the rest where it was predicted.
-        return sources.proposed(members, poses, np.abs(poses - base.x[members]) > 1e-9)
+        jumped = np.abs(poses - base.x[members]) > np.sqrt(np.finfo(np.float64).eps)
+        return sources.proposed(members, poses, jumped)
 
     @cached_property
     def _searches(self) -> dict[str, LimbSearch]:
@@ -200,7 +196,7 @@ class KinematicJumps:
         groups = []
         while left:
             gaps = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1)
-            near = gaps < SAME_TRUNK
+            near = gaps < SAME_TRUNK_DISTANCE
             groups.append(np.array([i for i, ok in zip(left, near) if ok], dtype=np.intp))
             left = [i for i, ok in zip(left, near) if not ok]
         return groups

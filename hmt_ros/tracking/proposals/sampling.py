@@ -60,7 +60,7 @@ def _noise(shape: tuple[int, ...], scale: float, rng: np.random.Generator) -> Ar
     if scale > 0:
         return scale * noise
     heavy = np.sqrt(rng.chisquare(1, size=(*shape[:-1], 1)))
-    return noise / np.maximum(heavy, 1e-3)
+    return noise / np.maximum(heavy, np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from hmt_ros.body import load_body
+from hmt_ros.image.subject import LARGEST_FILE, parse_subject
 from hmt_ros.tracking import Subject, SubjectError, read_subject
-from hmt_ros.tracking.subject import LARGEST_FILE, parse_subject
 
 JOINTS = {'head': [150, 20.5], 'neck': [151, 40], 'left_hip': [160, 110], 'right_hip': [140, 111]}
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_ros.image.keypoint_evidence import keypoint_evidence
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.tracking.keypoint_evidence import keypoint_evidence
 
 NONE = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 

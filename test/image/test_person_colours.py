@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_ros.tracking.appearance import BINS, Colours, binned, shares, surroundings
+from hmt_ros.image.person_colours import BINS, Colours, binned, shares, surroundings
 
 
 def test_surroundings_are_near_and_not_the_model():

@@ -5,20 +5,29 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_ros.rendering.renderer import render_silhouettes
-from hmt_ros.tracking.person_shape import (
+from hmt_ros.body import Camera
+from hmt_ros.body.camera import Viewpoint
+from hmt_ros.image.person_shape import (
     covered,
     largest_person,
     looks_like_person,
     on_raster,
     raster_step,
 )
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.rendering.renderer import render_silhouettes
 
 
 @pytest.fixture(scope='module')
-def film(filmed, camera, human32):
+def camera() -> Camera:
+    return Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
+
+
+@pytest.fixture(scope='module')
+def film(camera, human32):
     """Poses and silhouettes of a second."""
-    poses, _, _ = filmed('reach', 1.0, camera)
+    view = Viewpoint(distance=3.2)
+    poses = procedural_motion('reach', human32, 1.0, 10.0, 3, viewpoint=view)
     return poses, render_silhouettes(human32, poses, camera)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
+from hmt_ros.body.keep_out import BARE, MARGIN, Capsules, keep_out_capsules, reach_after
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking.keep_out import BARE, MARGIN, Capsules, keep_out_capsules, reach_after
 
 BODY = load_body('human37')
 

@@ -38,8 +38,10 @@ BARE = 0.07
 SPACING = 1.2
 # Share of a radius that is added to it rather than covered by capsules side by side.
 LITTLE = 0.15
-# Speed, m/s, and reach, m, of a striking hand; speed of a runner, m/s.
-FASTEST, ARM, RUNNER = 7.0, 0.7, 3.0
+# Speed, m/s, and reach, m, of a striking hand.
+STRIKING_SPEED, ARM_REACH = 7.0, 0.7
+# Speed that a person hardly exceeds, a runner's, m/s.
+RUNNING_SPEED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +122,7 @@ class Capsules:
 
 def reach_after(time: float) -> float:
     """Maximum distance, m, that any part of a person moves in a time, s."""
-    return min(FASTEST * time, ARM + RUNNER * time)
+    return min(STRIKING_SPEED * time, ARM_REACH + RUNNING_SPEED * time)
 
 
 def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float = 0.99) -> Capsules:

@@ -1,0 +1,67 @@
+"""Pose of a camera in a frame that stands still: p_fixed = C p + c."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from hmt_ros.body.camera import AXES, Camera
+from hmt_ros.inference.arrays import Array
+
+# Largest difference of an entry of R R' from the identity for R to be a rotation.
+NOT_ORTHOGONAL = 1e-3
+# Distance of people and of the scene, where it is unknown, m.
+USUAL_DISTANCE = 3.0
+
+
+class CameraPose(NamedTuple):
+    """Pose of the camera optical frame in a frame that stands still: p_fixed = C p + c.
+
+    Attributes:
+        rotation: C (3, 3).
+        position: c (3,), m.
+    """
+
+    rotation: Array
+    position: Array
+
+    @classmethod
+    def of(cls, position: ArrayLike, rotation: ArrayLike) -> CameraPose:
+        """A pose from position (3,), m, and rotation (3, 3).
+
+        Raises:
+            ValueError: other shapes, numbers that are not finite, or no rotation.
+        """
+        place, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
+        if place.shape != AXES[0].shape or not np.isfinite(place).all():
+            raise ValueError(
+                f'the position of the camera must be three finite numbers, saw {place.tolist()}'
+            )
+        if (
+            turn.shape != AXES.shape
+            or not np.abs(turn @ turn.T - AXES).max() < NOT_ORTHOGONAL
+            or np.linalg.det(turn) < 0
+        ):
+            raise ValueError(
+                f'the rotation of the camera must be a rotation matrix (3, 3), saw {turn.tolist()}'
+            )
+        return cls(turn, place)
+
+    def equals(self, other: CameraPose) -> bool:
+        """Whether the other pose has the very same numbers."""
+        return all(np.array_equal(a, b) for a, b in zip(self, other, strict=True))
+
+    def shift(self, other: CameraPose, camera: Camera) -> float:
+        """About how far the images of still points are apart from the two poses, px."""
+        angle = Rotation.from_matrix(self.rotation.T @ other.rotation).magnitude()
+        apart = float(np.linalg.norm(self.position - other.position))
+        return float(max(camera.fx, camera.fy) * (angle + apart / USUAL_DISTANCE))
+
+    def towards(self, other: CameraPose, share: float) -> CameraPose:
+        """The pose at a share of the constant motion to another pose; 0: here, 1: there."""
+        turn = Rotation.from_matrix(self.rotation.T @ other.rotation).as_rotvec()
+        rotation = self.rotation @ Rotation.from_rotvec(share * turn).as_matrix()
+        return CameraPose(rotation, self.position + share * (other.position - self.position))

@@ -1,0 +1,141 @@
+"""Rasterisation of a body's flesh: the triangles of its mesh that face a camera, and silhouettes.
+
+Triangles are cut into spans of pixels, all in numpy over whole arrays. A pixel belongs to a
+triangle when its centre lies inside; neighbouring triangles share no pixel and leave none out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.flesh import Mesh
+from hmt_ros.body.kinematics import forward
+from hmt_ros.inference.arrays import Array, Index, Mask
+
+STACKS, SLICES = 13, 18  # of the mesh of a part: its outline is right to 2 % of its radius
+SMALLEST_AREA = 1e-6  # px^2, of twice a triangle: a smaller one covers the centre of no pixel
+CHUNK = 16  # poses whose silhouettes are drawn together
+
+
+def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
+    """Silhouettes (N, H, W) of a body at poses (N, d).
+
+    Raises:
+        ValueError: the body has no flesh, or the poses have a wrong shape.
+    """
+    poses = np.asarray(poses, dtype=np.float64)
+    mesh = mesh_of(body)
+    result = np.zeros((len(poses), camera.height, camera.width), dtype=bool)
+    for start in range(0, len(poses), CHUNK):
+        frames = forward(body.skeleton, poses[start : start + CHUNK])
+        points = frames.points(mesh.segments, mesh.vertices)
+        pixels = fill(project(mesh, points, camera), camera.height, camera.width).pixels
+        result[start : start + CHUNK].reshape(-1)[pixels] = True
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """F triangles that face the camera."""
+
+    images: Index  # (F,) index of the image
+    corners: Index  # (3, F) vertices
+    u: Array  # (3, F) px
+    v: Array  # (3, F) px
+    inverse_depth: Array  # (3, F) 1 / z of the corners, 1/m
+
+
+@dataclass(frozen=True, eq=False)
+class Filled:
+    """M pairs of a pixel and a triangle that contains its centre."""
+
+    pixels: Index  # (M,) index into all images, row by row
+    rows: Index
+    columns: Index
+    triangles: Index
+
+
+@lru_cache(maxsize=8)
+def mesh_of(body: Body) -> Mesh:
+    """Triangles of the flesh, the normals of which point outwards."""
+    if not body.shapes:
+        raise ValueError(f'body {body.name} has no flesh: it can not be drawn')
+    mesh = body.flesh.mesh(STACKS, SLICES)
+    # The order of the corners decides which triangles face the camera: make it fit the normals.
+    a, b, c = mesh.vertices[mesh.triangles.T]
+    inwards = np.einsum('fx,fx->f', np.cross(b - a, c - a), mesh.normals[mesh.triangles[:, 0]]) < 0
+    triangles = np.where(inwards[:, None], mesh.triangles[:, ::-1], mesh.triangles)
+    return replace(mesh, triangles=triangles)
+
+
+@lru_cache(maxsize=8)
+def _field_of_view(camera: Camera) -> Array:
+    """Bounds [[low, high], [low, high]] of x / z and of y / z of points in the image."""
+    u, v = np.linspace(-0.5, camera.width - 0.5, 33), np.linspace(-0.5, camera.height - 0.5, 33)
+    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1))
+    slopes = (rays[..., :2] / rays[..., 2:]).reshape(-1, 2)
+    low, high = slopes.min(0), slopes.max(0)
+    margin = 0.05 * (high - low)
+    return np.stack([low - margin, high + margin], axis=1)
+
+
+def project(mesh: Mesh, points: Array, camera: Camera) -> Triangles:
+    """Triangles that face the camera and may be seen, of vertices (V, 3, N) of N images."""
+    p = np.ascontiguousarray(points.transpose(1, 0, 2))
+    (u, v), _ = camera.project_with_derivative(p, derivative=False)
+    a, b, c = mesh.triangles.T
+    # Counter-clockwise from outside is clockwise where the v axis points down. A corner behind the
+    # camera is NaN, and the triangle is left out.
+    area = (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
+    visible = area < -SMALLEST_AREA
+    # Far outside the image a distortion model may fold back into it.
+    (left, right), (top, bottom) = _field_of_view(camera)
+    x, y, z = p
+    sides = (x < left * z, x > right * z, y < top * z, y > bottom * z)
+    for side in sides:
+        if side.any():
+            visible &= ~(side[a] & side[b] & side[c])
+    triangle, image = np.nonzero(visible)
+    corners = np.ascontiguousarray(mesh.triangles[triangle].T)
+    return Triangles(image, corners, u[corners, image], v[corners, image], 1.0 / z[corners, image])
+
+
+def fill(triangles: Triangles, height: int, width: int) -> Filled:
+    """All pixels whose centres lie in triangles, whether or not another triangle hides them."""
+    # Corners from top to bottom. Both triangles at an edge then compute its places alike, and every
+    # pixel goes to one of them.
+    order = np.argsort(triangles.v, axis=0, kind='stable')
+    u0, u1, u2 = np.take_along_axis(triangles.u, order, axis=0)
+    v0, v1, v2 = np.take_along_axis(triangles.v, order, axis=0)
+    rows, which = _ranges(_first(v0, height), _first(v2, height))
+    with np.errstate(divide='ignore', invalid='ignore'):  # an edge along a row is never asked
+        upper, lower, long = (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1), (u2 - u0) / (v2 - v0)
+    below = rows >= v1[which]
+    one = u0[which] + long[which] * (rows - v0[which])
+    two = np.where(below, u1[which], u0[which])
+    two += np.where(below, lower[which], upper[which]) * (
+        rows - np.where(below, v1[which], v0[which])
+    )
+    start, stop = _first(np.minimum(one, two), width), _first(np.maximum(one, two), width)
+    columns, span = _ranges(start, stop)
+    first = (triangles.images[which] * height + rows) * width
+    return Filled(first[span] + columns, rows[span], columns, which[span])
+
+
+def _first(places: Array, size: int) -> Index:
+    """First whole number from each place on, within an image."""
+    return np.clip(np.ceil(places), 0, size).astype(np.intp)
+
+
+def _ranges(start: Index, stop: Index) -> tuple[Index, Index]:
+    """All whole numbers of the ranges [start, stop), and the range that each belongs to."""
+    count = np.maximum(stop - start, 0)
+    which = np.repeat(np.arange(len(start)), count)
+    first = start - (np.cumsum(count) - count)
+    return np.arange(len(which)) + first[which], which

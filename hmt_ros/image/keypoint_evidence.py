@@ -1,0 +1,79 @@
+"""Evidence of keypoints for a person in view, and whether a track can start from them."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array
+
+# Fewest keypoints that make a person.
+FEWEST_KEYPOINTS = 6
+# Confidence of a keypoint whose position is trusted.
+MIN_CONFIDENCE = 0.5
+# Detectors find small people in the legs of a table and in leaves, with full confidence. Keypoints
+# of a person at this magnification, px/m, are no evidence; at twice this, they count in full.
+MIN_MAGNIFICATION = 22.0
+
+
+def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
+    """Evidence of a detector for a person in view, from -1, nobody, to 1.
+
+    It is 1 where the confidences have at least the sum of the fewest trusted keypoints that make a
+    person, and -1 below a third of that. Fewer joints, and a person of a few pixels, are evidence
+    neither of a person nor of an empty image.
+    """
+    seen = keypoints.confidences[keypoints.seen]
+    most = 0.0
+    if len(seen) >= FEWEST_KEYPOINTS:
+        most = min(max(_magnification(keypoints, body) / MIN_MAGNIFICATION - 1.0, 0.0), 1.0)
+    whole = float(seen.sum()) / (FEWEST_KEYPOINTS * MIN_CONFIDENCE)
+    return float(np.clip(3.0 * whole - 2.0, -1.0, most))
+
+
+def suffices(keypoints: Keypoints | None, body: Body) -> bool:
+    """Whether keypoints of one image fix place and facing direction of a person.
+
+    They do with all joints of the trunk but one.
+    """
+    if keypoints is None:
+        return False
+    names = _confident(keypoints)
+    trunk = [name for pair in body.trunk_pairs for name in pair]
+    of_trunk = sum(name in names for name in trunk)
+    return len(names) >= FEWEST_KEYPOINTS and of_trunk >= len(trunk) - 1
+
+
+def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
+    """Whether keypoints are a person, and fix the facing direction."""
+    if keypoints is None or keypoint_evidence(keypoints, body) <= 0.0:
+        return False
+    names = _confident(keypoints)
+    return any(left in names and right in names for left, right in body.trunk_pairs)
+
+
+def _confident(keypoints: Keypoints) -> set[str]:
+    sure = keypoints.seen & (keypoints.confidences >= MIN_CONFIDENCE)
+    return {keypoints.names[i] for i in np.flatnonzero(sure)}
+
+
+def _magnification(keypoints: Keypoints, body: Body) -> float:
+    """About how many px a metre has at the person: the extent of joints over that in standing."""
+    standing = _standing(body)
+    known = [i for i in np.flatnonzero(keypoints.seen) if keypoints.names[i] in standing]
+    if not known:
+        return math.inf
+    joints = np.array([standing[keypoints.names[i]] for i in known])
+    extent = np.ptp(keypoints.pixels[known], axis=0).max()
+    return float(extent / max(np.ptp(joints, axis=0).max(), 1e-3))
+
+
+@lru_cache(maxsize=8)
+def _standing(body: Body) -> dict[str, Array]:
+    """Positions (3,) of the joints of a person who stands, m."""
+    joints = body.joint_positions(body.prior_mean[None])[0]
+    return dict(zip(body.joint_names, joints, strict=True))

@@ -1,0 +1,129 @@
+"""Area of a person in an image, and pieces of a silhouette that may be a person."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.background import BackgroundSettings, one_person
+from hmt_ros.image.surface_points import coarse_mesh
+from hmt_ros.inference.arrays import Array, Mask
+
+# Height of the raster that areas and colours are taken at, px.
+RASTER = 240
+# A person's silhouette is this long at least, px, and neither a line nor a rectangle: bounds of its
+# area as a fraction of the square of its length, and of its bounding box.
+LEAST_LENGTH = 40
+LEAST_FILLED, MOST_FILLED = 0.04, 0.9
+
+
+class Piece(NamedTuple):
+    """A piece of a silhouette that has the shape of one person.
+
+    Attributes:
+        area: px of the image.
+        cut: whether the left or the right side of the image may cut it.
+    """
+
+    area: float
+    cut: bool
+
+
+def raster_step(height: int) -> int:
+    """How many pixels of an image of this height lie between two of the raster."""
+    return max(round(height / RASTER), 1)
+
+
+def on_raster(image: NDArray[Any], raster: Mask) -> NDArray[Any]:
+    """An image (H, W, ...) at the pixels of a coarser raster (h, w)."""
+    size = raster.shape[::-1]
+    seen = image.view(np.uint8) if image.dtype == np.bool_ else image
+    return np.asarray(cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST)).view(image.dtype)
+
+
+def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
+    """The largest piece of a foreground that has the shape of one person; None: there is none.
+
+    A piece is connected, or it is the largest one with the pieces near it: clothes in the colours
+    of the room leave holes.
+
+    Args:
+        foreground: (h, w).
+        step: px of the image between two of its pixels.
+    """
+    x, y, across, down = cv2.boundingRect(foreground.view(np.uint8))
+    if across == 0:
+        return None
+    # Most of an image is empty.
+    inside = np.ascontiguousarray(foreground[y : y + down, x : x + across])
+    _, _, stats, _ = cv2.connectedComponentsWithStats(inside.view(np.uint8), connectivity=8)
+    whole = one_person(inside, BackgroundSettings())
+    boxes = [*stats[1:].tolist(), [*cv2.boundingRect(whole.view(np.uint8)), counted(whole)]]
+    alike = [
+        Piece(float(step**2 * area), x + left == 0 or x + left + width == foreground.shape[1])
+        for left, _, width, height, area in boxes
+        if _is_person(width, height, area, step)
+    ]
+    return max(alike, default=None)
+
+
+def _is_person(width: int, height: int, area: int, step: int) -> bool:
+    length = max(width, height)
+    return (
+        step * length >= LEAST_LENGTH
+        and area >= LEAST_FILLED * length**2
+        and area <= MOST_FILLED * width * height
+    )
+
+
+def looks_like_person(silhouette: Mask) -> bool:
+    """Whether a silhouette (H, W) has the size and shape of one person."""
+    _, _, width, height = cv2.boundingRect(silhouette.view(np.uint8))
+    return _is_person(width, height, counted(silhouette), 1)
+
+
+def covered(body: Body, camera: Camera, pose: Array, step: int = 1) -> Mask:
+    """Every step-th pixel (H / step, W / step) that a body covers at a pose (d,).
+
+    Each part of the flesh counts as the convex hull of its projected points.
+    """
+    mesh = coarse_mesh(body)
+    points = forward(body.skeleton, pose[None]).points(mesh.segments, mesh.vertices)[:, :, 0]
+    shape = -(-camera.height // step), -(-camera.width // step)
+    pixels = camera.project(points) / step
+    usable: Mask = np.all(np.isfinite(pixels), axis=1)
+    mask = np.zeros(shape, dtype=np.uint8)
+    for part in range(len(body.flesh.parts)):
+        here = mesh.parts == part
+        # A part that is partly behind the camera has no hull.
+        if usable[here].all():
+            fill_hull(mask, pixels[here])
+    return mask.view(np.bool_)
+
+
+def fill_hull(mask: NDArray[np.uint8], pixels: Array) -> None:
+    """Sets the pixels of a mask (H, W) in the convex hull of points (N, 2), px, to 1."""
+    # Far outside of the image a hull is cut, not wrapped.
+    limit = 4.0 * max(mask.shape)
+    points = np.clip(pixels, -limit, limit).round().astype(np.int32)
+    cv2.fillConvexPoly(mask, cv2.convexHull(points), 1)
+
+
+def counted(mask: Mask) -> int:
+    """Number of the pixels of a mask."""
+    return cv2.countNonZero(mask.view(np.uint8))
+
+
+def resized(area: Mask, margin: float) -> Mask:
+    """An area (H, W) with a margin, as a fraction of its height; negative: without it."""
+    pixels = area.view(np.uint8)
+    size = max(round(abs(margin) * cv2.boundingRect(pixels)[3]), 1)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
+    change = cv2.dilate if margin > 0 else cv2.erode
+    return np.asarray(change(pixels, kernel), dtype=np.uint8) > 0

@@ -1,0 +1,209 @@
+"""Source of the silhouette of an image, and whether the background is to be trusted.
+
+A mask of a segmenter is taken as it is, else the background is subtracted, once the scene is known
+to be empty (`EmptyScene`). When a track starts from joints, the pose is known, and
+
+    f = |foreground and area of the body| / |area of the body|
+
+is near 1 before an empty scene, and less in clothes of the colours of the room. Below
+`MIN_FOREGROUND_FRACTION` a background that was learned is forgotten and put together anew, pixel by
+pixel, from the images that follow: where no mode of the posterior has the person, as far as
+something else than silhouettes says where that is. Until it is known around the person, images are
+tracked without silhouettes.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera_pose import CameraPose
+from hmt_ros.body.keep_out import RUNNING_SPEED
+from hmt_ros.body.rasterisation import render_silhouettes
+from hmt_ros.image.background import BackgroundModel, SceneWatch, Silhouette, one_person
+from hmt_ros.image.empty_scene import EmptyScene
+from hmt_ros.image.observation import Box
+from hmt_ros.image.person_shape import resized
+from hmt_ros.inference.arrays import Array, Image, Mask
+
+# Shift of the still scene, px, above which a background belongs to another view.
+VIEW_SHIFT = 2.0
+# Minimum fraction of the person that is foreground before a background without the person.
+MIN_FOREGROUND_FRACTION = 0.35
+# Log odds of somebody in a scene that was put together where nobody was, nats.
+COMPLETED_LOG_ODDS = -6.0
+# Margins of the area of a body, as a fraction of its height: for the sure area of the person, and
+# for the possible one.
+INNER_MARGIN, OUTER_MARGIN = 0.01, 0.06
+# Largest share of the person's area that may be unknown where silhouettes are used.
+MAX_UNKNOWN_FRACTION = 0.02
+# Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
+REGION_MARGIN = 0.3
+
+
+class Silhouettes:
+    """The silhouettes of one person before one camera.
+
+    Args:
+        background: the empty scene, or a model that is to learn it.
+        shared: whether other people share the background; it is then learned elsewhere.
+
+    Attributes:
+        scene: the empty scene, as far as it is known.
+        watch: tells whether the camera has moved since the background was taken.
+        doubted: whether the background was learned with the person in it, and is not known again.
+    """
+
+    def __init__(self, background: BackgroundModel, *, shared: bool = False) -> None:
+        self.scene = EmptyScene(background, trusted=shared)
+        self.doubted = False
+        self.watch = SceneWatch()
+        self._shared = shared
+        self._learning = background.frames == 0 and not shared
+        self._seen_from: CameraPose | None = None
+
+    @property
+    def background(self) -> BackgroundModel:
+        """The empty scene, as far as it is known."""
+        return self.scene.background
+
+    @property
+    def known(self) -> str:
+        """State of the background, in a few words."""
+        unknown = self.background.unknown
+        if unknown is not None:
+            return f'forgotten, {1 - unknown.mean():.0%} known again'
+        if self.scene.known:
+            return 'known'
+        return 'not yet seen empty' if self.background.frames else 'unknown'
+
+    def forget(self) -> None:
+        """Begins anew without a background: the camera sees another scene."""
+        self.scene = EmptyScene(BackgroundModel(self.background.settings), trusted=self._shared)
+        self.doubted, self._learning = False, not self._shared
+        self.watch = SceneWatch()
+
+    def see_from(self, pose: CameraPose, camera: Camera) -> None:
+        """Takes the pose of the camera at an image; from another view the scene is another."""
+        if self._seen_from is None:
+            self._seen_from = pose
+        elif pose.shift(self._seen_from, camera) > VIEW_SHIFT:
+            self.forget()
+            self._seen_from = pose
+
+    def learn(self, image: Image, stamp: int, detected: bool | None = None) -> None:
+        """Learns the scene from an image before the track; see `EmptyScene.learn`."""
+        if self._learning:
+            if self.doubted:
+                self.forget()
+            self.scene.learn(image, stamp, detected)
+
+    def silhouette(
+        self,
+        image: Image,
+        stamp: int,
+        mask: Mask | None,
+        region: Box | None,
+        others: Mask | None = None,
+    ) -> Silhouette | None:
+        """The silhouette in an image; None: unknown.
+
+        Args:
+            image: (H, W, 3).
+            stamp: of the image, ns.
+            mask: (H, W) of a segmenter, if any.
+            region: where the person can be; None: anywhere.
+            others: (H, W) pixels that somebody else covers; None: none.
+        """
+        if mask is not None:
+            mask = mask if others is None else mask & ~others
+            return Silhouette(one_person(mask, self.background.settings, region))
+        scene = self.scene
+        if self.doubted or not (scene.seen and scene.background.frames):
+            return None
+        if not self._shared:
+            self.watch.look(image, self.background)
+        scene.judge(image, stamp)
+        if scene.is_of_somebody:
+            self._doubt()
+        return self.background.split(image, region, others) if scene.known else None
+
+    def anywhere(self, image: Image, mask: Mask | None, others: Mask | None, step: int) -> Mask:
+        """All foreground of an image, at every step-th pixel (H / step, W / step).
+
+        Args:
+            image, mask, others: as for `silhouette`, which is not None.
+            step: px.
+        """
+        found = self.background.foreground(image) if mask is None else mask
+        coarse = found[::step, ::step]
+        if others is not None:
+            coarse = coarse & ~others[::step, ::step]
+        pixels = np.ascontiguousarray(coarse).view(np.uint8)
+        # Single pixels are noise.
+        return np.asarray(cv2.medianBlur(pixels, 3), dtype=np.uint8).view(np.bool_)
+
+    def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
+        """Doubts the background if too little of the person, in poses (K, d), is foreground.
+
+        A background that was given, not learned, is the empty scene: then nobody is there.
+        """
+        if not self.background.frames or not self._learning:
+            return
+        inside = resized(_area(body, camera, poses), -INNER_MARGIN)
+        if not inside.any():
+            return
+        if self.background.foreground(image)[inside].mean() < MIN_FOREGROUND_FRACTION:
+            self._doubt()
+
+    def _doubt(self) -> None:
+        """Forgets a background that shows the person."""
+        self.doubted = True
+        self.background.forget()
+
+    def complete(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
+        """Puts a forgotten background together, where the person in poses (K, d) is not."""
+        if self.background.unknown is None:
+            return
+        area = _area(body, camera, poses)
+        around = resized(area, OUTER_MARGIN)
+        self.background.complete(image, around)
+        unknown = self.background.unknown
+        known = unknown is None or (unknown & around).sum() <= MAX_UNKNOWN_FRACTION * area.sum()
+        trusted, self.doubted = not self.doubted, not known
+        if known and not trusted:
+            self.scene.log_odds, self.scene.seen = COMPLETED_LOG_ODDS, True
+            self.check(image, body, camera, poses[:1])
+
+
+def region_of(
+    body: Body, camera: Camera, poses: Array, margin: float = REGION_MARGIN, dt: float = 0.0
+) -> Box | None:
+    """Where a person in poses (K, d) can be in the next image; None: anywhere.
+
+    Args:
+        body, camera, poses: of the person.
+        margin: around all joints, as a fraction of their extent.
+        dt: time since the person was at the poses, s.
+    """
+    pixels = camera.project(body.joint_positions(poses)).reshape(-1, 2)
+    pixels = pixels[np.isfinite(pixels).all(1)]
+    if len(pixels) == 0:
+        return None
+    low, high = pixels.min(0), pixels.max(0)
+    nearest = max(float(poses[:, 2].min()), 0.1)
+    reach = RUNNING_SPEED * dt * camera.magnification(nearest)
+    margin = max(margin * max(float((high - low).max()), 1.0), reach)
+    size = (camera.width, camera.height)
+    left, top = (int(x) for x in np.clip(np.floor(low - margin), 0, size))
+    right, bottom = (int(x) for x in np.clip(np.ceil(high + margin), 0, size))
+    if right - left < 2 or bottom - top < 2:
+        return None
+    return left, top, right, bottom
+
+
+def _area(body: Body, camera: Camera, poses: Array) -> Mask:
+    """Where some of the poses (K, d) have the body, (H, W)."""
+    return np.asarray(render_silhouettes(body, poses, camera).any(0), dtype=np.bool_)
