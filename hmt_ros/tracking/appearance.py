@@ -34,10 +34,6 @@ from hmt_ros.inference.error_model import seconds
 from hmt_ros.tracking.settings import MAJORITY, UNDECIDED_FRACTION
 from hmt_ros.tracking.view import View
 
-__all__ = ['MOST', 'Appearance', 'Motion']
-
-MOST = MAJORITY
-
 
 class Silhouetted(NamedTuple):
     """Evidence of a silhouette for the presence of a person, from -1, nobody, to 1.

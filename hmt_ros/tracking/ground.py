@@ -48,8 +48,6 @@ from hmt_ros.tracking.settings import (
     VERTICAL_TIME,
 )
 
-__all__ = ['GIVEN_UP_SIGMA', 'Ground', 'GroundEstimator', 'GroundSettings', 'KnownGround']
-
 
 @dataclass(frozen=True)
 class KnownGround:
@@ -257,6 +255,15 @@ class GroundEstimator:
     def vertical_known(self) -> bool:
         """Whether the vertical is given, or the lines of the scene show it; else it is guessed."""
         return self.known.up is not None or self._seen is not None
+
+    @property
+    def vertical(self) -> Array | None:
+        """(3,) the vertical, camera frame, as given or as the lines show it; None: unknown."""
+        return self.estimate.up if self.vertical_known else None
+
+    def gravity(self, weight: float) -> Gravity | None:
+        """Gravity for a start, with a factor on its energy; None: it is unknown, or not used."""
+        return Gravity(self.plane, weight) if self.vertical_known and weight > 0 else None
 
     @property
     def plane(self) -> FloorPlane:

@@ -8,8 +8,10 @@ colours and keypoints in `image`, errors of cues in `inference.error_model`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 
@@ -293,3 +295,69 @@ class TrackerSettings:
             refined=min(self.search.refined, max(limbs // 2, 1)),
             surprising=False,
         )
+
+
+# --- Beliefs of a track
+
+# Rates at which chains of two states begin and end, 1/s.
+RATES: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {
+        # Somebody comes into an empty view, and leaves it. Chosen.
+        'existence': (0.1, 0.2),
+        # Another takes the place of who was seen last, unseen, once in an hour. Chosen.
+        'same person': (0.0, 1.0 / 3600.0),
+        # A track follows again, and fails; a cue shows the person again, or something else.
+        # Chosen.
+        'track and cues': (1.0, 0.05),
+        # A detector as a whole shows the person again, and somebody else. Chosen.
+        'detector': (1.0, 0.02),
+    }
+)
+# Largest log likelihood ratio of somebody against nobody in an image, nats, and how long its errors
+# last, s. A clear image is wrong in 1 of 3,000 cases, by some lasting cause that is not modelled. A
+# detector misses a badly visible person in about 1 of 100 images, for longer. Chosen.
+EXISTENCE_CUES: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {'clear': (8.0, 0.2), 'doubtful': (5.0, 0.25)}
+)
+# Probability of existence above which somebody is there, and a new track may start, and below which
+# nobody is, if the image says so. Between them it is undecided. Chosen.
+PRESENT_PROBABILITY, ABSENT_PROBABILITY = 0.85, 0.03
+# Fraction of a cue that is left to a silhouette which a side of the image may cut, and to keypoints
+# of a part of a person. Chosen.
+PART_FRACTION = 0.6
+# Evidence of a cue that is wholly explained against one that is not at all, nats, and the number of
+# its measurements that give it: neighbours err together. Chosen.
+VALIDITY_NATS, VALIDITY_COUNT = 16.0, 4
+# How long misfits of the modes to a cue last, s. Chosen.
+MISFIT_TIME = 0.1
+# Maximum evidence of one image about a cue, nats: it may be wrong in unforeseen ways. Chosen.
+MAX_CUE_NATS = 3.5
+# Probability that a mode has a part of the body where it is: limbs lag behind, and hide before the
+# trunk. Chosen.
+PLACED_PROBABILITY = 0.8
+# Probability that the evidence of an image for a facing direction is about the person. Chosen.
+FACING_VALID = 0.9
+# Largest log odds of a facing direction, nats: those against a way that a start lacks. Chosen.
+MAX_FACING_NATS = 10.0
+# Least probability of an exchange of sides by a detector. Chosen.
+LEAST_EXCHANGE = 1e-6
+# Log weight below that of the heaviest mode up to which modes show where the person may be, nats.
+# Chosen.
+LIKELY_NATS = 4.0
+# Share of the time for which somebody stands on both feet, where contact is unknown. Chosen.
+RESTING_SHARE = 0.3
+
+# --- Modes
+
+# Gain by a step below which a minimum is found, nats. Chosen.
+MINIMUM_TOLERANCE = 0.02
+# Largest standard deviation of a variable of a mode, where an image shows nothing, and that of one
+# which rests on its limit (3 degrees), rad or m. Chosen.
+MAX_SIGMA, LIMIT_SIGMA = 2.0, 0.05
+# How often the shape is fitted to the first image, and the number of the heaviest modes that it is
+# estimated from. Chosen.
+FIRST_SHAPE_FITS, SHAPE_MODES = 3, 4
+# Newton steps from the reversal of a mode to its optimum, before candidates are compared. Chosen.
+REVERSAL_ITERATIONS = 8
+# Bits of an identity below the number of the posture of unseen limbs.
+POSTURE_BITS = 20

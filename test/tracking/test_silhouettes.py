@@ -47,11 +47,11 @@ def test_masks_replace_the_background(film, subject, human32, camera):
                 for i, (image, mask) in enumerate(zip(images, masks, strict=True))
             ]
         )
-        assert tracker.status is Status.TRACKING
-        assert tracker.misfit < 0.2
+        assert tracker.estimate.status is Status.TRACKING
+        assert tracker.estimate.misfit < 0.2
     assert in_bytes(runs[0]) == in_bytes(runs[1])
     errors = [
-        best_error(tracker.body, posterior, human32, pose)
+        best_error(tracker.estimate.body, posterior, human32, pose)
         for (posterior, _), pose in zip(runs[0], poses, strict=True)
     ]
     assert max(errors) < 0.1
@@ -74,10 +74,10 @@ def test_no_background_is_learned_from_what_a_mask_shows_a_person_in(film, human
     mask = np.zeros(images[0].shape[:2], dtype=bool)
     tracker = Tracker(human32, camera)
     tracker.step(images[0], 0, mask=mask)
-    assert tracker.background.frames == 1
+    assert tracker.silhouettes.background.frames == 1
     mask[50:60, 50:60] = True
     tracker.step(images[1], 1, mask=mask)
-    assert tracker.background.frames == 1
+    assert tracker.silhouettes.background.frames == 1
     assert not tracker.silhouettes.scene.known
     with pytest.raises(ValueError, match=r'images of \(240, 320\), saw a mask of \(120, 320\)'):
         tracker.step(images[1], 2, mask=mask[::2])
@@ -161,7 +161,7 @@ def test_tracking_where_the_background_was_learned_with_the_person_in_it(
         given = None if alone else keypoints_of(human32, poses[i], 1.0, i)
         posterior, _ = tracker.step(image, i * FRAME, given)
         if posterior is not None:
-            errors.append(best_error(tracker.body, posterior, human32, poses[i]))
+            errors.append(best_error(tracker.estimate.body, posterior, human32, poses[i]))
             doubted.append(tracker.silhouettes.doubted)
     assert len(errors) == 32
     known = doubted.index(False)
