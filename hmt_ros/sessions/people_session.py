@@ -23,6 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hmt_ros.body import Camera
+from hmt_ros.body.camera_pose import CameraPose
 from hmt_ros.image.association import (
     GATE,
     ImageTrack,
@@ -55,7 +56,6 @@ from hmt_ros.sessions.track_start import TrackStart
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking import Status
-from hmt_ros.tracking.camera_motion import CameraPose
 from hmt_ros.tracking.settings import LIKELY_NATS
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,

@@ -43,10 +43,11 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.image.keypoint_evidence import keypoint_evidence, suffices
+from hmt_ros.image.person_colours import Motion
 from hmt_ros.image.still_picture import StillPicture
 from hmt_ros.inference.error_model import seconds, share_of_time
 from hmt_ros.inference.markov_chain import MarkovChain, of_log_odds, update
-from hmt_ros.tracking.appearance import Appearance, Motion
+from hmt_ros.tracking.appearance import Appearance
 from hmt_ros.tracking.settings import (
     ABSENT_PROBABILITY,
     EXISTENCE_CUES,

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera_pose import CameraPose
 from hmt_ros.body.mirror import relevelled
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.experts.lifter import KeypointHistory, lifted_positions, load_lifter
@@ -42,12 +43,11 @@ from hmt_ros.tracking.beginning import (
     first_start,
     poses_to_search,
 )
-from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
+from hmt_ros.tracking.camera_motion import CameraPath
 from hmt_ros.tracking.contact import by_foot
 from hmt_ros.tracking.existence import GIVEN, Existence
 from hmt_ros.tracking.filter import Judged, MixtureFilter
 from hmt_ros.tracking.ground import (
-    GIVEN_UP_SIGMA,
     GroundEstimator,
     KnownGround,
     unit_vector,
@@ -57,7 +57,7 @@ from hmt_ros.tracking.laplace_approximation import likelihood_modes
 from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE, of_depth_at_best
 from hmt_ros.tracking.observer import Observer
 from hmt_ros.tracking.pose_prediction import PosePrediction
-from hmt_ros.tracking.settings import LIKELY_NATS, RESTING_SHARE, TrackerSettings
+from hmt_ros.tracking.settings import GIVEN_UP_SIGMA, LIKELY_NATS, RESTING_SHARE, TrackerSettings
 from hmt_ros.tracking.track_state import Estimate, TrackState, no_likelihood
 from hmt_ros.tracking.validity import DEPTH, Validity
 from hmt_ros.tracking.view import View

@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import Body, load_body
+from hmt_ros.body.camera_pose import CameraPose
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings, read_subject
-from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath, CameraPose
+from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath
 from hmt_ros.tracking.contact import by_foot, contacts_of
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
