@@ -358,8 +358,7 @@ def _multimodality_figure(training: Described) -> Figure:
 
 
 def _scaled(values: Array) -> Array:
-    result: Array = values / np.maximum(values.std(0), 1e-6)
-    return result
+    return values / np.maximum(values.std(0), 1e-6)
 
 
 def _example_figure(pairs: TrainingSet) -> Figure:

@@ -261,8 +261,7 @@ def target_basis(encoding: PoseEncoding, targets: Array) -> Array:
     slopes = slopes.reshape(len(chosen), -1, body.dimension) @ by_target
     metric = np.einsum('nij,nik->jk', slopes, slopes, optimize=True)
     metric /= len(chosen) * (len(body.joint_names) - 1)
-    factor: Array = np.linalg.cholesky(metric + SMALLEST**2 * np.eye(encoding.size))
-    return factor
+    return np.linalg.cholesky(metric + SMALLEST**2 * np.eye(encoding.size))
 
 
 def affinities(vectors: Array) -> Array:
@@ -270,8 +269,7 @@ def affinities(vectors: Array) -> Array:
     squared = squared_distances(vectors, vectors)
     off = squared[~np.eye(len(squared), dtype=bool)]
     scale = max(float(np.median(off)) if len(off) else 1.0, 1e-12)
-    result: Array = np.exp(-0.5 * squared / scale)
-    return result
+    return np.exp(-0.5 * squared / scale)
 
 
 def multimodality(inputs: Array, targets: Array, clusters: int, seed: int = 0) -> Index:
@@ -295,5 +293,4 @@ def multimodality(inputs: Array, targets: Array, clusters: int, seed: int = 0) -
     ]
     pairs = np.unique(np.stack(labels, axis=1), axis=0)
     under = np.bincount(pairs[:, 0], minlength=clusters)
-    counts: Index = np.bincount(under[under > 0])[1:]
-    return counts
+    return np.bincount(under[under > 0])[1:]

@@ -182,8 +182,7 @@ class ExpertMixture(ConditionalDensity):
             squares = squared_distances(points, self._candidates).min(1) / self.basis_.width**2
         else:
             squares = (points**2).mean(1)
-        result: Array = np.exp(-0.5 * squares)
-        return result
+        return np.asarray(np.exp(-0.5 * squares))
 
     # Learning.
 

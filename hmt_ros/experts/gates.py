@@ -237,8 +237,7 @@ class _Softmax:
         """MacKay's fixed point with the hyperprior."""
         determined = np.maximum(found.determined, 0.0)
         precisions = (determined + 2.0 * SHAPE) / ((found.weights**2).sum(0) + 2.0 * RATE)
-        result: Array = np.maximum(precisions, LEAST_PRECISION)
-        return result
+        return np.asarray(np.maximum(precisions, LEAST_PRECISION))
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,8 +304,7 @@ class GaussianGates:
             z = (features - mean) @ whiteners[i].T
             result[:, i] = (z * z).sum(1)
         size = features.shape[1] * np.log(2.0 * np.pi)
-        log_scores: Array = self.log_shares - 0.5 * (result + log_dets + size)
-        return log_scores
+        return np.asarray(self.log_shares - 0.5 * (result + log_dets + size))
 
     def learned(
         self, features: Array, responsibilities: Array, sample_weights: Array

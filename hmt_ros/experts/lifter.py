@@ -123,8 +123,7 @@ def proportions(usual: Body, lengths: Mapping[str, float]) -> Array:
     own = usual.segment_lengths
     weight = np.array([own[name] for name in PROPORTIONED])
     ratio = np.array([max(lengths[name] / own[name], SHORTEST) for name in PROPORTIONED])
-    result: Array = np.log(ratio) - weight @ np.log(ratio) / weight.sum()
-    return result
+    return np.asarray(np.log(ratio) - weight @ np.log(ratio) / weight.sum())
 
 
 def places_of(keypoints: Keypoints, scheme: str = AUTO) -> list[int]:

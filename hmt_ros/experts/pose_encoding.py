@@ -125,14 +125,12 @@ class PoseEncoding:
     def _from_view(self, points: Array) -> Array:
         """Rotations (N, 3, 3) from a camera that looks at points (N, 3), upright by the level."""
         level = self.body.level
-        result: Array = level @ ray_rotations(points @ level)
-        return result
+        return level @ ray_rotations(points @ level)
 
     def _view_by_root(self, points: Array) -> Array:
         """Derivatives (N, 3, 3) of that rotation by the points, camera frame."""
         level = self.body.level
-        result: Array = level @ _rotation_by_root(points @ level) @ level.T
-        return result
+        return level @ _rotation_by_root(points @ level) @ level.T
 
     def _checked(self, targets: ArrayLike, roots: ArrayLike) -> tuple[Array, Array]:
         targets = np.asarray(targets, dtype=np.float64)

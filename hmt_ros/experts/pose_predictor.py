@@ -216,8 +216,7 @@ class PosePredictor:
     def _described(self, blob: PersonBlob, camera: Camera) -> Array:
         view = centred_view(blob, camera, self.body.level)
         parts = silhouette_parts(view, self.descriptor.points)
-        result: Array = self.descriptor.describe([parts])[0]
-        return result
+        return np.asarray(self.descriptor.describe([parts])[0])
 
     def targets_after(
         self,

@@ -164,8 +164,7 @@ def _first_roots(encoding: PoseEncoding, camera: Camera, sides: Array, targets: 
     extent = np.linalg.norm(joints.max(1) - joints.min(1), axis=1) + 0.2 * encoding.body.scale
     depth = 0.5 * extent / np.tan(0.5 * max(float(angle), 1e-3))
     depth = np.clip(depth, 2.0 * encoding.body.lower[2], 0.9 * encoding.body.upper[2])
-    result: Array = depth[:, None] * ray / max(float(ray[2]), 0.1)
-    return result
+    return np.asarray(depth[:, None] * ray / max(float(ray[2]), 0.1))
 
 
 def _prior(roots: Array) -> Array:
@@ -229,5 +228,4 @@ def _by_pose(frames: Frames, mesh: Mesh, vertices: Index, points: Array) -> Arra
     u, v, w = np.moveaxis(arm, -1, 0)
     turning = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
     moved = np.where(skeleton.dof_is_rotation[:, None], turning, axes[:, None])
-    result: Array = moved * skeleton.moves[mesh.segments[vertices]][..., None]
-    return result
+    return moved * skeleton.moves[mesh.segments[vertices]][..., None]

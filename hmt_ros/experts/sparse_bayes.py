@@ -96,14 +96,12 @@ class SparseRegression:
 
     def mean(self, features: Array) -> Array:
         """M' phi, (n, D), of features (n, K) of all candidates."""
-        result: Array = features[:, self.active] @ self.weights
-        return result
+        return features[:, self.active] @ self.weights
 
     def spread(self, features: Array) -> Array:
         """phi' L^-1 phi, (n,): the variance of the mean in units of the noise."""
         phi = features[:, self.active]
-        result: Array = ((phi @ self.covariance) * phi).sum(1)
-        return result
+        return np.asarray(((phi @ self.covariance) * phi).sum(1))
 
 
 def posterior(

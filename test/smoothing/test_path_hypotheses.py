@@ -47,7 +47,7 @@ def test_weights_and_states_are_those_of_the_posterior(modes, dynamics):
     offset = found.log_values - exact.log_weights
     np.testing.assert_allclose(offset, offset[0], atol=1e-6)
     assert (np.diff(found.log_values) <= 0).all()
-    step = PathHypotheses.first(mixtures[0], dynamics)
+    step = PathHypotheses.of_states(first_state(mixtures[0], dynamics))
     for mixture in mixtures[1:]:
         step = step.followed(mixture, dynamics, 1.0, 81)
     np.testing.assert_allclose(step.log_weights, found.log_values)
@@ -95,7 +95,7 @@ def test_paths_are_traced_to_their_beginning(modes, walk):
         steps.append(
             steps[-1].followed(mixture, walk, 1.0, 5)
             if steps
-            else PathHypotheses.first(mixture, walk)
+            else PathHypotheses.of_states(first_state(mixture, walk))
         )
     nodes = traced(steps)
     whole = probable_paths(mixtures, walk, np.ones(3), 5)

@@ -275,8 +275,7 @@ class SilhouetteDescriptor:
     def describe(self, parts: Iterable[SilhouetteParts]) -> Array:
         """Vectors (n, p) of silhouettes."""
         features = np.array([np.concatenate(list(self._features(x).values())) for x in parts])
-        result: Array = (features * self.scale_ - self.centre_) @ self.basis_
-        return result
+        return np.asarray((features * self.scale_ - self.centre_) @ self.basis_)
 
     def _features(self, parts: SilhouetteParts) -> dict[str, Array]:
         # Square roots of shares, as in the codebook.
@@ -334,8 +333,7 @@ def _weights(name: str, columns: Array) -> Array:
         spread = np.sqrt(columns.shape[1]) * np.maximum(columns.std(0), 1e-6)
     else:
         spread = np.full(columns.shape[1], max(float(np.sqrt(columns.var(0).sum())), 1e-9))
-    result: Array = WEIGHTS[name] / spread
-    return result
+    return np.asarray(WEIGHTS[name] / spread)
 
 
 def _at_one_size(mask: Bytes) -> Bytes:
@@ -344,8 +342,7 @@ def _at_one_size(mask: Bytes) -> Bytes:
     height, width = (max(round(side * factor), 3) for side in mask.shape)
     how = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
     resized = cv2.resize(mask * np.uint8(255), (width, height), interpolation=how)
-    result: Bytes = (resized > 127).astype(np.uint8)
-    return result
+    return (resized > 127).astype(np.uint8)
 
 
 def _map_and_moments(mask: Bytes) -> tuple[Array, Array]:
