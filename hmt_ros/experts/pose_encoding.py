@@ -189,10 +189,7 @@ def _orthogonal(axes: Array) -> Array:
     up = axes[:, 3:] - (axes[:, 3:] * front).sum(1, keepdims=True) * front
     up = _unit(up)
     result = np.empty((len(axes), 3, 3))
-    result[:, :, 1], result[:, :, 2] = front, up
-    for k in range(3):  # the cross product of both
-        i, j = (k + 1) % 3, (k + 2) % 3
-        result[:, k, 0] = front[:, i] * up[:, j] - front[:, j] * up[:, i]
+    result[:, :, 0], result[:, :, 1], result[:, :, 2] = np.cross(front, up), front, up
     return result
 
 

@@ -224,8 +224,6 @@ def _by_pose(frames: Frames, mesh: Mesh, vertices: Index, points: Array) -> Arra
     skeleton = frames.skeleton
     axes, origins = frames.dofs_by_pose()  # (M, d, 3)
     arm = points[:, :, None] - origins[:, None]
-    x, y, z = np.moveaxis(axes[:, None], -1, 0)
-    u, v, w = np.moveaxis(arm, -1, 0)
-    turning = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+    turning = np.cross(axes[:, None], arm)
     moved = np.where(skeleton.dof_is_rotation[:, None], turning, axes[:, None])
     return moved * skeleton.moves[mesh.segments[vertices]][..., None]

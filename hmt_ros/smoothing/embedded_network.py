@@ -105,7 +105,10 @@ def embedded_network(
     each_node = np.split(node_values, np.cumsum([pairs.shape[1] for pairs in within]))
     each_link = np.split(link_values, np.cumsum([pairs.shape[1] for pairs in across]))
     return EmbeddedNetwork(
-        tuple(_node_values(m.weights, *one) for m, *one in zip(mixtures, each_node, within)),
+        tuple(
+            _node_values(mixture.weights, values, pairs)
+            for mixture, values, pairs in zip(mixtures, each_node, within)
+        ),
         tuple(
             values.reshape(len(left), len(right))
             for (left, right), values in zip(pairwise(mixtures), each_link)

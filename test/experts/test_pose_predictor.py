@@ -181,7 +181,7 @@ def test_a_person_cut_by_the_border(
     cut = np.roll(mask, 300 - knees, axis=0)
     cut[: 300 - knees] = False
     found = predictor.observe(cut, CAMERA)
-    assert found.placement.cut
+    assert any(found.place.cut)
     assert 'bottom' in found.place.remarks[-1]
     whole = predictor.observe(mask, CAMERA)
     spreads = [
