@@ -119,24 +119,15 @@ class LinearGaussianDynamics:
                 )
 
     @classmethod
-    def random_walk(
-        cls,
-        rates: ArrayLike,
-        *,
-        initial_mean: ArrayLike | None = None,
-        initial_covariance: ArrayLike | None = None,
-        step: float = 1.0,
-    ) -> LinearGaussianDynamics:
-        """First-order dynamics, x_{t+1} = x_t + noise.
+    def random_walk(cls, rates: ArrayLike, *, step: float = 1.0) -> LinearGaussianDynamics:
+        """First-order dynamics, x_{t+1} = x_t + noise; the first pose is unknown.
 
         Args:
             rates: (d,) variances, or (d, d) covariance, that the pose gains per second.
-            initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
         """
         diffusion = _matrix(rates)
         d = len(diffusion)
-        mean, precision = _initial(d, initial_mean, initial_covariance)
-        return cls(np.zeros((d, d)), diffusion, d, mean, precision, step)
+        return cls(np.zeros((d, d)), diffusion, d, np.zeros(d), np.zeros((d, d)), step)
 
     @classmethod
     def constant_velocity(
@@ -144,29 +135,24 @@ class LinearGaussianDynamics:
         rates: ArrayLike,
         velocity_sigma: ArrayLike,
         *,
-        initial_mean: ArrayLike | None = None,
-        initial_covariance: ArrayLike | None = None,
         step: float = 1.0,
     ) -> LinearGaussianDynamics:
-        """Second-order dynamics; the state is the pose and its velocity.
+        """Second-order dynamics; the state is the pose, at first unknown, and its velocity.
 
         Args:
             rates: (d,) variances, or (d, d) covariance, that the velocity gains per second.
             velocity_sigma: (d,) or scalar, standard deviation of the first velocity, per second.
-            initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
         """
         white = _matrix(rates)
         d = len(white)
         sigma = np.broadcast_to(np.asarray(velocity_sigma, dtype=np.float64), (d,))
         if not (sigma > 0).all():
             raise ValueError(f'dynamics: velocity_sigma must be positive, saw {sigma.min()}')
-        drift, diffusion = np.zeros((2, 2 * d, 2 * d))
+        drift, diffusion, precision = np.zeros((3, 2 * d, 2 * d))
         drift[:d, d:] = np.eye(d)
         diffusion[d:, d:] = white
-        mean, precision = np.zeros(2 * d), np.zeros((2 * d, 2 * d))
-        mean[:d], precision[:d, :d] = _initial(d, initial_mean, initial_covariance)
         precision[d:, d:] = np.diag(sigma**-2.0)
-        return cls(drift, diffusion, d, mean, precision, step)
+        return cls(drift, diffusion, d, np.zeros(2 * d), precision, step)
 
     @property
     def state_dimension(self) -> int:
@@ -313,17 +299,3 @@ def _precision_of(covariance: Array) -> tuple[Array, float]:
 def _matrix(rates: ArrayLike) -> Array:
     value = np.atleast_1d(np.asarray(rates, dtype=np.float64))
     return np.diag(value) if value.ndim == 1 else value
-
-
-def _initial(d: int, mean: ArrayLike | None, covariance: ArrayLike | None) -> tuple[Array, Array]:
-    if (mean is None) != (covariance is None):
-        raise ValueError('dynamics: give both initial_mean and initial_covariance, or neither')
-    if mean is None or covariance is None:
-        return np.zeros(d), np.zeros((d, d))
-    matrix = _matrix(covariance)
-    try:
-        np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        raise ValueError('dynamics: initial_covariance is not positive definite') from None
-    precision = np.linalg.inv(matrix)
-    return np.asarray(mean, dtype=np.float64), 0.5 * (precision + precision.T)

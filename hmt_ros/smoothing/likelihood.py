@@ -112,11 +112,6 @@ class MixtureLikelihood:
         at = self.first[:-1] + path
         return self.log_scales[at], self.means[at], self.precisions[at]
 
-    def modes_at(self, t: int) -> tuple[Array, Array, Array]:
-        """log scales (K_t,), means (K_t, d) and precisions (K_t, d, d) of the modes at a time."""
-        at = slice(self.first[t], self.first[t + 1])
-        return self.log_scales[at], self.means[at], self.precisions[at]
-
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
@@ -173,12 +168,6 @@ class WindowLikelihood:
             np.concatenate([mean, means]),
             np.concatenate([precision, precisions]),
         )
-
-    def modes_at(self, t: int) -> tuple[Array, Array, Array]:
-        """As for `MixtureLikelihood`: over n variables at the first time, over d later."""
-        if t == 0 or self.later is None:
-            return self.first.modes_at(t)
-        return self.later.modes_at(t - 1)
 
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE

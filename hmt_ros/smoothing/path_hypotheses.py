@@ -378,16 +378,14 @@ class SmoothedPath:
             apart[..., t, :] -= x[..., t + 1, :] @ gain.T
         return np.asarray(np.linalg.solve(self.roots, apart[..., None])[..., 0])
 
-    def inverse_blocks(self) -> tuple[Array, Array]:
-        """Blocks of P^-1: (T, n, n) on the diagonal and (T-1, n, n) below it."""
+    def inverse_blocks(self) -> Array:
+        """Blocks (T, n, n) on the diagonal of P^-1."""
         covariances = np.array(self.filtered)
-        neighbours = np.empty_like(covariances[1:])
         for t in range(self.times - 2, -1, -1):
             (passage, row), gain = self.passages[t], self.gains[t]
-            np.matmul(covariances[t + 1], gain.T, out=neighbours[t])
-            change = gain @ (neighbours[t] - passage.covariances[row] @ gain.T)
+            change = gain @ (covariances[t + 1] @ gain.T - passage.covariances[row] @ gain.T)
             covariances[t] += 0.5 * (change + change.T)
-        return covariances, neighbours
+        return covariances
 
     def matrix(self) -> BlockTridiagonal:
         """P."""

@@ -105,7 +105,7 @@ class TrajectoryMixture:
         """Covariances (T, d, d) of the poses of component i, inflation included."""
         if i not in self._covariances:
             d = self.dimension
-            blocks = self.factors[i].inverse_blocks()[0]
+            blocks = self.factors[i].inverse_blocks()
             self._covariances[i] = self.inflation[i] ** 2 * blocks[:, :d, :d]
         return self._covariances[i]
 

@@ -248,9 +248,7 @@ class FreeEnergy:
             at += sizes[name]
         self.parameters = at
         self.bands = np.stack([factor.band.T for factor in factors])
-        self.marginals = np.empty((self.count, self.times, self.size, self.size))
-        for i, factor in enumerate(factors):
-            self.marginals[i] = factor.inverse_blocks()[0]
+        self.marginals = np.stack([factor.inverse_blocks() for factor in factors])
         self.log_determinants = np.array([factor.log_determinant for factor in factors])
         self.roots = self._coloured(noise)
 
