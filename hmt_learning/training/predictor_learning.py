@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_learning.training.descriptor_learning import first_components, learn_descriptor
 from hmt_learning.training.network_learning import LearningNetwork, tools_are_there
 from hmt_learning.training.training_set import TrainingSet
 from hmt_ros.body import Body
@@ -165,7 +166,7 @@ class Described:
         count = min(count, self.descriptor.size)
         return replace(
             self,
-            descriptor=self.descriptor.with_components(count),
+            descriptor=first_components(self.descriptor, count),
             descriptors=self.descriptors[:, :count],
         )
 
@@ -184,7 +185,8 @@ def described(
     descriptor = descriptor or SilhouetteDescriptor()
     # Shape contexts of all silhouettes would fill the memory.
     some = np.random.default_rng(descriptor.seed).permutation(len(pairs))[:FOR_DESCRIPTOR]
-    descriptor.fit([silhouette_parts(pairs.mask(i), descriptor.points) for i in np.sort(some)])
+    seen = [silhouette_parts(pairs.mask(i), descriptor.points) for i in np.sort(some)]
+    learn_descriptor(descriptor, seen)
     masks: Iterable[Bytes] = pairs.masks()
     if progress is not None:
         masks = progress(masks, len(pairs))

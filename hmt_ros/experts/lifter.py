@@ -261,16 +261,12 @@ class Network(Layers):
     scale: Floats
     middle: Floats
 
-    @property
-    def experts(self) -> int:
-        """Number of experts, K."""
-        return int(self.last.shape[1]) // (1 + 6 * len(self.middle))
-
     def __call__(self, inputs: Floats) -> tuple[Array, Array, Array]:
         """Log gates (N, K), means (N, K, J, 3) and deviations (N, K, J, 3), m, of inputs (N, p)."""
         whitened: Floats = (inputs - self.mean) / self.scale
         out = self.outputs(whitened).astype(np.float64)
-        n, k, j = len(inputs), self.experts, len(self.middle)
+        n, j = len(inputs), len(self.middle)
+        k = out.shape[1] // (1 + 6 * j)
         gates, means = out[:, :k], out[:, k : k * (1 + 3 * j)].reshape(n, k, j, 3)
         spreads = out[:, k * (1 + 3 * j) :].reshape(n, k, j, 3)
         deviations = np.exp(np.clip(spreads + SPREAD, *SPREADS))

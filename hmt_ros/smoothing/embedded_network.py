@@ -25,7 +25,6 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.gaussian_pairs import pair_log_densities
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.smoothing.likelihood import check_mixtures
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +57,9 @@ def embedded_network(
         intervals: (T-1,) s; (T,) with `first`.
         first: a density of the state (n variables) at a time before the mixtures; its components
             are the first layer of nodes.
-
-    Raises:
-        ValueError: mixtures that can not be smoothed.
     """
     if first is not None:
         return _with_first(first, mixtures, dynamics, intervals)
-    check_mixtures(mixtures, factorise=False)
     d, n = dynamics.dimension, dynamics.state_dimension
     begin = np.concatenate([[0], np.cumsum([len(mixture) for mixture in mixtures])])
     means = np.concatenate([mixture.means for mixture in mixtures])
@@ -80,12 +75,8 @@ def embedded_network(
         at: Any = slice(0, begin[-2])
         if len(different) > 1:
             at = np.repeat(which == i, np.diff(begin[:-1])).nonzero()[0]
-        if np.array_equal(own, np.eye(d)):
-            predicted[at] = means[at]
-            spread[at] = covariances[at] + noise
-        else:
-            predicted[at] = means[at] @ own.T
-            spread[at] = own @ covariances[at] @ own.T + noise
+        predicted[at] = means[at] @ own.T
+        spread[at] = own @ covariances[at] @ own.T + noise
 
     # All pairs in one go: the modes of a time with each other, and with those of the next time.
     within = [_pairs_within(len(mixture)) for mixture in mixtures]
@@ -98,10 +89,6 @@ def embedded_network(
     ).T
     node_values = pair_log_densities(means, covariances, means, covariances, node_pairs)
     link_values = pair_log_densities(predicted, spread, means, covariances, link_pairs)
-    if not np.isfinite(node_values).all():
-        # A factorisation has failed: the check says where.
-        check_mixtures(mixtures)
-
     each_node = np.split(node_values, np.cumsum([pairs.shape[1] for pairs in within]))
     each_link = np.split(link_values, np.cumsum([pairs.shape[1] for pairs in across]))
     return EmbeddedNetwork(

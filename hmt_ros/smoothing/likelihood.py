@@ -314,12 +314,8 @@ def or_missed(mixture: GaussianMixture, variances: Array) -> GaussianMixture:
     )
 
 
-def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = True) -> None:
-    """Checks that the mixtures of a window can be smoothed.
-
-    Args:
-        mixtures: one for each time.
-        factorise: whether covariances are checked to be positive definite.
+def check_mixtures(mixtures: Sequence[GaussianMixture]) -> None:
+    """Checks that the mixtures of a window, one for each time, can be smoothed.
 
     Raises:
         ValueError: a mixture that can not be smoothed, with its place.
@@ -337,8 +333,6 @@ def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = Tru
                 f'mixture {t} has {mixture.dimension} variables, those before '
                 f'{mixtures[0].dimension}'
             )
-        if not factorise:
-            continue
         try:
             mixture.cholesky()
         except ValueError as error:

@@ -232,10 +232,8 @@ class FreeEnergy:
         self.factors = list(factors)
         self.low = np.tile(np.broadcast_to(low, (self.size,)), self.times)
         self.high = np.tile(np.broadcast_to(high, (self.size,)), self.times)
-        held = np.sqrt(np.maximum(weights, LEAST_WEIGHT))
-        self.scale = held
-        self.spread = held * np.sqrt(2.0 * self.total)
-        self.adapt = tuple(name for name in ADAPTABLE if name in adapt)
+        self.scale = np.sqrt(np.maximum(weights, LEAST_WEIGHT))
+        self.spread = self.scale * np.sqrt(2.0 * self.total)
         sizes = {
             'weights': self.count,
             'means': self.count * self.total,
@@ -243,9 +241,10 @@ class FreeEnergy:
         }
         self.slices: dict[str, slice] = {}
         at = 0
-        for name in self.adapt:
-            self.slices[name] = slice(at, at + sizes[name])
-            at += sizes[name]
+        for name, size in sizes.items():
+            if name in adapt:
+                self.slices[name] = slice(at, at + size)
+                at += size
         self.parameters = at
         self.bands = np.stack([factor.band.T for factor in factors])
         self.marginals = np.stack([factor.inverse_blocks() for factor in factors])
@@ -367,8 +366,6 @@ class FreeEnergy:
             square = (means - means[k]) ** 2 * metric
             farthest[k] = square.reshape(self.count, self.times, self.size).sum(2).argmax(1)
         i, j = np.triu_indices(self.count, 1)
-        if len(i) == 0:
-            return near, farthest
         at = farthest[i, j]
         poses = means.reshape(-1, self.size)
         pairs = np.stack([i, j], axis=1) * self.times + at[:, None]

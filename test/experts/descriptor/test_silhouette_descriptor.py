@@ -6,6 +6,7 @@ import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_learning.motion.viewpoint import Viewpoint
+from hmt_learning.training.descriptor_learning import learn_descriptor
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError, centred_view, person_blob
@@ -33,8 +34,8 @@ def masks() -> np.ndarray:
 
 @pytest.fixture(scope='module')
 def descriptor(masks: np.ndarray) -> SilhouetteDescriptor:
-    return SilhouetteDescriptor(codebook_size=30, components=40).fit(
-        [silhouette_parts(x) for x in masks]
+    return learn_descriptor(
+        SilhouetteDescriptor(codebook_size=30, components=40), [silhouette_parts(x) for x in masks]
     )
 
 
@@ -96,8 +97,8 @@ def test_arrays_bring_it_back(descriptor: SilhouetteDescriptor, masks: np.ndarra
 def test_it_learns_the_same_from_the_same(
     descriptor: SilhouetteDescriptor, masks: np.ndarray
 ) -> None:
-    again = SilhouetteDescriptor(codebook_size=30, components=40).fit(
-        [silhouette_parts(x) for x in masks]
+    again = learn_descriptor(
+        SilhouetteDescriptor(codebook_size=30, components=40), [silhouette_parts(x) for x in masks]
     )
     np.testing.assert_array_equal(again.basis_, descriptor.basis_)
 
@@ -122,7 +123,7 @@ def test_nobody(descriptor: SilhouetteDescriptor) -> None:
 
 def test_one_silhouette_is_too_few(masks: np.ndarray) -> None:
     with pytest.raises(ValueError, match='2 silhouettes'):
-        SilhouetteDescriptor().fit([silhouette_parts(masks[0])])
+        learn_descriptor(SilhouetteDescriptor(), [silhouette_parts(masks[0])])
 
 
 def test_the_centred_view_undoes_place_and_lens() -> None:
