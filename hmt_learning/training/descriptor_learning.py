@@ -12,6 +12,7 @@ from hmt_ros.experts.descriptor.silhouette_descriptor import (
     ShapeContextCodebook,
     SilhouetteDescriptor,
     SilhouetteParts,
+    features_of,
 )
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import k_means
@@ -37,44 +38,43 @@ def learned_codebook(contexts: Array, count: int = 50, seed: int = 0) -> ShapeCo
     return ShapeContextCodebook(k_means(np.sqrt(contexts), count, np.random.default_rng(seed))[0])
 
 
-def learn_descriptor(
-    descriptor: SilhouetteDescriptor, parts: list[SilhouetteParts]
+def learned_descriptor(
+    parts: list[SilhouetteParts],
+    *,
+    codebook_size: int = 50,
+    points: int = 100,
+    components: int = 64,
 ) -> SilhouetteDescriptor:
-    """Learns from silhouettes what a descriptor lacks, and returns it.
+    """The descriptor that silhouettes give.
+
+    Args:
+        parts: of silhouettes with so many points.
+        codebook_size: Number of centres of the codebook.
+        components: Maximum number of components of the vector.
 
     Raises:
         ValueError: there are too few silhouettes.
     """
     if len(parts) < 2:
         raise ValueError(f'a descriptor needs 2 silhouettes at least, saw {len(parts)}')
-    total = len(parts) * descriptor.points
+    total = len(parts) * points
     step = max(total // FOR_CODEBOOK, 1)
-    rng = np.random.default_rng(descriptor.seed)
-    chosen = rng.permutation(total)[: FOR_CODEBOOK * step : step]
+    chosen = np.random.default_rng(0).permutation(total)[: FOR_CODEBOOK * step : step]
     contexts = np.concatenate([part.contexts for part in parts])[np.sort(chosen)]
-    descriptor.codebook_ = learned_codebook(contexts, descriptor.codebook_size, descriptor.seed)
-    rows = [descriptor.features(part) for part in parts]
+    codebook = learned_codebook(contexts, codebook_size)
+    rows = [features_of(codebook, part) for part in parts]
     names = list(rows[0])
     columns = {name: np.array([row[name] for row in rows]) for name in names}
-    descriptor.scale_ = np.concatenate([_weights(name, columns[name]) for name in names])
-    features = np.concatenate([columns[name] for name in names], axis=1) * descriptor.scale_
-    descriptor.centre_ = features.mean(0)
-    _, deviations, directions = np.linalg.svd(features - descriptor.centre_, full_matrices=False)
-    count = min(descriptor.components, int((deviations > 1e-6 * deviations[0]).sum()))
+    scale = np.concatenate([_weights(name, columns[name]) for name in names])
+    features = np.concatenate([columns[name] for name in names], axis=1) * scale
+    centre = features.mean(0)
+    _, deviations, directions = np.linalg.svd(features - centre, full_matrices=False)
+    count = min(components, int((deviations > 1e-6 * deviations[0]).sum()))
     # The sign of a direction is arbitrary: make its largest entry positive.
     signs = np.sign(directions[np.arange(count), np.abs(directions[:count]).argmax(1)])
     stretch = (deviations[:count] / deviations[0]) ** -WHITENING
-    descriptor.basis_ = directions[:count].T * (signs * stretch)
-    return descriptor
-
-
-def first_components(descriptor: SilhouetteDescriptor, count: int) -> SilhouetteDescriptor:
-    """The descriptor with the first `count` components alone, those of the largest variance."""
-    d = descriptor
-    result = SilhouetteDescriptor(d.codebook_size, d.points, count, d.seed)
-    result.codebook_, result.centre_, result.scale_ = d.codebook_, d.centre_, d.scale_
-    result.basis_ = d.basis_[:, :count]
-    return result
+    basis = directions[:count].T * (signs * stretch)
+    return SilhouetteDescriptor(codebook, scale, centre, basis, points)
 
 
 def _weights(name: str, columns: Array) -> Array:

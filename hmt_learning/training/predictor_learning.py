@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_learning.training.descriptor_learning import first_components, learn_descriptor
+from hmt_learning.training.descriptor_learning import learned_descriptor
 from hmt_learning.training.network_learning import LearningNetwork, tools_are_there
 from hmt_learning.training.training_set import TrainingSet
 from hmt_ros.body import Body
@@ -166,7 +166,7 @@ class Described:
         count = min(count, self.descriptor.size)
         return replace(
             self,
-            descriptor=first_components(self.descriptor, count),
+            descriptor=replace(self.descriptor, basis=self.descriptor.basis[:, :count]),
             descriptors=self.descriptors[:, :count],
         )
 
@@ -174,19 +174,20 @@ class Described:
 def described(
     body: Body,
     pairs: TrainingSet,
-    descriptor: SilhouetteDescriptor | None = None,
     progress: Progress | None = None,
+    **of_descriptor: int,
 ) -> Described:
     """Descriptors and targets of a training set.
 
     Args:
         progress: Iterates over the silhouettes, given their number.
+        of_descriptor: see `learned_descriptor`.
     """
-    descriptor = descriptor or SilhouetteDescriptor()
     # Shape contexts of all silhouettes would fill the memory.
-    some = np.random.default_rng(descriptor.seed).permutation(len(pairs))[:FOR_DESCRIPTOR]
-    seen = [silhouette_parts(pairs.mask(i), descriptor.points) for i in np.sort(some)]
-    learn_descriptor(descriptor, seen)
+    some = np.sort(np.random.default_rng(0).permutation(len(pairs))[:FOR_DESCRIPTOR])
+    descriptor = learned_descriptor(
+        [silhouette_parts(pairs.mask(i)) for i in some], **of_descriptor
+    )
     masks: Iterable[Bytes] = pairs.masks()
     if progress is not None:
         masks = progress(masks, len(pairs))

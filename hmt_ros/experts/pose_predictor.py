@@ -313,7 +313,7 @@ class PosePredictor:
             'body': body.name,
             'dof_names': list(body.dof_names),
             'lengths': body.segment_lengths,
-            'descriptor': self.descriptor.parameters(),
+            'descriptor': {'points': self.descriptor.points},
             'notes': self.notes,
         }
         arrays: Arrays = header(KIND, parameters)
@@ -350,7 +350,7 @@ class PosePredictor:
             else:
                 _check_body(body, names, where)
             descriptor = SilhouetteDescriptor.from_arrays(
-                parameters['descriptor'], part('descriptor', arrays)
+                part('descriptor', arrays), int(parameters['descriptor']['points'])
             )
             model = stored_model(part('model', arrays), where)
             dynamics = part('dynamics', arrays)

@@ -14,7 +14,6 @@ from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 from hmt_ros.experts import LocalExperts, NearestNeighbours
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
-from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor
 from hmt_ros.experts.pose_predictor import ALONE, BY_EXPERTS, PosePredictor
 
 CAMERA = Camera(400.0, 400.0, 199.5, 149.5, 400, 300)
@@ -30,7 +29,7 @@ def training(body: Body) -> Described:
     sequences = [procedural_sequence('walk', body, 5.0, seed) for seed in (1, 2)]
     settings = TrainingSettings(samples=600, elevation_spread=3.0)
     pairs = training_set(body, sequences, settings)
-    return described(body, pairs, SilhouetteDescriptor(codebook_size=25, components=30))
+    return described(body, pairs, codebook_size=25, components=30)
 
 
 @pytest.fixture(scope='module')

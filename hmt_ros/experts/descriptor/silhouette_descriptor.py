@@ -182,87 +182,78 @@ def silhouette_parts(mask: ArrayLike, points: int = 100) -> SilhouetteParts:
     )
 
 
+@dataclass(frozen=True, eq=False)
 class SilhouetteDescriptor:
-    """Vectors of silhouettes; learns in `hmt_learning.training.descriptor_learning`.
-
-    Args:
-        codebook_size: Number of centres of the codebook.
-        components: Maximum number of components of the vector.
+    """Vectors of silhouettes, as `hmt_learning.training.descriptor_learning` has learned them.
 
     Attributes:
-        codebook_: Codebook of shape contexts.
-        centre_: (q,) mean of the weighted parts.
-        scale_: (q,) weights of the parts.
-        basis_: (q, p) principal directions, scaled.
+        codebook: Codebook of shape contexts.
+        scale: (q,) weights of the parts.
+        centre: (q,) mean of the weighted parts.
+        basis: (q, p) principal directions, scaled.
+        points: Number of points on the outline.
+
+    Raises:
+        ValueError: arrays that do not fit, or are not finite.
     """
 
-    def __init__(
-        self, codebook_size: int = 50, points: int = 100, components: int = 64, seed: int = 0
-    ) -> None:
-        self.codebook_size = codebook_size
-        self.points = points
-        self.components = components
-        self.seed = seed
+    codebook: ShapeContextCodebook
+    scale: Array
+    centre: Array
+    basis: Array
+    points: int = 100
+
+    def __post_init__(self) -> None:
+        for name in ('scale', 'centre', 'basis'):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f'{name} of the descriptor must be finite')
+        length = len(self.codebook.centres) + FIXED
+        shapes = (self.scale.shape, self.centre.shape, self.basis.shape[:1])
+        if shapes != ((length,),) * 3 or self.basis.ndim != 2:
+            raise ValueError(f'arrays of the descriptor have shapes {shapes}, wanted ({length},)')
 
     @property
     def size(self) -> int:
         """Length of the vector, p."""
-        return int(self.basis_.shape[1])
+        return int(self.basis.shape[1])
 
     def describe(self, parts: Iterable[SilhouetteParts]) -> Array:
         """Vectors (n, p) of silhouettes."""
-        features = np.array([np.concatenate(list(self.features(x).values())) for x in parts])
-        return np.asarray((features * self.scale_ - self.centre_) @ self.basis_)
-
-    def features(self, parts: SilhouetteParts) -> dict[str, Array]:
-        """The features of a silhouette, by part, before they are weighted."""
-        # Square roots of shares, as in the codebook.
-        return {
-            'shape_contexts': np.sqrt(self.codebook_.histogram(parts.contexts)),
-            'edge_pairs': np.sqrt(parts.edge_pairs),
-            'distances': parts.distances,
-            'moments': parts.moments,
-        }
-
-    def parameters(self) -> dict[str, Any]:
-        """The constructor's arguments."""
-        return {
-            'codebook_size': self.codebook_size,
-            'points': self.points,
-            'components': self.components,
-            'seed': self.seed,
-        }
+        features = [np.concatenate([*features_of(self.codebook, x).values()]) for x in parts]
+        return np.asarray((np.array(features) * self.scale - self.centre) @ self.basis)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The learned arrays in single precision, for a file."""
         return {
-            'codebook': self.codebook_.centres.astype(np.float32),
-            'scale': self.scale_.astype(np.float32),
-            'centre': self.centre_.astype(np.float32),
-            'basis': self.basis_.astype(np.float32),
+            'codebook': self.codebook.centres.astype(np.float32),
+            'scale': self.scale.astype(np.float32),
+            'centre': self.centre.astype(np.float32),
+            'basis': self.basis.astype(np.float32),
         }
 
     @classmethod
-    def from_arrays(
-        cls, parameters: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
-    ) -> SilhouetteDescriptor:
-        """The descriptor that `parameters` and `to_arrays` stored.
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], points: int) -> SilhouetteDescriptor:
+        """The descriptor that `to_arrays` stored.
 
         Raises:
-            ValueError, KeyError, TypeError: arrays are missing or do not fit.
+            ValueError, KeyError: arrays are missing or do not fit.
         """
-        result = cls(**parameters)
-        result.codebook_ = ShapeContextCodebook(np.asarray(arrays['codebook'], dtype=np.float64))
-        for name in ('scale', 'centre', 'basis'):
-            value = np.asarray(arrays[name], dtype=np.float64)
-            if not np.isfinite(value).all():
-                raise ValueError(f'{name} of the descriptor must be finite')
-            setattr(result, f'{name}_', value)
-        length = len(result.codebook_.centres) + FIXED
-        shapes = (result.scale_.shape, result.centre_.shape, result.basis_.shape[:1])
-        if shapes != ((length,),) * 3 or result.basis_.ndim != 2:
-            raise ValueError(f'arrays of the descriptor have shapes {shapes}, wanted ({length},)')
-        return result
+        codebook, scale, centre, basis = (
+            np.asarray(arrays[name], dtype=np.float64)
+            for name in ('codebook', 'scale', 'centre', 'basis')
+        )
+        return cls(ShapeContextCodebook(codebook), scale, centre, basis, points)
+
+
+def features_of(codebook: ShapeContextCodebook, parts: SilhouetteParts) -> dict[str, Array]:
+    """The features of a silhouette, by part, before they are weighted."""
+    # Square roots of shares, as in the codebook.
+    return {
+        'shape_contexts': np.sqrt(codebook.histogram(parts.contexts)),
+        'edge_pairs': np.sqrt(parts.edge_pairs),
+        'distances': parts.distances,
+        'moments': parts.moments,
+    }
 
 
 def _at_one_size(mask: Bytes) -> Bytes:
