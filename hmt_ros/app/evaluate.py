@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import show_progress
@@ -22,7 +22,7 @@ from hmt_ros.evaluation.pose_scores import MODEL_SIGMA
 from hmt_ros.evaluation.track_scores import Estimate, TrackScorer, TrackScores, Truth
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from msg_tools import BagMessage, BagReader, MessageError
+from msg_tools import BagMessage, BagReader
 from msg_tools.messages.ground import GROUND, ground_of
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import (
@@ -30,8 +30,6 @@ from msg_tools.messages.trajectory_mixtures import (
     TrajectoryMixture,
     trajectory_mixture_of,
 )
-
-_Content = TypeVar('_Content')
 
 EPILOG = """\
 Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from their true
@@ -277,7 +275,7 @@ def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
         if not ups or not truth.ground:
             return {}
         for stored in bag.messages(ups):
-            content = _content(ground_of, stored)
+            content = stored.content(ground_of)
             ups[stored.topic][content.stamp_ns] = content.up, content.up_sigma
     found = {name: gravity_scores(mine, truth.ground) for name, mine in ups.items()}
     return {name: scores for name, scores in found.items() if scores is not None}
@@ -322,7 +320,7 @@ def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
 
 
 def _read_pose(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -> None:
-    content = _content(pose_mixture_of, stored)
+    content = stored.content(pose_mixture_of)
     _check_frame(track, content.frame_id)
     track.kind = content.kind.name.lower()
     if not len(content.weights):
@@ -343,19 +341,11 @@ def _read_pose(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -
 
 def _read_trajectories(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -> None:
     """Takes the marginals of a window."""
-    content = _content(trajectory_mixture_of, stored)
+    content = stored.content(trajectory_mixture_of)
     _check_frame(track, content.frame_id)
     track.kind = 'trajectories'
     body = bodies.of(stored.topic, content)
     track.take_window([_marginal(content, t, body) for t in range(len(content.stamps_ns))])
-
-
-def _content(read: Callable[[Any], _Content], stored: BagMessage) -> _Content:
-    """The content of a message."""
-    try:
-        return read(stored.message)
-    except MessageError as error:
-        raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
 
 
 def _marginal(content: TrajectoryMixture, t: int, body: Body | None) -> Estimate:

@@ -97,11 +97,7 @@ def read_grounds(path: Path, topic: str, frame_id: str) -> dict[int, GroundState
             return {}
         found = {}
         for stored in bag.messages([chosen]):
-            try:
-                content = ground_of(stored.message)
-            except ValueError as error:
-                where = f'{path}: {stored.topic} at {stored.log_time_ns} ns'
-                raise ValueError(f'{where}: {error}') from error
+            content = stored.content(ground_of)
             if content.frame_id == frame_id:
                 found[content.stamp_ns] = content
     return found

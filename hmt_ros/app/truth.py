@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hmt_ros.evaluation.ground_scores import TrueGround
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.transform_buffer import rotation_matrix
-from msg_tools import BagReader, MessageError
+from msg_tools import BagReader
 from msg_tools.files.array_file import read_archive
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
 
@@ -137,10 +138,7 @@ def _truth_of(bag: BagReader, topic: str) -> Truth:
     names: tuple[str, ...] | None = None
     frame_id = ''
     for stored in bag.messages([topic]):
-        try:
-            content = pose_mixture_of(stored.message, None, names)
-        except MessageError as error:
-            raise ValueError(f'{source}: message at {stored.log_time_ns} ns: {error}') from error
+        content = stored.content(partial(pose_mixture_of, joint_names=names))
         names, frame_id = content.joint_names, frame_id or content.frame_id
         if len(content.weights):
             joints[content.stamp_ns] = content.joint_positions[0]

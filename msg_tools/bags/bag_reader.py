@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import zstandard
 from rosbags.typesys.store import Typestore
@@ -35,6 +35,8 @@ from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.message_types import typestore, typestore_of_definition
 
 _log = logging.getLogger(__name__)
+
+Content = TypeVar('Content')
 
 _SQLITE_MAGIC = b'SQLite format 3\x00'
 _MCAP_MAGIC = b'\x89MCAP0\r\n'
@@ -66,12 +68,14 @@ class BagMessage:
     """A message of a bag, still as bytes until `message` is asked for.
 
     Attributes:
+        path: of the bag.
         topic: as written in the bag.
         msgtype: for example 'sensor_msgs/msg/Image'.
         log_time_ns: when it was recorded.
         data: CDR bytes, as stored.
     """
 
+    path: Path
     topic: str
     msgtype: str
     log_time_ns: int
@@ -87,10 +91,24 @@ class BagMessage:
         """
         return self._deserialise(self)
 
+    def content(self, read: Callable[[Any], Content]) -> Content:
+        """What a function reads in the message.
+
+        Raises:
+            ValueError: the bytes do not fit the type, or the function says so; one line, with the
+                place in the bag.
+        """
+        message = self.message
+        try:
+            return read(message)
+        except ValueError as error:
+            where = f'{self.path}: {self.topic} at {self.log_time_ns} ns'
+            raise ValueError(f'{where}: {error}') from error
+
     def with_message(self, message: Any) -> BagMessage:
         """Another message of `rosbags` in the place of this one; it has no bytes."""
         kind = message.__msgtype__
-        return BagMessage(self.topic, kind, self.log_time_ns, b'', lambda _: message)
+        return BagMessage(self.path, self.topic, kind, self.log_time_ns, b'', lambda _: message)
 
 
 class BagReader(AbstractContextManager['BagReader']):
@@ -235,6 +253,7 @@ class BagReader(AbstractContextManager['BagReader']):
         for stored in heapq.merge(*found, key=attrgetter('log_time')):
             if stored.channel is not None:
                 yield BagMessage(
+                    self.path,
                     stored.channel.topic,
                     _full_name(stored.channel.msgtype),
                     stored.log_time,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -20,7 +21,6 @@ from msg_tools import BagMessage, BagReader
 from msg_tools.messages.ground import GroundState
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.keep_out import KEEP_OUT, KeepOutState
-from msg_tools.messages.message_error import MessageError
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, PoseMixture, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 
@@ -309,30 +309,30 @@ def _take(
     grounds: Mapping[int, GroundState],
 ) -> None:
     """Adds a message to the layer of its topic."""
-    try:
-        if stored.msgtype == POSE_MIXTURE:
-            new: Layer[Any] | None = _pose_layer(stored.topic, stored.message, bodies, grounds)
-        else:
-            new = _trajectory_layer(stored.topic, stored.message, bodies)
-        if new is None:
-            return
-        known = found.setdefault(stored.topic, new)
-        pairs: tuple[tuple[str, object, object], ...] = (
-            ('kind', known.kind, new.kind),
-            ('frame', known.frame_id, new.frame_id),
-            ('joints', known.joint_names, new.joint_names),
-        )
-        for what, was, seen in pairs:
-            if was != seen:
-                raise MessageError(f'mixture has the {what} {seen!r}, before it was {was!r}')
-    except ValueError as error:
-        raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
+    read: partial[Layer[Any] | None] = partial(_trajectory_layer, stored.topic, bodies)
+    if stored.msgtype == POSE_MIXTURE:
+        read = partial(_pose_layer, stored.topic, bodies, grounds)
+    new = stored.content(read)
+    if new is None:
+        return
+    known = found.setdefault(stored.topic, new)
+    pairs: tuple[tuple[str, object, object], ...] = (
+        ('kind', known.kind, new.kind),
+        ('frame', known.frame_id, new.frame_id),
+        ('joints', known.joint_names, new.joint_names),
+    )
+    for what, was, seen in pairs:
+        if was != seen:
+            raise ValueError(
+                f'{stored.topic} at {stored.log_time_ns} ns: mixture has the {what} {seen!r}, '
+                f'before it was {was!r}'
+            )
     for stamp, mixture in new.mixtures.items():
         known.mixtures.setdefault(stamp, mixture)
 
 
 def _pose_layer(
-    topic: str, message: Any, bodies: RecordedBodies, grounds: Mapping[int, GroundState]
+    topic: str, bodies: RecordedBodies, grounds: Mapping[int, GroundState], message: Any
 ) -> Layer[Moment] | None:
     """A layer of one mixture; None: nobody was seen."""
     content = pose_mixture_of(message)
@@ -361,7 +361,7 @@ def _pose_layer(
     return Layer(topic, kind, content.frame_id, names, {stamp: moment}, angles_of(body))
 
 
-def _trajectory_layer(topic: str, message: Any, bodies: RecordedBodies) -> Layer[Window]:
+def _trajectory_layer(topic: str, bodies: RecordedBodies, message: Any) -> Layer[Window]:
     """A layer of one window."""
     content = trajectory_mixture_of(message)
     body = bodies.of(topic, content)
