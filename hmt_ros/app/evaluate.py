@@ -89,12 +89,14 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     truth = recorded_truth(bag) if arguments.truth is None else read_truth(arguments.truth)
     if truth is None:
         raise ValueError(f'{bag} has no ground truth: name a .npz file or a bag with --truth')
-    total = message_count(bag, arguments.topics)
+    with BagReader(bag) as reader:
+        names = chosen_topics(reader, arguments.topics)
+        total = reader.message_count({*body_topics(reader), *names})
     with show_progress('evaluate', 'messages', total, quiet=arguments.quiet) as bar:
         found = score_bag(
             bag,
             truth,
-            topics=arguments.topics,
+            topics=names,
             model_sigma=model_sigma,
             body_model=arguments.body,
             seed=arguments.seed,
@@ -149,8 +151,6 @@ def as_text(
     found: dict[str, TrackScores],
     truth: Truth,
     verticals: Mapping[str, GravityScores] | None = None,
-    *,
-    by_joint: bool = True,
 ) -> str:
     """Tables for people: one row per topic, and the errors joint by joint."""
     rows: list[tuple[str, ...]] = [
@@ -195,12 +195,11 @@ def as_text(
             )
         )
     lines = [f'against {truth.source}, {len(truth.joints)} frames', '', *table(rows)]
-    if by_joint:
-        joints = [('best of K, mm', *found)]
-        for joint in next(iter(found.values())).scores.names:
-            cells = [summary['by_joint'][joint]['best_mm'] for summary in summaries.values()]
-            joints.append((joint, *(f'{cell:.0f}' for cell in cells)))
-        lines += ['', *table(joints)]
+    joints = [('best of K, mm', *found)]
+    for joint in next(iter(found.values())).scores.names:
+        cells = [summary['by_joint'][joint]['best_mm'] for summary in summaries.values()]
+        joints.append((joint, *(f'{cell:.0f}' for cell in cells)))
+    lines += ['', *table(joints)]
     feet = [f'{name}: {scores}' for name, scores in (verticals or {}).items()]
     feet += [f'{name}: {topic.ground}' for name, topic in found.items() if topic.ground is not None]
     lines += ['', *feet] if feet else []
@@ -279,16 +278,6 @@ def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
             ups[stored.topic][content.stamp_ns] = content.up, content.up_sigma
     found = {name: gravity_scores(mine, truth.ground) for name, mine in ups.items()}
     return {name: scores for name, scores in found.items() if scores is not None}
-
-
-def message_count(path: Path, topics: Iterable[str] = ()) -> int:
-    """Number of messages that `score_bag` reads.
-
-    Raises:
-        ValueError: see `chosen_topics`.
-    """
-    with BagReader(path) as bag:
-        return bag.message_count({*body_topics(bag), *chosen_topics(bag, topics)})
 
 
 def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:

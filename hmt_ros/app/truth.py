@@ -50,8 +50,10 @@ def recorded_truth(path: Path) -> Truth | None:
         ValueError: there are several, or messages that can not be understood.
     """
     with BagReader(path) as bag:
-        topic = _truth_topic(bag)
-        return None if topic is None else _truth_of(bag, topic)
+        found = [topic for topic in mixture_topics(bag) if is_truth(bag, topic)]
+        if len(found) > 1:
+            raise ValueError(f'{bag.path} has several ground truths ({", ".join(found)})')
+        return _truth_of(bag, found[0]) if found else None
 
 
 def _from_arrays(path: Path) -> Truth:
@@ -106,14 +108,6 @@ def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int
         )
         for i, stamp in enumerate(stamps)
     }
-
-
-def _truth_topic(bag: BagReader) -> str | None:
-    """The topic of the ground truth in a bag; None if it has none."""
-    found = [topic for topic in mixture_topics(bag) if is_truth(bag, topic)]
-    if len(found) > 1:
-        raise ValueError(f'{bag.path} has several ground truths ({", ".join(found)})')
-    return found[0] if found else None
 
 
 def mixture_topics(bag: BagReader) -> list[str]:

@@ -83,8 +83,8 @@ class TrajectoryMixture:
         m, t, d = len(self.weights), len(self.stamps_ns), len(self.dof_names)
         if m == 0 or t == 0:
             raise MessageError(f'trajectories: {m} components of {t} poses, wanted one at least')
-        identities = np.zeros(m) if self.identities is None else self.identities
-        object.__setattr__(self, 'identities', identities_of(identities, m, 'trajectories'))
+        identities = identities_of(self.identities, m, 'trajectories')
+        object.__setattr__(self, 'identities', identities)
         shapes: dict[str, tuple[int, ...]] = {
             'weights': (m,),
             'means': (m, t, d),
