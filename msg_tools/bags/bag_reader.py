@@ -19,7 +19,7 @@ import os
 import stat
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from operator import attrgetter
@@ -129,7 +129,7 @@ class BagReader(AbstractContextManager['BagReader']):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self._typestores: dict[Channel, Typestore] = {}
-        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch = ExitStack()
         try:
             self._files = [self._open_file(file) for file in self._storage_paths()]
         except BaseException:
@@ -151,9 +151,7 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def close(self) -> None:
         """Removes the files that were decompressed into the folder for temporary files."""
-        if self._scratch is not None:
-            self._scratch.cleanup()
-            self._scratch = None
+        self._scratch.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -339,9 +337,8 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def _decompressed(self, path: Path) -> Path:
         """The content of a zstd file, as a file that lives as long as the reader."""
-        if self._scratch is None:
-            self._scratch = tempfile.TemporaryDirectory(prefix='bag_reader.')
-        target = Path(self._scratch.name) / path.stem
+        folder = self._scratch.enter_context(tempfile.TemporaryDirectory(prefix='bag_reader.'))
+        target = Path(folder) / path.stem
         with path.open('rb') as compressed, target.open('wb') as plain:
             zstandard.ZstdDecompressor().copy_stream(compressed, plain)
         return target

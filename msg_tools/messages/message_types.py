@@ -254,8 +254,8 @@ _ZEROS: dict[str, Callable[[], Any]] = {
 def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
     """For each field the maker of its default, and the dtype where it is an array of numbers."""
     result: dict[str, tuple[Callable[[], Any], str | None]] = {}
-    for name, description in typestore().fielddefs[msgtype][1]:
-        kind, detail = description
+    fields: Any = typestore().fielddefs[msgtype][1]
+    for name, (kind, detail) in fields:
         if kind == Nodetype.NAME:
             result[name] = partial(RosbagsMessages().create, str(detail)), None
         elif kind == Nodetype.BASE:

@@ -61,10 +61,15 @@ def ground_at(grounds: Mapping[int, GroundState], stamp_ns: int) -> GroundState 
     return grounds.get(stamp_ns) or next(iter(grounds.values()), None)
 
 
+def _plane_of(ground: GroundState | None) -> Array:
+    """The floor (4,), or else the plane of a level camera."""
+    plane = None if ground is None else ground.plane
+    return _LEVEL if plane is None else plane
+
+
 def heights_of(joints: Array, ground: GroundState | None) -> Array:
     """Heights (...,) of positions (..., 3): above the floor, or above a level camera, m."""
-    plane = None if ground is None else ground.plane
-    plane = _LEVEL if plane is None else plane
+    plane = _plane_of(ground)
     return np.asarray(joints @ plane[:3] + plane[3], dtype=np.float64)
 
 
@@ -77,8 +82,7 @@ def marginals_of(content: PoseMixture, body: Body | None, ground: GroundState | 
     covariances, spread = content.covariances, content.joint_covariances
     if covariances is None or spread is None:
         return np.empty((2, len(content.weights), 0))
-    plane = None if ground is None else ground.plane
-    up = (_LEVEL if plane is None else plane)[:3]
+    up = _plane_of(ground)[:3]
     sigmas = np.sqrt(np.einsum('i,kjil,l->kj', up, spread, up))
     result = [np.stack([heights_of(content.joint_positions, ground), sigmas])]
     if body is not None:
@@ -309,7 +313,7 @@ def _take(
     grounds: Mapping[int, GroundState],
 ) -> None:
     """Adds a message to the layer of its topic."""
-    read: partial[Layer[Any] | None] = partial(_trajectory_layer, stored.topic, bodies)
+    read: Callable[[Any], Layer[Any] | None] = partial(_trajectory_layer, stored.topic, bodies)
     if stored.msgtype == POSE_MIXTURE:
         read = partial(_pose_layer, stored.topic, bodies, grounds)
     new = stored.content(read)

@@ -8,16 +8,14 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
 from hmt_ros.app.report.images import FilmStrip
 from hmt_ros.app.report.mixtures import Layer, Moment, RecordedMixtures, Window
 from hmt_ros.app.report.skeletons import (
-    STYLE,
     draw_overlays,
     draw_overview,
     draw_side_views,
-    save_picture,
+    new_picture,
 )
 from hmt_ros.evaluation.pose_scores import LOST
 from hmt_ros.evaluation.track_scores import TrackScores, Truth, mode_errors
@@ -98,9 +96,8 @@ def _draw_weights(path: Path, track: Layer[Moment], truth: Truth | None) -> None
     weights = np.zeros((most, len(seconds)))
     for t, moment in enumerate(moments):
         weights[: len(moment.weights), t] = moment.weights
-    with mpl.rc_context(STYLE):
-        known = truth is not None
-        figure = Figure((9.0, 5.0 if known else 2.8), dpi=110, layout='constrained')
+    known = truth is not None
+    with new_picture(path, (9.0, 5.0 if known else 2.8), 'constrained') as figure:
         axes = figure.subplots(2 if known else 1, 1, squeeze=False, sharex=True)[:, 0]
         colours = mpl.colormaps['cividis'](np.linspace(0.95, 0.1, most))
         axes[0].stackplot(seconds, weights, colors=colours, linewidth=0.4, edgecolor='white')
@@ -111,7 +108,6 @@ def _draw_weights(path: Path, track: Layer[Moment], truth: Truth | None) -> None
         if truth is not None:
             _draw_errors(axes[1], track, truth, seconds)
         axes[-1].set_xlabel('time, s')
-        save_picture(figure, path)
 
 
 def _draw_errors(axes: Any, track: Layer[Moment], truth: Truth, seconds: Array) -> None:
@@ -137,8 +133,7 @@ def _draw_errors(axes: Any, track: Layer[Moment], truth: Truth, seconds: Array) 
 
 def _draw_calibration(path: Path, scores: dict[str, TrackScores]) -> None:
     """Coverage of the highest-density regions over their probability."""
-    with mpl.rc_context(STYLE):
-        figure = Figure((10.4, 4.8), dpi=110, layout='constrained')
+    with new_picture(path, (10.4, 4.8), 'constrained') as figure:
         axes: Any = figure.subplots(1, 3, sharey=True)
         for number, (name, topic) in enumerate(scores.items()):
             found = topic.scores
@@ -156,14 +151,12 @@ def _draw_calibration(path: Path, scores: dict[str, TrackScores]) -> None:
         axes[0].set_ylabel('fraction of true positions in it')
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, frameon=False, loc='outside lower center', ncols=2)
-        save_picture(figure, path)
 
 
 def _draw_free_energy(path: Path, layers: Sequence[Layer[Window]]) -> None:
     """Free energy of each window in the first and in the last iteration."""
     start = min(min(layer.mixtures) for layer in layers)
-    with mpl.rc_context(STYLE):
-        figure = Figure((9.0, 2.8), dpi=110, layout='constrained')
+    with new_picture(path, (9.0, 2.8), 'constrained') as figure:
         axes: Any = figure.subplots()
         for number, layer in enumerate(layers):
             windows = [one for one in layer.mixtures.values() if len(one.free_energy)]
@@ -182,4 +175,3 @@ def _draw_free_energy(path: Path, layers: Sequence[Layer[Window]]) -> None:
                 )
         axes.set(xlabel='end of the window, s', ylabel='free energy, nats')
         axes.legend(frameon=False, fontsize=8)
-        save_picture(figure, path)
