@@ -30,7 +30,7 @@ import zstandard
 from rosbags.typesys.store import Typestore
 
 from msg_tools.bags.bag_metadata import BagError, read_file_names, reason
-from msg_tools.bags.storage import Channel, McapFile, SqliteFile, StorageFile, StoredMessage
+from msg_tools.bags.storage import Channel, McapFile, SqliteFile, StoredMessage
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.message_types import typestore, typestore_of_definition
 
@@ -312,7 +312,7 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
         return paths
 
-    def _open_file(self, path: Path) -> StorageFile:
+    def _open_file(self, path: Path) -> SqliteFile | McapFile:
         name = str(path)
         try:
             magic = _first_bytes(path)
@@ -359,7 +359,9 @@ def _first_bytes(path: Path) -> bytes:
         return file.read(len(_SQLITE_MAGIC))
 
 
-def _from_its_start(file: StorageFile, topics: Collection[str]) -> Iterator[StoredMessage]:
+def _from_its_start(
+    file: SqliteFile | McapFile, topics: Collection[str]
+) -> Iterator[StoredMessage]:
     """A mark without a channel, then the messages: no file is opened before its time has come."""
     yield StoredMessage(_NEVER if file.start is None else file.start, None, b'')
     yield from file.messages(topics)

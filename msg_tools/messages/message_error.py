@@ -44,6 +44,20 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
     return array.reshape(shape)
 
 
+def complete_mixture(record: Any, what: str) -> None:
+    """Makes names tuples, and identities numbers, in a frozen dataclass about a mixture.
+
+    Raises:
+        MessageError: a name that is there twice, a segment length that is not finite, another
+            number of identities than of weights.
+    """
+    for name in ('dof_names', 'joint_names'):
+        object.__setattr__(record, name, names_of(getattr(record, name), f'{what}: {name}'))
+    check_lengths(record.segment_lengths, what)
+    identities = identities_of(record.identities, len(record.weights), what)
+    object.__setattr__(record, 'identities', identities)
+
+
 def freeze_arrays(
     record: Any, shapes: Mapping[str, tuple[int, ...]], what: str, optional: Sequence[str] = ()
 ) -> None:

@@ -24,13 +24,12 @@ from msg_tools.messages.message_error import (
     array_of_all,
     check_covariances,
     check_finite,
-    check_lengths,
     check_names,
     check_weights,
+    complete_mixture,
     constant_of,
     flat,
     freeze_arrays,
-    identities_of,
     lengths_of,
     named_numbers,
     names_of,
@@ -138,9 +137,7 @@ class PoseMixture:
     reason: str = ''
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
-        object.__setattr__(self, 'joint_names', names_of(self.joint_names, 'mixture: joint_names'))
-        check_lengths(self.segment_lengths, 'mixture')
+        complete_mixture(self, 'mixture')
         components, d, joints = len(self.weights), len(self.dof_names), len(self.joint_names)
         shapes = {
             'weights': (components,),
@@ -158,8 +155,6 @@ class PoseMixture:
             object.__setattr__(self, 'log_likelihoods', np.full(components, np.nan))
         if self.degrees_of_freedom is None:
             object.__setattr__(self, 'degrees_of_freedom', np.zeros(components))
-        identities = identities_of(self.identities, components, 'mixture')
-        object.__setattr__(self, 'identities', identities)
         freeze_arrays(
             self, shapes, 'mixture', optional=('covariances', 'shape_covariance', *OF_JOINTS)
         )

@@ -224,7 +224,7 @@ class VideoFile(FrameSource):
 
     def _times(self) -> Iterator[int]:
         """Times of the frames, each of which is the present frame until the next is asked for."""
-        step = self._step()
+        fps = self._capture.get(cv2.CAP_PROP_FPS)
         first, last = 0.0, -1
         while self._capture.grab():
             time = self._capture.get(cv2.CAP_PROP_POS_MSEC)
@@ -235,19 +235,15 @@ class VideoFile(FrameSource):
                 time_ns = round(self.count * SECOND_NS / self._fps)
             elif time_ns <= last:
                 # Containers without times give zero, damaged ones jump back.
-                if step is None:
+                if not 0 < fps <= FASTEST:
                     raise ValueError(
                         f'{self.path} has neither times nor a rate of frames; give --fps'
                     )
-                time_ns = last + step
+                time_ns = last + round(SECOND_NS / fps)
             last = time_ns
             self.count += 1
             yield time_ns
         self.ended = True
-
-    def _step(self) -> int | None:
-        fps = self._capture.get(cv2.CAP_PROP_FPS)
-        return round(SECOND_NS / fps) if 0 < fps <= FASTEST else None
 
 
 class ImageFolder(FrameSource):

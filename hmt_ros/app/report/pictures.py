@@ -60,23 +60,18 @@ def draw_pictures(
     Returns:
         Names of the files, keys of `PICTURES`.
     """
-    drawn = []
     if mixtures.layers:
         track = mixtures.layers[0]
         few, many = track.spread(IN_OVERVIEW), track.spread(ON_SHEETS)
         chosen = [{t: images.kept[t] for t in own if t in images.kept} for own in (few, many)]
         if images.camera is not None and chosen[0]:
             draw_overview(folder / 'overview.png', track, images.camera, chosen[0], truth)
-            drawn.append('overview.png')
         if images.camera is not None and chosen[1]:
             draw_overlays(folder / 'overlays.png', track, images.camera, chosen[1])
-            drawn.append('overlays.png')
         draw_side_views(folder / 'side_views.png', track, many, truth)
         _draw_weights(folder / 'weights.png', track, truth)
-        drawn += ['side_views.png', 'weights.png']
     if any(topic.scores.levels is not None for topic in scores.values()):
         _draw_calibration(folder / 'calibration.png', scores)
-        drawn.append('calibration.png')
     recorded = [
         layer
         for layer in mixtures.trajectories
@@ -84,8 +79,7 @@ def draw_pictures(
     ]
     if recorded:
         _draw_free_energy(folder / 'free_energy.png', recorded)
-        drawn.append('free_energy.png')
-    return drawn
+    return [name for name in PICTURES if (folder / name).exists()]
 
 
 def _draw_weights(path: Path, track: Layer[Moment], truth: Truth | None) -> None:
