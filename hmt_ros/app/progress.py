@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from threading import Event, Thread
 from typing import Any, TypeAlias, TypeVar
 
@@ -24,6 +24,7 @@ from hmt_ros.compiled_code import compiling
 
 Item = TypeVar('Item')
 Progress: TypeAlias = 'tqdm[Any]'
+Tell = Callable[[str], object]  # a line for the user
 
 INTERVAL = 3.0  # s, between two lines; a bar shows the time every second
 

@@ -8,10 +8,10 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import (
+    Array,
     MessageError,
     check_finite,
     constant_of,
@@ -23,7 +23,6 @@ from msg_tools.messages.states import pose_message
 
 KEEP_OUT = 'hmt_msgs/msg/KeepOut'
 
-Array = NDArray[np.float64]
 
 _ADD, _DELETE_ALL = 0, 3
 _SPHERE, _CYLINDER = 2, 3

@@ -12,14 +12,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_error import MessageError, check_covariances, names_of, numbers
+from msg_tools.messages.message_error import (
+    Array,
+    MessageError,
+    check_covariances,
+    names_of,
+    numbers,
+)
 from msg_tools.messages.message_types import MessageFactory
-
-Array = NDArray[np.float64]
 
 KEYPOINTS_2D, KEYPOINTS_3D = 'hmt_msgs/msg/Keypoints2D', 'hmt_msgs/msg/Keypoints3D'
 # Of one person; detectors find up to a few hundred.

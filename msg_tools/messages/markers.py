@@ -16,11 +16,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from msg_tools.messages.ground import GroundState
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_error import MessageError
+from msg_tools.messages.message_error import Array, MessageError
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.states import pose_message, quaternions
 
@@ -43,8 +43,6 @@ _SPHERE = 0.09  # diameter, m
 _LEAST = 0.05
 # Joints of a foot, by the end of its name.
 _OF_FOOT = ('ankle', 'toe')
-
-Array = NDArray[np.float64]
 
 
 def skeleton_markers(

@@ -20,6 +20,7 @@ from hmt_ros.body.mirror import relevelled
 from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import (
+    Array,
     MessageError,
     array_of_all,
     check_covariances,
@@ -36,8 +37,6 @@ from msg_tools.messages.message_error import (
     numbers,
 )
 from msg_tools.messages.message_types import MessageFactory
-
-Array = NDArray[np.float64]
 
 POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 # No node publishes more components; a message with millions would block its reader.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from msg_tools.messages.headers import EARLIEST_NS, header_message, time_message, time_ns
 from msg_tools.messages.message_error import (
+    Array,
     MessageError,
     array_of_all,
     check_covariances,
@@ -25,8 +26,6 @@ from msg_tools.messages.message_error import (
     numbers,
 )
 from msg_tools.messages.message_types import MessageFactory
-
-Array = NDArray[np.float64]
 
 TRAJECTORY_MIXTURE = 'hmt_msgs/msg/TrajectoryMixture'
 

@@ -18,13 +18,11 @@ from collections import Counter
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.skeleton import Skeleton
-from msg_tools.messages.message_error import MessageError
-
-Array = NDArray[np.float64]
+from msg_tools.messages.message_error import Array, MessageError
 
 # URDF wants limits with every joint that has a range; these stand for none.
 _UNLIMITED = 1000.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,8 +86,8 @@ class Selection:
             yield number, time_ns, first is not None and (number - first) % self.every == 0
 
 
-class FrameSource(ABC):
-    """Frames of a file or a folder.
+class FrameSource:
+    """Frames of a file or a folder; one of neither kind has none, and numbers those of others.
 
     Args:
         names: of the files of its frames in their order; empty for a video file.
@@ -115,13 +114,13 @@ class FrameSource(ABC):
         self._by_name = {Path(x).stem: i for i, x in reversed([*enumerate(names)])}
         self._by_name |= {x: i for i, x in enumerate(names)}
 
-    @abstractmethod
     def frames(self, selection: Selection) -> Iterator[Frame]:
         """The frames that are wanted; once only.
 
         Raises:
             ValueError: a frame can not be read.
         """
+        return iter(())
 
     def number_of(self, label: str | int) -> int:
         """Number, from 0, of the frame that a label means.
