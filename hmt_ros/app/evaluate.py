@@ -14,7 +14,7 @@ from typing import Any
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import show_progress
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
+from hmt_ros.app.recorded_bodies import RecordedBodies, body_topics
 from hmt_ros.app.truth import is_truth, mixture_topics, read_truth, recorded_truth
 from hmt_ros.body import Body
 from hmt_ros.evaluation.ground_scores import GravityScores, gravity_scores
@@ -250,14 +250,11 @@ def score_bag(
             name: TrackScorer(name, truth, model_sigma=model_sigma, seed=seed) for name in names
         }
         bodies = RecordedBodies(body_model)
-        for stored in bag.messages([*body_topics(bag), *names]):
-            if stored.msgtype == BODY:
-                bodies.learn(stored)
-            elif stored.msgtype == POSE_MIXTURE:
+        for stored in bodies.messages(bag, names, progress):
+            if stored.msgtype == POSE_MIXTURE:
                 _read_pose(stored, found[stored.topic], bodies)
             else:
                 _read_trajectories(stored, found[stored.topic], bodies)
-            progress(1)
         return {name: track.finish() for name, track in found.items()}
 
 

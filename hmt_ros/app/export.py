@@ -21,7 +21,7 @@ import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import show_progress
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics, read_grounds
+from hmt_ros.app.recorded_bodies import RecordedBodies, read_grounds
 from hmt_ros.app.truth import mixture_topics
 from hmt_ros.body import Body
 from hmt_ros.body.moving_skeleton import CAMERA_TO_ROOM, MovingSkeleton, bvh_text
@@ -354,11 +354,7 @@ def _mixtures(
 ) -> Iterator[PoseMixture]:
     """The mixtures on a topic, which are all over the same variables; teaches the bodies."""
     names: dict[str, tuple[str, ...]] = {}
-    for stored in bag.messages([*body_topics(bag), name]):
-        progress(1)
-        if stored.msgtype == BODY:
-            bodies.learn(stored)
-            continue
+    for stored in bodies.messages(bag, [name], progress):
         content = stored.content(partial(pose_mixture_of, **names))
         names = {'dof_names': content.dof_names, 'joint_names': content.joint_names}
         yield content

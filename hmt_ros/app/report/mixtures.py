@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from hmt_ros.app.evaluate import chosen_topics
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics, topic_beside
+from hmt_ros.app.recorded_bodies import RecordedBodies, topic_beside
 from hmt_ros.body import Body
 from hmt_ros.inference.arrays import Array
 from msg_tools import BagMessage, BagReader
@@ -281,14 +281,10 @@ def read_mixtures(
         told = (x.message for x in every if x.message.state != KeepOutState.STALE)
         answered = {time_ns(x.header.stamp): str(x.reason) for x in told}
         bodies = RecordedBodies(body_model)
-        for stored in bag.messages([*body_topics(bag), *names]):
-            if stored.msgtype == BODY:
-                bodies.learn(stored)
-            else:
-                _take(found, stored, bodies, grounds or {})
-                if stored.msgtype == POSE_MIXTURE:
-                    answered.setdefault(time_ns(stored.message.header.stamp), '')
-            progress(1)
+        for stored in bodies.messages(bag, names, progress):
+            _take(found, stored, bodies, grounds or {})
+            if stored.msgtype == POSE_MIXTURE:
+                answered.setdefault(time_ns(stored.message.header.stamp), '')
     for name, layer in found.items():
         found[name] = replace(layer, mixtures=dict(sorted(layer.mixtures.items())))
     layers = [found[name] for name in names if name in found]
