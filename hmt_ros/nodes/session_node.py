@@ -18,7 +18,6 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -41,11 +40,9 @@ from hmt_ros.nodes.estimating_thread import (
 )
 from hmt_ros.nodes.node_parameters import (
     QOS_OVERRIDES,
-    as_in_ros,
-    descriptor,
+    declare,
     next_step,
     unknown_parameters,
-    with_empty_lists,
 )
 from hmt_ros.nodes.own_messages import OwnMessages
 from hmt_ros.nodes.silent_topics import SilentTopics
@@ -59,7 +56,7 @@ from hmt_ros.nodes.subscribed_topic import (
 )
 from hmt_ros.sessions.declared_parameters import (
     NodeParameters,
-    declared_parameters,
+    values_of,
     with_values,
 )
 from hmt_ros.sessions.handled import HANDLED, Handled, Output, handled_message
@@ -109,18 +106,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if self.get_parameter('use_sim_time').value:
             # A bag that is played again.
             defaults = replace(defaults, reset_on_time_jump=True)
-        declared = declared_parameters(defaults)
-        self.declare_parameters(
-            '', [(p.name, as_in_ros(p.default), descriptor(p)) for p in declared]
-        )
-        values = {p.name: self.get_parameter(p.name).value for p in declared}
-        self._settings: Parameters = with_values(defaults, values)
-        self._names = values.keys()
+        self._settings: Parameters = declare(self, defaults)
+        self._names = values_of(defaults).keys()
         self._warn_of_unknown(qos=False)
-        lists = {p.name for p in declared if isinstance(p.default, tuple)}
-        self.add_pre_set_parameters_callback(partial(with_empty_lists, names=lists))
-        # An empty list of a parameter file has come as no value, too.
-        self.set_parameters([Parameter(name) for name in lists if values[name] is None])
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._refuse_impossible_transitions()
         self.preparing = False
@@ -299,19 +287,11 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forgets the estimate, closes topics."""
+        """Forgets the estimate, closes topics; also at shutdown and after an error."""
         self._close()
         return super().on_cleanup(state)
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """As cleanup, from any state."""
-        self._close()
-        return super().on_shutdown(state)
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Back to the state before configuration."""
-        self._close()
-        return super().on_error(state)
+    on_shutdown = on_error = on_cleanup
 
     def _subscribe(self, wanted: SubscribedTopic) -> None:
         assert self._estimator is not None

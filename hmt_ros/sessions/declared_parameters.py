@@ -179,6 +179,14 @@ class DeclaredParameter:
     effect: str
     path: tuple[str, ...]
 
+    @property
+    def bounds(self) -> str:
+        """Lowest and highest value in words; '' without limits."""
+        if self.limits is None:
+            return ''
+        digits = '.0f' if isinstance(self.default, int) else 'g'
+        return ' to '.join(format(limit, digits) for limit in self.limits)
+
     def checked(self, value: Any) -> Value:
         """A value from a file or a command line, with the type of the parameter.
 

@@ -24,7 +24,7 @@ The rules, besides those of `Session`:
   smoothed as a camera sees them that is turned by quarter turns; then a new window begins.
 - Angles that go round are taken from mixture to mixture without whole turns, each mode from the
   nearest one before: to the dynamics a turn more would be a jump.
-- The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
+- The dynamics bridge gaps. One that is longer than `LONGEST_INTERVAL` is reported.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.body.mirror import clear_level, free_limits, relevelled, without_turns
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.image_evidence import Evidence, KeptMixtures, evidence_of
@@ -75,6 +76,13 @@ NOBODY = 'nobody'  # status while nobody is in view
 SAME_PERSON = 0.02
 # Time between two smoothings, as a share of the lag, and at most, s: neighbours hardly differ.
 SHARE_OF_LAG, RARELY = 0.2, 0.1
+# Maximum number of components of a mixture over trajectories.
+MAX_TRAJECTORIES = 16
+# Interval between two mixtures above which a gap is reported, s.
+LONGEST_INTERVAL = 0.25
+# Factor on the variance that the motion prior of the filter gains in a second. Sudden motion is
+# more frequent than under a Gaussian of the mean variance; chosen on clips (docs/smoothing.md).
+LIVELINESS = 2.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +92,7 @@ class SmootherState(SessionState):
     Attributes:
         window: poses in the window.
         trajectories: components of the mixture over them.
-        gaps: intervals between mixtures that were longer than `longest_interval`.
+        gaps: intervals between mixtures that were longer than `LONGEST_INTERVAL`.
         longest_gap: s.
     """
 
@@ -193,7 +201,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         p = self.parameters
         if self._newest is not None:
             interval = (stamp - self._newest) / SECOND_NS
-            if interval > p.longest_interval:
+            if interval > LONGEST_INTERVAL:
                 self._gaps += 1
                 self._longest_gap = max(self._longest_gap, interval)
                 self._log.note(
@@ -318,17 +326,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _smoother(self, body: Body) -> MixtureSmoother:
         """The smoother that the parameters ask for."""
         p = self.parameters
-        kind = PathSmoother if p.method == 'paths' else MixtureSmoother
-        smoother = kind(
-            p.dynamics.of(body),
-            *free_limits(body),
-            p.max_trajectories,
-            through_modes=p.through_modes,
-            points=body.relative_joints,
-        )
-        if p.resting_feet and isinstance(smoother, PathSmoother):
-            return replace(smoother, resting=RestingPoints.of_soles(body))
-        return smoother
+        prior = motion_prior(body)
+        livelier = replace(prior, diffusion=LIVELINESS * prior.diffusion)
+        settings = livelier, *free_limits(body), MAX_TRAJECTORIES
+        if p.method != 'paths':
+            return MixtureSmoother(*settings, points=body.relative_joints)
+        resting = RestingPoints.of_soles(body) if p.resting_feet else None
+        return PathSmoother(*settings, points=body.relative_joints, resting=resting)
 
     def _end_window(self) -> None:
         """Publishes the poses that are still open, and forgets the window."""
