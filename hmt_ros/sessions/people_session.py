@@ -249,14 +249,9 @@ class PeopleSession(TrackingSession):
         self, found: Sequence[Found], stamp: int
     ) -> tuple[dict[_Person, Found], list[Found]]:
         """Detections of the people who are followed, by person, and the detections left over."""
-        own: dict[_Person, Found] = {}
-        left = list(found)
-        for person in self.tracks:
-            for one in left:
-                if person.known_as and one.detected.name == person.known_as:
-                    own[person] = one
-                    left.remove(one)
-                    break
+        named = {one.detected.name: one for one in found if one.detected.name}
+        own = {x: named[x.known_as] for x in self.tracks if x.known_as in named}
+        left = [one for one in found if one not in own.values()]
         others = [person for person in self.tracks if person not in own]
         pairs = assigned([x.place for x in others], [x.sighting for x in left], stamp)
         for row, column in pairs.items():

@@ -80,7 +80,7 @@ def trajectory_content(
         covariances: whether they are part of the message.
         shapes: (d, d) by stamp, added to covariances: of errors shared by poses of all images.
     """
-    content = found.message_content() if covariances else _without_covariances(found)
+    content = found.message_content(covariances=covariances)
     if covariances:
         wide = _symmetric(content['marginal_covariances'])
         for t, stamp in enumerate(content['stamps_ns']):
@@ -225,23 +225,6 @@ def _joints(means: Array, body: Body) -> Array:
     """Joint positions (M, T, J, 3) of trajectories (M, T, d)."""
     joints = body.joint_positions(means.reshape(-1, body.dimension))
     return joints.reshape(*means.shape[:2], len(body.joint_names), 3)
-
-
-def _without_covariances(found: TrajectoryMixture) -> dict[str, Any]:
-    """As `TrajectoryMixture.message_content`, which would compute them."""
-    assert found.stamps_ns is not None
-    before = found.stamps_ns[0] - 1
-    return {
-        'weights': found.weights,
-        'means': found.means,
-        'marginal_covariances': None,
-        'log_joint': found.log_joint,
-        'inflation': found.inflation,
-        'stamps_ns': found.stamps_ns,
-        'final_until_ns': before if found.final_until_ns is None else found.final_until_ns,
-        'free_energy': found.free_energy,
-        'identities': np.array(found.identities) if found.identities else None,
-    }
 
 
 def _symmetric(covariances: Array) -> Array:

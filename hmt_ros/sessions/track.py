@@ -25,11 +25,10 @@ from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.focal_length import with_depth_error
-from hmt_ros.sessions.handled import HandlingLog
+from hmt_ros.sessions.handled import HandlingLog, Output
 from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
 from hmt_ros.sessions.track_messages import (
     TOPICS_OF_NODE,
-    Made,
     TrackedImage,
     nobody_messages,
     robot_messages,
@@ -217,14 +216,14 @@ class Track:
             return False
         return published
 
-    def stale(self, silence: float) -> Iterator[Made]:
+    def stale(self, silence: float) -> Iterator[Output]:
         """Messages for a robot where no image is answered; may be called by any thread.
 
         Args:
             silence: time since the newest image was answered, s.
         """
         for made in robot_messages(self.robot, self._parameters, self._wants, silence):
-            yield made._replace(topic=topic_of(self.person, made.topic))
+            yield replace(made, topic=topic_of(self.person, made.topic))
 
     def _placed_tracker(self, camera: Camera) -> Tracker:
         """The tracker, which knows gravity and the pose of the camera at the image.
@@ -348,7 +347,7 @@ class Track:
         with self._shared.answering:
             self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen, reason)
             for made in robot_messages(self.robot, p, self._wants):
-                self._put_out(*made)
+                self._put_out(made.topic, made.stamp_ns, made.message)
             self._shared.answered += 1
 
 

@@ -95,16 +95,15 @@ class TrackStart:
         Raises:
             ValueError: it was taken by another camera.
         """
-        background, file = BackgroundModel(), self.parameters.background_file
-        if self.background is not None:
-            height, width = self.background.shape[:2]
-            if (width, height) != (camera.width, camera.height):
-                raise ValueError(
-                    f'{file} has {width}x{height} pixels, but the camera gives '
-                    f'{camera.width}x{camera.height}'
-                )
-            background = BackgroundModel.from_image(self.background)
-        return background
+        if self.background is None:
+            return BackgroundModel()
+        height, width = self.background.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise ValueError(
+                f'{self.parameters.background_file} has {width}x{height} pixels, but the camera '
+                f'gives {camera.width}x{camera.height}'
+            )
+        return BackgroundModel.from_image(self.background)
 
 
 def prepare_start(

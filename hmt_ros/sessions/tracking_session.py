@@ -173,8 +173,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         with self._shared.answering:
             if answered != self.answered:
                 return []
-            made = (one for track in self.tracks for one in track.stale(silence))
-            return [Output(topic, stamp, message) for topic, stamp, message in made]
+            return [made for track in self.tracks for made in track.stale(silence)]
 
     def forecast(self, stamp_ns: int) -> PoseMixture:
         """See `RobotOutputs`; may be called by any thread."""
