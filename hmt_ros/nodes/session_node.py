@@ -14,6 +14,7 @@ has been published. A player that waits for it feeds the node in lock step.
 from __future__ import annotations
 
 import time
+import traceback
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -34,7 +35,6 @@ from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, trouble_of_period
 from hmt_ros.nodes.estimating_thread import (
     EstimatingThreads,
     Estimator,
-    InnerFaults,
     Waiting,
     received,
 )
@@ -132,7 +132,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         # On topics that the node both publishes and subscribes to.
         self._own = OwnMessages()
         self._failure = ''
-        self._inner_faults = InnerFaults()
+        # Errors of the node itself.
+        self._errors, self._last_error = 0, ''
         self._told_at = self._untold = 0
         self._told_status = ''
         self._events = MiddlewareEvents(self.get_logger().warn)
@@ -265,8 +266,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             place=self._nodes.index(self),
             tell=self._tell,
             tell_change=self._diagnose,
-            inner_faults=self._inner_faults,
-            log_error=self.get_logger().error,
+            tell_error=self._tell_error,
         )
         session.topic_names = {one.source: self.resolve_topic_name(one.topic) for one in inputs}
         self._silent.listen(inputs, self.SESSION.COUNTED)
@@ -416,6 +416,12 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if self._handled.get_subscription_count():
             self._handled.publish(serialise(handled_message(RosbagsMessages(), handled)))
 
+    def _tell_error(self, error: Exception) -> str:
+        self._errors += 1
+        self._last_error = f'{type(error).__name__}: {error_line(error)}'
+        self.get_logger().error(''.join(traceback.format_exception(error)))
+        return self._last_error
+
     def _publish(self, output: Output) -> None:
         publisher, name = self._outputs[output.topic], self._local_name(output.topic)
         if name in self._heard:
@@ -518,8 +524,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
                 *state.values(),
                 *((f'faults: {kind}', str(count)) for kind, count in sorted(state.faults.items())),
                 ('last fault', state.last_fault),
-                ('errors of the node itself', str(self._inner_faults.count)),
-                ('last error of the node itself', self._inner_faults.last),
+                ('errors of the node itself', str(self._errors)),
+                ('last error of the node itself', self._last_error),
                 *((f'nothing on {topics}', why) for topics, why in self._silent.texts.items()),
                 *self._events.values(),
                 *self._rates.values(),

@@ -144,5 +144,4 @@ def unit_vector(vector: Sequence[float], name: str) -> Array:
     length = float(np.linalg.norm(v)) if v.shape == (3,) else math.nan
     if not _SHORTEST < length < math.inf:
         raise ValueError(f'{name} must be three finite numbers, not all zero, saw {v.tolist()}')
-    result: Array = v / length
-    return result
+    return v / length

@@ -72,8 +72,7 @@ def yaml_scalar(value: Value) -> str:
         return "'" + value.replace("'", "''") + "'"
     if isinstance(value, list | tuple):
         return f'[{", ".join(yaml_scalar(each) for each in value)}]'
-    text: str = yaml.safe_dump(value)
-    return text.removesuffix('\n...\n').strip()
+    return yaml.safe_dump(value).removesuffix('\n...\n').strip()
 
 
 def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -> dict[str, Any]:
@@ -103,8 +102,7 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
         if isinstance(value, dict) and PARAMETERS_KEY in value
     }
     if not sections:
-        values = dict(_flattened(document, '', path))
-        return {} if by_name else values
+        return {} if by_name else dict(_flattened(document, '', path))
     result: dict[str, Any] = {}
     for key in document:
         if str(key) not in sections:

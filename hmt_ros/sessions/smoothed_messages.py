@@ -229,5 +229,4 @@ def _joints(means: Array, body: Body) -> Array:
 
 def _symmetric(covariances: Array) -> Array:
     """The covariances without the asymmetry of rounding."""
-    result: Array = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
-    return result
+    return 0.5 * (covariances + np.swapaxes(covariances, -1, -2))

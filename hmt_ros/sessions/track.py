@@ -267,7 +267,7 @@ class Track:
         likelihood: GaussianMixture,
     ) -> bool:
         p, fixed = self._parameters, self._fixed_frame()
-        starts = self.body is None or not _looks_like(tracker.body, self.body)
+        starts = self.body is None or not resembles(tracker.body, self.body, RESHAPED)
         if starts:
             self.body = tracker.body
         if fixed is not None:
@@ -351,9 +351,9 @@ class Track:
             self._shared.answered += 1
 
 
-def _looks_like(body: Body, shown: Body) -> bool:
-    """Whether a body is the one that has been described, up to small changes of its estimate."""
-    if body.dof_names != shown.dof_names:
+def resembles(body: Body, other: Body, tolerance: float) -> bool:
+    """Whether two bodies are of one model, and their lengths differ by a tolerance, m, at most."""
+    if (body.name, body.dof_names) != (other.name, other.dof_names):
         return False
-    change = np.abs(body.skeleton.lengths - shown.skeleton.lengths)
-    return bool(change.max(initial=0.0) <= RESHAPED)
+    change = np.abs(body.skeleton.lengths - other.skeleton.lengths)
+    return bool(change.max(initial=0.0) <= tolerance)
