@@ -17,7 +17,7 @@ from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.messages.headers import time_ns
 
 
-class FilterNode(TrackingNode[TrackingSession, FilterParameters]):
+class FilterNode(TrackingNode):
     """The node; its parameters are the fields of `FilterParameters`."""
 
     NAME = 'filter_node'

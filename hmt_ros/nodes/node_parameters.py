@@ -141,11 +141,13 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
         sections = list(_sections(document, '')) if isinstance(document, Mapping) else []
         if any(re.fullmatch(_pattern(section), node) for section in sections):
             continue
-        near = next((section for section in sections if _is_meant(section, node)), None)
-        if near is not None:
+        own = node.rpartition('/')[2]
+        named = {section.rpartition('/')[2]: section for section in sections}
+        near = difflib.get_close_matches(own, named, n=1, cutoff=_ALIKE_NODE)
+        if near:
             texts.append(
-                f'{path}: its parameters are for {near!r}, and this node is {node!r}: none is '
-                f'used; name the section {"/**/" + node.rpartition("/")[2]!r}'
+                f'{path}: its parameters are for {named[near[0]]!r}, and this node is {node!r}: '
+                f'none is used; name the section {"/**/" + own!r}'
             )
     return texts
 
@@ -164,9 +166,3 @@ def _pattern(section: str) -> str:
     """Regular expression over full names of nodes that a section matches."""
     parts = {'*': '/[^/]+', '**': '(/[^/]+)*'}
     return ''.join(parts.get(part, f'/{re.escape(part)}') for part in section.split('/')[1:])
-
-
-def _is_meant(section: str, node: str) -> bool:
-    """Whether this section is probably meant for the node."""
-    name, own = section.rpartition('/')[2], node.rpartition('/')[2]
-    return difflib.SequenceMatcher(None, name, own).ratio() >= _ALIKE_NODE

@@ -26,7 +26,7 @@ from hmt_ros.sessions.tracking_parameters import PeopleParameters
 STAYS_OPEN = 5
 
 
-class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
+class PeopleNode(TrackingNode):
     """The node; its parameters are the fields of `PeopleParameters`."""
 
     NAME = 'people_node'

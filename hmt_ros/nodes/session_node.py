@@ -138,8 +138,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._told_status = ''
         self._events = MiddlewareEvents(self.get_logger().warn)
         self._silent = SilentTopics(self, self.get_logger().warn)
-        self._counted = f'{self.SESSION.UNIT}s'
-        self._rates = Rates(self._counted, self.SESSION.DONE)
+        self._rates = Rates(f'{self.SESSION.UNIT}s', self.SESSION.DONE)
         self._diagnostics = self.create_publisher(
             DiagnosticArray,
             '/diagnostics',
@@ -275,7 +274,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._warn_of_unknown(qos=True)
         topic = session.topic_names[inputs[-1].source]
         wants = session.state.wants
-        self.get_logger().info(f'{self._counted} from {topic}; waits for {wants}')
+        self.get_logger().info(f'{self._rates.name} from {topic}; waits for {wants}')
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -518,7 +517,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             values += [
                 ('status', state.status),
                 *(
-                    (f'{self._counted} {what}', str(state.counts[what]))
+                    (f'{self._rates.name} {what}', str(state.counts[what]))
                     for what in ('received', self.SESSION.DONE, 'skipped', 'dropped')
                 ),
                 *state.values(),

@@ -38,7 +38,6 @@ from hmt_ros.sessions.image_inputs import (
     REMEMBERED,
     ImageInput,
     ImageInputs,
-    Taken,
 )
 from hmt_ros.sessions.session import NeededInput, Session, SessionState, State
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
@@ -69,17 +68,17 @@ class WaitingImage(NamedTuple):
         image: (H, W, 3) BGR.
         stamp_ns: of the image.
         frame_id: optical frame of the camera.
-        given: inputs that have come with it, by name.
+        given: content of the inputs that have come with it, by name; None: nothing.
     """
 
     image: Image
     stamp_ns: int
     frame_id: str
-    given: Mapping[str, Taken] = MappingProxyType({})
+    given: Mapping[str, Any] = MappingProxyType({})
 
     def content(self, name: str) -> Any:
         """Content of an input for the image; None: nothing."""
-        return self.given[name].content if name in self.given else None
+        return self.given.get(name)
 
     @property
     def mask(self) -> Mask | None:

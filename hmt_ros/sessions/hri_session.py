@@ -167,7 +167,6 @@ class HriSession(Session[HriParameters, HriState]):
     UNIT = 'mixture'
     DONE = 'converted'
     ESTIMATE = 'every body'
-    CHECKED = ()
 
     def _set_up(self) -> None:
         self._camera: Camera | None = None

@@ -87,7 +87,6 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
     UNIT = 'image'
     DONE = 'detected'
     ESTIMATE = 'the sequence'
-    CHECKED = ()
 
     def _set_up(self) -> None:
         kind = DETECTORS[self.parameters.detector]

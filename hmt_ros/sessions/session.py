@@ -147,7 +147,7 @@ class Session(ABC, Generic[Parameters, State]):
     UNIT: ClassVar[str]
     DONE: ClassVar[str]
     ESTIMATE: ClassVar[str]
-    CHECKED: ClassVar[tuple[str, ...]]
+    CHECKED: ClassVar[tuple[str, ...]] = ()
 
     state: State
 

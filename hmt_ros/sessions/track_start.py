@@ -62,13 +62,13 @@ class TrackStart:
     def tracker(
         self,
         camera: Camera,
-        ground: KnownGround | None = None,
+        ground: KnownGround,
         shared: BackgroundModel | None = None,
     ) -> Tracker:
         """A tracker that waits for its first image.
 
         Args:
-            ground: gravity and floor, as far as they are known; None: by the parameters.
+            ground: gravity and floor, as far as they are known.
             shared: background of several people, which is learned elsewhere; None: an own one.
 
         Raises:
@@ -76,14 +76,13 @@ class TrackStart:
         """
         p = self.parameters
         background = self.background_model(camera) if shared is None else shared
-        known = p.known_ground if ground is None else ground
         tracker = Tracker(
             self.body,
             camera,
             p.tracker,
             background,
             p.random_seed,
-            known_ground=known,
+            known_ground=ground,
             shared_background=shared is not None,
         )
         tracker.reset(self.initial, box=self.box)
