@@ -209,7 +209,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _jump_back(self, stamp: int) -> None:
         super()._jump_back(stamp)
-        self._keypoints.forget()
+        self._keypoints.chosen.forget()
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name != KEYPOINTS:

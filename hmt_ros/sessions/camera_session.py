@@ -265,21 +265,22 @@ class CameraSession(Session[CameraParameters, State]):
             return
         seen.append(frame)
         images, infos = self._named_frames[IMAGE], self._named_frames[CAMERA_INFO]
-        text = ''
         if len(seen) > 1:
-            text = (
+            self._log.note(
+                'frame_id',
                 f'{self._on_topic(source)} has messages of the frames {seen[-2]!r} and {frame!r}: '
-                'wanted those of one camera; stop or remap one of the publishers'
+                'wanted those of one camera; stop or remap one of the publishers',
+                warn=True,
             )
         elif images and infos and frame not in (images if source == CAMERA_INFO else infos):
-            text = (
+            self._log.note(
+                'frame_id',
                 f'{self._on_topic(IMAGE)} has frame_id {images[-1]!r}, '
                 f'{self._on_topic(CAMERA_INFO)} has {infos[-1]!r}: results are in that of the '
                 'image; if both are of one camera, set one frame_id in its driver, else remap '
-                'camera_info'
+                'camera_info',
+                warn=True,
             )
-        if text:
-            self._log.note('frame_id', text, warn=True)
 
     def _take_image(self, message: Any, stamp: int) -> None:
         self._see_frame(IMAGE, message)

@@ -158,8 +158,7 @@ class StampedInputs(Generic[T]):
 
     def __init__(self, most: int = REMEMBERED) -> None:
         self._most = most
-        self._content: dict[int, T | None] = {}
-        self._newest = -1
+        self.clear()
 
     def put(self, stamp_ns: int, content: T | None) -> None:
         """Keeps an input for its image."""
@@ -179,7 +178,7 @@ class StampedInputs(Generic[T]):
 
     def clear(self) -> None:
         """Drops all inputs."""
-        self._content.clear()
+        self._content: dict[int, T | None] = {}
         self._newest = -1
 
 

@@ -194,11 +194,15 @@ class DetectionReader:
 
 
 class KeypointReader(DetectionReader):
-    """Reads the keypoints of the person who is tracked."""
+    """Reads the keypoints of the person who is tracked.
+
+    Attributes:
+        chosen: one of several people.
+    """
 
     def __init__(self, source: str, log: HandlingLog) -> None:
         super().__init__(source, log)
-        self._chosen = ChosenPerson()
+        self.chosen = ChosenPerson()
 
     def read(
         self,
@@ -243,7 +247,7 @@ class KeypointReader(DetectionReader):
             own = (x.keypoints for x in people if x.name == p.person_id and x.keypoints.seen.any())
             chosen = next(own, None)
         else:
-            chosen = self._chosen.choose(people, stamp, LONGEST_ABSENCE)
+            chosen = self.chosen.choose(people, stamp, LONGEST_ABSENCE)
         return None if chosen is None else chosen[np.flatnonzero(chosen.seen)]
 
     def at_joints(
@@ -272,7 +276,3 @@ class KeypointReader(DetectionReader):
                 )
         known, _ = found.named_for(body, scheme)
         return known[np.flatnonzero(known.seen)] if known.names else None
-
-    def forget(self) -> None:
-        """Forgets the chosen person; the next one is chosen anew."""
-        self._chosen.forget()

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import entr
 
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.declared_parameters import NodeParameters
@@ -328,5 +329,4 @@ def frame_id_of(message: Any) -> str:
 
 def entropy(weights: NDArray[np.float64]) -> float:
     """Entropy of the weights of a mixture, nats; NaN where there are none."""
-    positive = weights[weights > 0]
-    return abs(float(-(positive * np.log(positive)).sum())) if len(positive) else math.nan
+    return float(entr(weights).sum()) if len(weights) else math.nan

@@ -194,7 +194,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
     def _jump_back(self, stamp: int) -> None:
         super()._jump_back(stamp)
         # Where time begins again, so do the numbers of the tracks.
-        self._keypoints.forget()
+        self._keypoints.chosen.forget()
         self._begin()
 
     # One person; several override these.
