@@ -179,7 +179,7 @@ class StampedInputs(Generic[T]):
     def clear(self) -> None:
         """Drops all inputs."""
         self._content: dict[int, T | None] = {}
-        self._newest = -1
+        self._newest: int = -1
 
 
 class ImageInputs:
