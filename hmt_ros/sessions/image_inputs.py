@@ -160,6 +160,11 @@ class StampedInputs(Generic[T]):
         self._most = most
         self.clear()
 
+    def clear(self) -> None:
+        """Drops all inputs."""
+        self._content: dict[int, T | None] = {}
+        self._newest = -1
+
     def put(self, stamp_ns: int, content: T | None) -> None:
         """Keeps an input for its image."""
         self._newest = max(self._newest, stamp_ns)
@@ -175,11 +180,6 @@ class StampedInputs(Generic[T]):
         """The inputs by stamp, in order, for an image and all that are older; drops them."""
         taken = sorted(stamp for stamp in self._content if stamp <= stamp_ns)
         return {stamp: self._content.pop(stamp) for stamp in taken}
-
-    def clear(self) -> None:
-        """Drops all inputs."""
-        self._content: dict[int, T | None] = {}
-        self._newest: int = -1
 
 
 class ImageInputs:
