@@ -16,17 +16,17 @@ from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.ground_kernel import Constants
 from hmt_ros.body.ground_terms import GroundTerm
 from hmt_ros.body.kinematics import forward, placing_of
-from hmt_ros.body.pose_prior import MixturePrior, gaussian_model
-from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, SelfIntersection
-from hmt_ros.body.self_intersection import overlaps_of
+from hmt_ros.body.pose_prior import AnglePrior, MixturePrior
+from hmt_ros.body.pose_terms import FrameTerm
+from hmt_ros.body.self_intersection import SelfIntersection
 from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.optical_flow import FlowInputs, FlowTerm
+from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.pose_energy_kernel import NO_DESCENT, Compiled, Descent, solve
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import NO_MAP
@@ -39,6 +39,16 @@ from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, ad
 from hmt_ros.inference.threads import in_threads
 
 Term = TypeVar('Term')
+Parts = tuple[Array, Array, Array]
+CompiledTerm = (
+    ObservedImage
+    | KeypointTerm
+    | MixturePrior
+    | AnglePrior
+    | SelfIntersection
+    | GroundTerm
+    | FlowTerm
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +86,7 @@ class PoseEnergy:
     """
 
     likelihood: ImageLikelihood
-    terms: tuple[FrameTerm, ...]
+    terms: tuple[CompiledTerm | FrameTerm, ...]
     motion: Quadratic | Student | None = None
     point: Array | None = None
     free: Index | None = None
@@ -120,39 +130,16 @@ class PoseEnergy:
 
     def _evaluated(
         self, x: Array, rows: Index | None, derivatives: Derivatives, *, apart: bool
-    ) -> tuple[Energy, tuple[Array, Array, Array], Compiled]:
+    ) -> tuple[Energy, Parts, Compiled]:
         x = self._checked(x)
-        n, f = x.shape
-        rows = np.arange(n) if rows is None else np.asarray(rows, dtype=np.intp)
-        compiled, asked = self._compiled(n), n if derivatives else 0
-        value, gradient, hessian = np.empty(n), np.empty((asked, f)), np.empty((asked, f, f))
-        parts = _empty_parts(n if apart else 0, asked if apart else 0, f)
+        rows = np.arange(len(x)) if rows is None else np.asarray(rows, dtype=np.intp)
         exact = derivatives == Derivatives.EXACT
-        limits, nothing = np.zeros((2, f)), (np.empty(n, np.int8), np.zeros(n, np.int32))
-
-        def work(first: int, last: int) -> None:
-            solve(
-                first,
-                last,
-                compiled,
-                self._point,
-                self._free,
-                rows,
-                exact,
-                limits,
-                NO_DESCENT,
-                x,
-                value,
-                gradient,
-                hessian,
-                parts,
-                *nothing,
-            )
-
-        in_threads(work, n, 8, self.likelihood.threads)
+        limits = np.zeros((2, x.shape[1]))
+        energy, parts, compiled, *_ = self._solved(
+            x, rows, limits, NO_DESCENT, 8, exact=exact, wanted=bool(derivatives), apart=apart
+        )
         if self.counted is not None:
-            self.counted(n)
-        found = Energy(value, gradient, hessian) if derivatives else Energy(value)
+            self.counted(len(x))
         others = self._others(x, rows, derivatives)
         if apart:
             for other in others:
@@ -160,6 +147,7 @@ class PoseEnergy:
                 if derivatives:
                     for known, own in zip(parts[1:], other.derivatives(), strict=True):
                         known[:, 2] += own
+        found = energy if derivatives else Energy(energy.value)
         return add_energies([found, *others]), parts, compiled
 
     def minimise(
@@ -193,11 +181,41 @@ class PoseEnergy:
         n, f = x.shape
         metric = np.broadcast_to(np.asarray(step_scale, dtype=np.float64) ** -2.0, (f,)).copy()
         descent = Descent(max_iterations, float(damping), float(tolerance), metric)
-        limits, rows = np.stack([lower, upper]), np.arange(n)
-        compiled = self._compiled(n)
-        value, gradient, hessian = np.empty(n), np.empty((n, f)), np.empty((n, f, f))
+        energy, _, _, status, iterations = self._solved(
+            x, np.arange(n), np.stack([lower, upper]), descent, 2
+        )
+        if self.counted is not None:
+            self.counted(n + int(iterations.sum()))
+        gradient, hessian = energy.derivatives()
+        free = ~resting(x, gradient, lower, upper)
+        return Minimum(x, energy.value, gradient, hessian, free, status, iterations)
+
+    def _solved(
+        self,
+        x: Array,
+        rows: Index,
+        limits: Array,
+        descent: Descent,
+        together: int,
+        *,
+        exact: bool = False,
+        wanted: bool = True,
+        apart: bool = False,
+    ) -> tuple[Energy, Parts, Compiled, NDArray[np.int8], NDArray[np.int32]]:
+        """Energies of points x (n, f), which become minima; arguments and results as for `solve`.
+
+        Args:
+            together: number of points that a thread takes at once.
+            wanted: whether derivatives are wanted.
+            apart: whether the parts by cue are.
+        """
+        n, f = x.shape
+        asked, values = n if wanted else 0, n if apart else 0
+        slopes = asked if apart else 0
+        energy = np.empty(n), np.empty((asked, f)), np.empty((asked, f, f))
+        parts = np.empty((values, 3)), np.empty((slopes, 3, f)), np.empty((slopes, 3, f, f))
         status, iterations = np.empty(n, dtype=np.int8), np.zeros(n, dtype=np.int32)
-        parts = _empty_parts(0, 0, f)
+        compiled = self._compiled(n)
 
         def work(first: int, last: int) -> None:
             solve(
@@ -207,23 +225,18 @@ class PoseEnergy:
                 self._point,
                 self._free,
                 rows,
-                False,
+                exact,
                 limits,
                 descent,
                 x,
-                value,
-                gradient,
-                hessian,
+                *energy,
                 parts,
                 status,
                 iterations,
             )
 
-        in_threads(work, n, 2, self.likelihood.threads)
-        if self.counted is not None:
-            self.counted(n + int(iterations.sum()))
-        free = ~resting(x, gradient, lower, upper)
-        return Minimum(x, value, gradient, hessian, free, status, iterations)
+        in_threads(work, n, together, self.likelihood.threads)
+        return Energy(*energy), parts, compiled, status, iterations
 
     @cached_property
     def _point(self) -> Array:
@@ -285,23 +298,18 @@ class PoseEnergy:
     @cached_property
     def _rest(self) -> dict[str, Any]:
         """Inputs of compiled code besides the terms of the image."""
-        body = self.likelihood.body
-        keypoints, overlaps = self._term(KeypointTerm), self._term(SelfIntersection)
-        ground, mixture = self._term(GroundTerm), self._term(MixturePrior)
-        angles, flow = self._term(AnglePrior), self._term(FlowTerm)
-        detected = _no_keypoints(self.likelihood.model) if keypoints is None else keypoints.compiled
-        if mixture is None:
-            prior = gaussian_model(body, 0.0 if angles is None else angles.weight)
-        else:
-            prior = mixture.compiled
+        body, model = self.likelihood.body, self.likelihood.model
+        keypoints, ground = self._term(KeypointTerm), self._term(GroundTerm)
+        prior = self._term(MixturePrior) or self._term(AnglePrior) or AnglePrior(body, 0.0)
+        overlaps = self._term(SelfIntersection) or SelfIntersection(body, np.inf)
         centres, precisions, tails = self._expected
         return {
             'placing': placing_of(body.skeleton),
-            'keypoints': detected,
-            'prior': prior,
-            'overlaps': overlaps_of(body, np.inf if overlaps is None else overlaps.sigma),
+            'keypoints': _no_keypoints(model) if keypoints is None else keypoints.compiled,
+            'prior': prior.compiled,
+            'overlaps': overlaps.compiled,
             'ground': _no_ground(body.dimension) if ground is None else ground.compiled,
-            'flow': _NO_FLOW if flow is None else flow.compiled,
+            'flow': self._term(FlowTerm) or _NO_FLOW,
             'centres': centres,
             'precisions': precisions,
             'tails': tails,
@@ -330,10 +338,6 @@ class PoseEnergy:
         )
 
 
-def _empty_parts(values: int, derivatives: int, d: int) -> tuple[Array, Array, Array]:
-    return np.empty((values, 3)), np.empty((derivatives, 3, d)), np.empty((derivatives, 3, d, d))
-
-
 # Kinds of terms with a kernel here.
 _KNOWN: tuple[Any, ...] = (
     ObservedImage,
@@ -346,7 +350,7 @@ _KNOWN: tuple[Any, ...] = (
 NOTHING_SEEN = Observation()
 _NONE, _NO_PAIRS = np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
 _NO_POINTS = Points(_NO_PAIRS, np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)), _NONE)
-_NO_FLOW = FlowInputs(
+_NO_FLOW = FlowTerm(
     SurfacePoints(_NONE, np.zeros((0, 0), np.int64), np.zeros((0, 0, 3)), np.zeros((0, 0, 2))),
     NO_MAP,
     0.0,

@@ -196,7 +196,7 @@ class Posterior:
         self.evaluations += evaluations
 
     @property
-    def known(self) -> tuple[FrameTerm, ...]:
+    def known(self) -> tuple[FrameTerm | GroundTerm, ...]:
         """Terms besides those of image and body: those that were added, gravity and floor."""
         if self.ground is None:
             return self.extra

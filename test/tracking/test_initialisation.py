@@ -7,7 +7,6 @@ import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_learning.motion.viewpoint import Viewpoint
-from hmt_ros.body.kinematics import forward
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.image.likelihood import LikelihoodSettings
@@ -88,9 +87,8 @@ def test_energies_are_those_of_joints_and_prior(camera, known):
     pixels = camera.project(body.joint_positions(poses))
     value = 0.5 * ((pixels - keypoints.pixels) ** 2).sum((1, 2))
     value += 0.5 * (((poses - body.prior_mean) / body.prior_sigma) ** 2).sum(1)
-    value += self_intersection_energy(
-        body, forward(body.skeleton, poses), sigma=LikelihoodSettings().self_intersection_sigma
-    )[0]
+    sigma = LikelihoodSettings().self_intersection_sigma
+    value += self_intersection_energy(body, poses, sigma=sigma)
     assert np.allclose(start.energies, value, rtol=1e-9)
     assert (np.diff(start.energies) >= 0).all()
     assert np.linalg.eigvalsh(start.hessians).min() > 0

@@ -21,9 +21,8 @@ from functools import cached_property
 
 import numpy as np
 
-from hmt_ros.body.kinematics import forward
 from hmt_ros.flips.limb_products import LimbProducts
-from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.keypoints import group_of
@@ -88,14 +87,12 @@ class LimbSearch:
             plan: allocation of its evaluations.
             rng: source of randomness.
         """
-        body, own = self.posterior.body, self.dofs
-        s = self.posterior.settings.search
+        s, own = self.posterior.settings.search, self.dofs
         block = covariance[np.ix_(own, own)]
         samples = self._draw(pose[own], block, plan.samples, rng)
-        others = self._rest.energies(
-            forward(body.skeleton, pose[None]), observation, derivatives=False
-        )
-        seen = self._own.seen(observation, explained=others.costs)
+        others = PoseEnergy(self._rest, (ObservedImage(self._rest, observation),))
+        explained = others.by_cue(pose[None], derivatives=False).outline_costs
+        seen = self._own.seen(observation, explained=explained)
         seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
         motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
         term = PoseEnergy(self._own, seen, motion, pose, own)
