@@ -63,6 +63,11 @@ class FlowTerm(NamedTuple):
     flow: ImageMap
     weight: float
 
+    @property
+    def compiled(self) -> FlowTerm:
+        """The term as compiled code reads it."""
+        return self
+
 
 @njit(cache=True, nogil=True)
 def add_flow(  # type: ignore[no-untyped-def]

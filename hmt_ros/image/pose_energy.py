@@ -13,13 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmt_ros.body.ground_kernel import Constants
-from hmt_ros.body.ground_terms import GroundTerm
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
 from hmt_ros.body.kinematics import forward, placing_of
 from hmt_ros.body.pose_prior import AnglePrior, MixturePrior
 from hmt_ros.body.pose_terms import FrameTerm
@@ -30,15 +31,13 @@ from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.pose_energy_kernel import NO_DESCENT, Compiled, Descent, solve
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import NO_MAP
-from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, Points
-from hmt_ros.image.terms.keypoints import NOT_LIFTED, KeypointTerm
-from hmt_ros.image.terms.registry import TERMS, Model
+from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
+from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, add_energies
 from hmt_ros.inference.threads import in_threads
 
-Term = TypeVar('Term')
 Parts = tuple[Array, Array, Array]
 CompiledTerm = (
     ObservedImage
@@ -93,7 +92,7 @@ class PoseEnergy:
     counted: Callable[[int], None] | None = None
 
     def __post_init__(self) -> None:
-        for kind in _KNOWN:
+        for kind in KINDS.values():
             found = [type(term).__name__ for term in self.terms if isinstance(term, kind)]
             if len(found) > 1:
                 raise ValueError(f'a sum has one term of a kind at most, saw {" and ".join(found)}')
@@ -264,7 +263,7 @@ class PoseEnergy:
     @cached_property
     def _strange(self) -> tuple[FrameTerm, ...]:
         """Terms without a kernel here."""
-        return tuple(x for x in self.terms if not any(isinstance(x, kind) for kind in _KNOWN))
+        return tuple(x for x in self.terms if not isinstance(x, CompiledTerm))
 
     def _others(self, x: Array, rows: Index, derivatives: Derivatives) -> list[Energy]:
         """Energies of the terms without a kernel, over the free variables."""
@@ -285,38 +284,39 @@ class PoseEnergy:
 
     def _compiled(self, count: int) -> Compiled:
         """The terms as compiled code reads them, for so many poses."""
-        image = self._term(ObservedImage)
-        likelihood = self.likelihood if image is None else image.likelihood
-        observation = NOTHING_SEEN if image is None else image.observation
-        inputs = likelihood.inputs(observation, count, None if image is None else image.explained)
+        image = self._known.get('image') or ObservedImage(self.likelihood, NOTHING_SEEN)
+        inputs = image.likelihood.inputs(image.observation, count, image.explained)
         running = [bool(one.term.weight > 0) for one in inputs]
         contour = any(on and term.needs_contour for on, term in zip(running, TERMS, strict=True))
+        model = image.likelihood.model
         return Compiled(
-            inputs=inputs, image=any(running), contour=contour, model=likelihood.model, **self._rest
+            inputs=inputs, image=any(running), contour=contour, model=model, **self._rest
         )
 
     @cached_property
     def _rest(self) -> dict[str, Any]:
         """Inputs of compiled code besides the terms of the image."""
-        body, model = self.likelihood.body, self.likelihood.model
-        keypoints, ground = self._term(KeypointTerm), self._term(GroundTerm)
-        prior = self._term(MixturePrior) or self._term(AnglePrior) or AnglePrior(body, 0.0)
-        overlaps = self._term(SelfIntersection) or SelfIntersection(body, np.inf)
+        body = self.likelihood.body
+        own = {name: term.compiled for name, term in self._known.items() if name != 'image'}
         centres, precisions, tails = self._expected
         return {
+            **_absent(body, self.likelihood.camera),
+            **own,
             'placing': placing_of(body.skeleton),
-            'keypoints': _no_keypoints(model) if keypoints is None else keypoints.compiled,
-            'prior': prior.compiled,
-            'overlaps': overlaps.compiled,
-            'ground': _no_ground(body.dimension) if ground is None else ground.compiled,
-            'flow': self._term(FlowTerm) or _NO_FLOW,
             'centres': centres,
             'precisions': precisions,
             'tails': tails,
         }
 
-    def _term(self, kind: type[Term]) -> Term | None:
-        return next((term for term in self.terms if isinstance(term, kind)), None)
+    @cached_property
+    def _known(self) -> dict[str, Any]:
+        """Terms with a kernel here, by the name of their inputs."""
+        return {
+            name: term
+            for name, kind in KINDS.items()
+            for term in self.terms
+            if isinstance(term, kind)
+        }
 
     @cached_property
     def _expected(self) -> tuple[Array, Array, float]:
@@ -338,48 +338,29 @@ class PoseEnergy:
         )
 
 
-# Kinds of terms with a kernel here.
-_KNOWN: tuple[Any, ...] = (
-    ObservedImage,
-    KeypointTerm,
-    (MixturePrior, AnglePrior),
-    SelfIntersection,
-    GroundTerm,
-    FlowTerm,
-)
+# Kinds of terms with a kernel here, by the names of their inputs in `Compiled`.
+KINDS: dict[str, Any] = {
+    'image': ObservedImage,
+    'keypoints': KeypointTerm,
+    'prior': (MixturePrior, AnglePrior),
+    'overlaps': SelfIntersection,
+    'ground': GroundTerm,
+    'flow': FlowTerm,
+}
 NOTHING_SEEN = Observation()
-_NONE, _NO_PAIRS = np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
-_NO_POINTS = Points(_NO_PAIRS, np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)), _NONE)
-_NO_FLOW = FlowTerm(
-    SurfacePoints(_NONE, np.zeros((0, 0), np.int64), np.zeros((0, 0, 3)), np.zeros((0, 0, 2))),
-    NO_MAP,
-    0.0,
-)
-_AS_CALLED = np.zeros((1, 1), dtype=np.int64)
-_ONE, _SURE = np.zeros(1), np.zeros((1, 1))
-
-
-def _no_keypoints(model: Model) -> KeypointInputs:
-    return KeypointInputs(
-        _NO_POINTS, NOT_LIFTED, model.tree, model.lens, 1.0, _ONE, _AS_CALLED, _SURE
-    )
 
 
 @lru_cache(maxsize=16)
-def _no_ground(dimension: int) -> Constants:
-    none, nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-    return Constants(
-        np.zeros(dimension, dtype=np.bool_),
-        np.zeros((0, dimension), dtype=np.bool_),
-        np.zeros(2),
-        np.zeros(3),
-        0.0,
-        none,
-        np.zeros((0, 3, 3)),
-        nothing,
-        none,
-        nothing,
-        0.0,
-        1.0,
-        1.0,
-    )
+def _absent(body: Body, camera: Camera) -> dict[str, Any]:
+    """What compiled code reads where a term is not there."""
+    none, nothing = np.zeros(0, np.int64), np.zeros((0, 0, 3))
+    no_keypoints = Keypoints((), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
+    no_floor = FloorPlane(np.zeros(3), 0.0, None, np.inf)
+    no_points = SurfacePoints(none, np.zeros((0, 0), np.int64), nothing, nothing[..., :2].copy())
+    return {
+        'keypoints': KeypointTerm(body.skeleton, camera, no_keypoints).compiled,
+        'prior': AnglePrior(body, 0.0).compiled,
+        'overlaps': SelfIntersection(body, np.inf).compiled,
+        'ground': GroundTerm(body, GroundSettings(0.0, 0.0), no_floor).compiled,
+        'flow': FlowTerm(no_points, NO_MAP, 0.0),
+    }
