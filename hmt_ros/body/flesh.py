@@ -97,7 +97,10 @@ def _rings(parts: Sequence[Superquadric], s: Array) -> tuple[Array, Array, Array
 
 
 def surfaces(parts: Sequence[Superquadric], s: Array, w: Array) -> tuple[Array, Array]:
-    """Points and outward unit normals (P, R, 3) of P parts, at heights s in (-1, 1) and angles w."""
+    """Points and outward unit normals (P, R, 3) of P parts at heights s in (-1, 1) and angles w.
+
+    s, w: (R,).
+    """
     centre, radius, slope, lean = _rings(parts, s)
     e2 = np.array([part.exponents[1] for part in parts])[:, None, None]
     around = np.stack([np.cos(w), np.sin(w)], axis=1)
@@ -136,7 +139,8 @@ class Flesh:
             for part, n in zip(self.parts, self.ring_count, strict=True)
         ]
         exponents = np.repeat([part.exponents[1] for part in self.parts], self.ring_count)
-        return Rings(*map(np.concatenate, zip(*stacks, strict=True)), exponents)
+        centre, radius, slope, lean = map(np.concatenate, zip(*stacks, strict=True))
+        return Rings(centre, radius, slope, lean, exponents)
 
     @cached_property
     def ring_parts(self) -> Index:

@@ -228,12 +228,10 @@ class Soles:
     Attributes:
         segments: (P,) that carry them; empty for a body without feet.
         local: (P, 3) in the frames of the segments, m.
-        feet: (P,) 0: left, 1: right.
     """
 
     segments: Index
     local: Array
-    feet: NDArray[np.intp]
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -245,8 +243,7 @@ def soles(body: Body) -> Soles:
     names = body.joint_names
     wanted = [f'{side}_{joint}' for side in FEET for joint in ('ankle', 'toe')]
     if not set(wanted) <= set(names):
-        nothing = np.zeros(0, dtype=np.intp)
-        return Soles(nothing, np.zeros((0, 3)), nothing)
+        return Soles(np.zeros(0, dtype=np.intp), np.zeros((0, 3)))
     joints = body.skeleton.joint_index(tuple(wanted)).reshape(2, 2)
     segments, local = [], []
     for ankle, toe in joints:
@@ -262,8 +259,7 @@ def soles(body: Body) -> Soles:
             # The middle of the equally low points: left and right of the middle line.
             local.append(points[lowest > lowest.max() - 1e-6].mean(0))
             segments.append(carrier)
-    feet = np.array([0, 0, 1, 1], dtype=np.intp)
-    return Soles(np.array(segments, dtype=np.intp), np.array(local), feet)
+    return Soles(np.array(segments, dtype=np.intp), np.array(local))
 
 
 def sole_points(body: Body, poses: Array) -> Array:

@@ -19,14 +19,12 @@ from hmt_ros.image.sampling import ImageMap, sample
 from hmt_ros.image.surface import project
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import ImageWindow
-from hmt_ros.image.terms.residuals import add_residual, assemble_pose, geman_mcclure
+from hmt_ros.image.terms.residuals import FEWEST, add_residual, assemble_pose, geman_mcclure
 
 # Standard deviation of the flow, px, and its further error, as a share of the displacement.
 SIGMA, SHARE = 1.5, 0.15
 # Width of the Geman-McClure kernel, in standard deviations.
 SCALE = 2.0
-# Fewer points than this do not make each of them count more.
-FEWEST = 20
 # Smaller images, px, have a flow of 0.
 SMALLEST = 32
 

@@ -38,7 +38,7 @@ from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, add_energies
 from hmt_ros.inference.threads import in_threads
 
-Parts = tuple[Array, Array, Array]
+Parts = tuple[Array, Array]
 CompiledTerm = (
     ObservedImage
     | KeypointTerm
@@ -57,13 +57,12 @@ class ByCue:
     Attributes:
         energy: sum of all.
         values: (n, 3).
-        gradients, hessians: (n, 3, d), (n, 3, d, d); of no pose: not asked for.
+        hessians: (n, 3, d, d); of no pose: not asked for.
         outline_costs: (n, M) energy of each sample of the silhouette's outline.
     """
 
     energy: Energy
     values: Array
-    gradients: Array
     hessians: Array
     outline_costs: Array
 
@@ -144,8 +143,7 @@ class PoseEnergy:
             for other in others:
                 parts[0][:, 2] += other.value
                 if derivatives:
-                    for known, own in zip(parts[1:], other.derivatives(), strict=True):
-                        known[:, 2] += own
+                    parts[1][:, 2] += other.derivatives()[1]
         found = energy if derivatives else Energy(energy.value)
         return add_energies([found, *others]), parts, compiled
 
@@ -210,9 +208,8 @@ class PoseEnergy:
         """
         n, f = x.shape
         asked, values = n if wanted else 0, n if apart else 0
-        slopes = asked if apart else 0
         energy = np.empty(n), np.empty((asked, f)), np.empty((asked, f, f))
-        parts = np.empty((values, 3)), np.empty((slopes, 3, f)), np.empty((slopes, 3, f, f))
+        parts = np.empty((values, 3)), np.empty((asked if apart else 0, 3, f, f))
         status, iterations = np.empty(n, dtype=np.int8), np.zeros(n, dtype=np.int32)
         compiled = self._compiled(n)
 

@@ -288,9 +288,9 @@ def solve(  # type: ignore[no-untyped-def]
         x: (n, f) points; become minima, where iterations are asked for.
         value, gradient, hessian: (n,), (n, f), (n, f, f) result; of no point: no derivatives are
             wanted, and no minima.
-        by_cue: energies (n, 3), gradients (n, 3, d) and Hessians (n, 3, d, d) of image, keypoints
-            and all other terms, result; of no point: not wanted. They are those of the last
-            evaluation, all variables are free, and gradients only where the others are.
+        by_cue: energies (n, 3) and Hessians (n, 3, d, d) of image, keypoints and all other terms,
+            result; of no point: not wanted. They are those of the last evaluation, all variables
+            are free, and Hessians only where derivatives are.
         status, iterations: (n,) results.
     """
     f, apart = len(free), len(by_cue[0]) > 0
@@ -343,7 +343,7 @@ def solve(  # type: ignore[no-untyped-def]
             if apart:
                 by_cue[0][n] = room.value
                 if wanted:
-                    by_cue[1][n], by_cue[2][n] = room.gradient, room.hessian
+                    by_cue[1][n] = room.hessian
             if turn == 0:
                 better = True
                 ended = not np.isfinite(found)

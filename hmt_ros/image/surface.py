@@ -320,14 +320,14 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
 def _bracketed_roots(bx, by, uz, kx, ky, power, cosines, sines):  # type: ignore[no-untyped-def]
     """Cosines, sines of the two roots of g(w) of `body.flesh`; False: none."""
     steps = 48
-    found_up, found_down = False, False
+    found = np.zeros(2, np.bool_)
     before = 0.0
     for k in range(steps + 1):
         w = -np.pi + k * (2.0 * np.pi / steps)
         at = _condition(w, bx, by, uz, kx, ky, power)
         if k > 0 and (before > 0) != (at > 0):
-            up = at > 0
-            if (up and not found_up) or (not up and not found_down):
+            side = 0 if at > 0 else 1
+            if not found[side]:
                 low, high, at_low, at_high = w - 2.0 * np.pi / steps, w, before, at
                 root = high
                 for _ in range(16):  # Illinois: false position that never stalls at one end
@@ -340,14 +340,10 @@ def _bracketed_roots(bx, by, uz, kx, ky, power, cosines, sines):  # type: ignore
                     else:
                         low, at_low = high, at_high
                     high, at_high = root, value
-                side = 0 if up else 1
                 cosines[side], sines[side] = np.cos(root), np.sin(root)
-                if up:
-                    found_up = True
-                else:
-                    found_down = True
+                found[side] = True
         before = at
-    return found_up and found_down
+    return found[0] and found[1]
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -17,7 +17,6 @@ from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
 from hmt_ros.image.terms.depth import (
     ASIDE,
     DEPTH,
-    FEWEST,
     FURTHEST,
     JUMP,
     LEAST_COSINE,
@@ -25,6 +24,7 @@ from hmt_ros.image.terms.depth import (
     usable_depths,
 )
 from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.residuals import FEWEST
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from test.oracles.single_terms import image_energy
 

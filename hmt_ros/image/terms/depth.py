@@ -37,7 +37,7 @@ from hmt_ros.image.terms.image_term import (
     TermSettings,
     Weighting,
 )
-from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
+from hmt_ros.image.terms.residuals import add_residual, geman_mcclure, weight_of_each
 
 # Depths that sensors measure, m; nearer and further ones are no evidence.
 NEAREST, FURTHEST = 0.2, 20.0
@@ -48,8 +48,6 @@ COS, SIN = float(np.cos(ASIDE)), float(np.sin(ASIDE))
 LEAST_COSINE = 0.3
 # Neighbouring depths that differ by more, as a share of the depth, lie on two surfaces.
 JUMP = 0.03
-# Fewer visible points than this do not make each of them count more.
-FEWEST = 20
 
 
 class DepthInputs(NamedTuple):
@@ -180,12 +178,7 @@ def add_depth(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
     mark_visibility(
         flesh, view.occluders, view.columns, view.origins, parts, points, valid, covered, hidden
     )
-    visible = view.contour_points * 5 // 10
-    if visible == 0:
-        for i in range(count):
-            if valid[i] and not hidden[i]:
-                visible += 1
-    each = term.weight / max(visible, FEWEST)
+    each = weight_of_each(term.weight, view.contour_points * 5 // 10, valid, hidden)
     unknown, _, _ = geman_mcclure(1.0, term.scale, each)
     energy = 0.0
     for i in range(count):

@@ -83,6 +83,21 @@ def contour_sigma(term, noise):  # type: ignore[no-untyped-def]
     return np.sqrt(term.sigma * term.sigma + blur * blur)
 
 
+# Fewer visible points than this do not make each of them count more.
+FEWEST = 20
+
+
+@njit(cache=True, nogil=True)
+def weight_of_each(weight, shared, valid, hidden):  # type: ignore[no-untyped-def]
+    """A weight shared among so many points; 0: among those that are valid and not hidden."""
+    count = shared
+    if count == 0:
+        for i in range(len(valid)):
+            if valid[i] and not hidden[i]:
+                count += 1
+    return weight / max(count, FEWEST)
+
+
 # Columns of a list of residuals: segment, point (3), derivative (3), pull, curvature.
 RECORDED = 9
 

@@ -93,9 +93,9 @@ class LimbSearch:
         others = PoseEnergy(self._rest, (ObservedImage(self._rest, observation),))
         explained = others.by_cue(pose[None], derivatives=False).outline_costs
         seen = self._own.seen(observation, explained=explained)
-        seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
+        terms = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
         motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
-        term = PoseEnergy(self._own, seen, motion, pose, own)
+        term = PoseEnergy(self._own, terms, motion, pose, own)
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: plan.refined]]
         self.posterior.evaluations += len(samples) + plan.refined * s.iterations
