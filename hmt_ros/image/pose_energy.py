@@ -49,6 +49,18 @@ CompiledTerm = (
     | FlowTerm
 )
 
+# Length of a moderate step of an angle, rad, and of a place, m.
+ROTATION_STEP, PLACE_STEP = 0.4, 0.3
+# First damping of a minimisation, and gain by a step below which a minimum is found, nats.
+DAMPING, TOLERANCE = 1.0, 1e-3
+# Maximum number of steps of a minimisation that is not limited otherwise.
+MAX_ITERATIONS = 40
+
+
+def scale_of(body: Body) -> Array:
+    """Length (d,) of a moderate step of each variable, rad or m."""
+    return np.where(body.skeleton.dof_is_rotation, ROTATION_STEP, PLACE_STEP)
+
 
 @dataclass(frozen=True, eq=False)
 class ByCue:
@@ -151,17 +163,24 @@ class PoseEnergy:
         self,
         x: ArrayLike,
         *,
-        step_scale: ArrayLike,
-        damping: float,
-        max_iterations: int,
-        tolerance: float,
+        step_scale: ArrayLike | None = None,
+        damping: float = DAMPING,
+        max_iterations: int = MAX_ITERATIONS,
+        tolerance: float = TOLERANCE,
     ) -> Minimum:
         """Minima from starts x (n, f) within the limits of the body; see `bounded_newton.minimise`.
+
+        Args:
+            x: starts.
+            step_scale: (f,) or a scalar; None: that of the body.
+            damping, max_iterations, tolerance: as for `bounded_newton.minimise`.
 
         Raises:
             ValueError: x has not f columns, or is not finite.
         """
         body = self.likelihood.body
+        if step_scale is None:
+            step_scale = scale_of(body)[self._free]
         lower, upper = body.lower[self._free], body.upper[self._free]
         if self._strange:
             return minimise(

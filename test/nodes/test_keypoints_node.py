@@ -66,19 +66,6 @@ def test_images_become_keypoints(world, somebody, monkeypatch):
     one.assert_described(KeypointsParameters())
 
 
-def test_lifecycle(world, somebody, monkeypatch):
-    monkeypatch.setitem(DETECTORS, 'mediapipe', STUB)
-    one = world(autostart=False)
-    one.node.start()
-    assert one.change_state('configure')
-    assert one.change_state('activate')
-    one.connect()
-    assert one.send('image', somebody.image(0)).faults == ()
-    assert one.change_state('deactivate')
-    assert one.change_state('cleanup')
-    assert one.state == 'unconfigured'
-
-
 def test_without_a_detector_one_line_says_what_to_do(world, monkeypatch):
     for name in ('ai_edge_litert', 'ai_edge_litert.interpreter'):
         monkeypatch.setitem(sys.modules, name, None)

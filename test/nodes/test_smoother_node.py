@@ -95,34 +95,6 @@ def test_parameters_are_those_of_the_file(running):
     assert running.limit('likelihood_mixture') == 3
 
 
-def test_one_warning_for_each_kind_and_the_node_lives(running, likelihoods):
-    def of_another_order(index):
-        message = likelihoods.message(index)
-        message.dof_names = message.dof_names[::-1]
-        return message
-
-    running.send('likelihood_mixture', likelihoods.message(1))
-    for make, indices in (
-        (of_another_order, (2, 2)),
-        (likelihoods.message, (1, 1)),
-        (likelihoods.message, (0, 0)),
-    ):
-        for index in indices:
-            handled = running.send('likelihood_mixture', make(index))
-            assert len(handled.faults) == 1
-    assert running.send('likelihood_mixture', likelihoods.message(9)).faults == ()
-    wanted = ('dof_names', 'wanted stamps that increase', 'reset_on_time_jump',
-              'no mixture for 0.80 s')  # fmt: skip
-    running.spin_until(lambda: len(running.warnings()) >= len(wanted))
-    for text, part in zip(running.warnings(), wanted, strict=True):
-        assert part in text
-    _, _, values = running.diagnosis()
-    assert values['mixtures smoothed'] == '2'
-    assert values['mixtures skipped'] == '6'
-    assert (values['gaps'], values['longest gap, s']) == ('1', '0.800')
-    assert values['faults: names'] == '2'
-
-
 def test_diagnostics(world, likelihoods):
     one = world().start()
     assert one.diagnosis()[:2] == (1, 'waits for likelihood_mixture')
@@ -195,13 +167,6 @@ def test_queue_holds_what_was_published(running, likelihoods):
     first, second = running.handled[-2:]
     assert 'message of likelihood_mixture can not be read' in first.faults[0]
     assert second.faults == ()
-
-
-def test_ends_cleanly(executable):
-    node = executable('smoother_node', '--params-file', str(CONFIG))
-    *about_kernels, last = node.stop_at('mixtures from /likelihood_mixture')
-    assert about_kernels
-    assert 'mixtures from /likelihood_mixture' in last
 
 
 def test_parameter_file_reaches_the_node(tmp_path, executable):

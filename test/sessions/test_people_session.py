@@ -145,7 +145,7 @@ def test_two_people_have_topics_of_their_own(session, outputs, small_camera):
     # One image, decoded once, and one background.
     first, second = StubTracker.made
     assert first.image is second.image
-    assert first.background is second.background
+    assert first.silhouettes.background is second.silhouettes.background
 
 
 def test_identities_stay_through_a_crossing(session, outputs, small_camera):
@@ -322,7 +322,7 @@ def test_an_empty_scene_is_learned_until_somebody_comes(session, small_camera):
         show(one, small_camera, i)
     show(one, small_camera, 6, somebody_at(15))
     show(one, small_camera, 7, somebody_at(15))
-    assert StubTracker.made[0].background.frames == 6
+    assert StubTracker.made[0].silhouettes.background.frames == 6
 
 
 def test_a_scene_that_was_hardly_seen_is_not_used(session, small_camera):
@@ -330,7 +330,7 @@ def test_a_scene_that_was_hardly_seen_is_not_used(session, small_camera):
     show(one, small_camera, 0)
     show(one, small_camera, 1, somebody_at(15))
     show(one, small_camera, 2, somebody_at(15))
-    assert StubTracker.made[0].background.frames == 0
+    assert StubTracker.made[0].silhouettes.background.frames == 0
 
 
 def test_somebody_at_the_border(session, small_camera):

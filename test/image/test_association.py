@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.tracking.association import (
+from hmt_ros.image.association import (
     GATE,
     ImageTrack,
     Sighting,
@@ -13,6 +12,7 @@ from hmt_ros.tracking.association import (
     moved,
     unknown_area,
 )
+from hmt_ros.image.terms.keypoints import Keypoints
 
 NAMES = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
 SHAPE = np.array([[-10.0, 20.0], [10.0, 20.0], [-15.0, -30.0], [15.0, -30.0]])
