@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.image_inputs import KEYPOINTS
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
@@ -143,26 +142,6 @@ def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_c
     np.testing.assert_allclose(tracker.gravities[-1], up_of(6), atol=1e-12)
 
 
-@pytest.mark.usefixtures('few_wait')
-def test_no_image_is_dropped_for_want_of_transforms(session, stub_tracker, small_camera, outputs):
-    one = session(queue_size=2, input_timeout=60.0)
-    one.take(CAMERA_INFO, small_camera.info())
-    for index in range(6):
-        one.take(IMAGE, small_camera.image(index))
-    assert len(grounds(outputs)) == 4
-    assert one.state.counts == {'received': 6, 'tracked': 4}
-
-
-def test_transforms_and_keypoints_are_waited_for_together(session, stub_tracker, small_camera):
-    one = session(use_keypoints=True)
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(IMAGE, small_camera.image(0))
-    one.take(TF, at(small_camera, 0))
-    assert stub_tracker.made == []
-    one.take(KEYPOINTS, small_camera.keypoints(0))
-    assert len(stub_tracker.made) == 1
-
-
 def test_a_camera_below_the_floor_has_no_height(session, stub_tracker, small_camera):
     one = session(floor_in_gravity_frame=True, camera_height=1.1)
     one.take(CAMERA_INFO, small_camera.info())
@@ -177,37 +156,20 @@ def test_a_camera_below_the_floor_has_no_height(session, stub_tracker, small_cam
     assert stub_tracker.made[0].known_ground.camera_height == 1.1
 
 
-@pytest.mark.parametrize(
-    ('spoil', 'why'),
-    [
-        (lambda t: setattr(t.transform.translation, 'x', np.nan), 'its numbers are not finite'),
-        (lambda t: setattr(t.transform.rotation, 'w', 7.0), 'its quaternion has length 7'),
-        (lambda t: setattr(t, 'child_frame_id', ''), 'a frame has no name'),
-    ],
-)
-def test_bad_transforms_are_counted(session, small_camera, outputs, spoil, why):
+def test_bad_transforms_are_counted(session, small_camera, outputs):
     one = session(input_timeout=0.0)
     one.take(CAMERA_INFO, small_camera.info())
     for index in range(2):
         bad = at(small_camera, index)
-        rotation = bad.transforms[0].transform.rotation
-        rotation.x, rotation.y, rotation.z, rotation.w = 0.0, 0.0, 0.0, 1.0
-        spoil(bad.transforms[0])
+        bad.transforms[0].transform.translation.x = np.nan
         handled = one.take(TF, bad)
         assert handled.faults == ()
         assert len(handled.warnings) == (index == 0)
-        assert why in one.state.last_fault
+        assert 'its numbers are not finite' in one.state.last_fault
         one.take(IMAGE, small_camera.image(index))
     one.take(IMAGE, small_camera.image(2))
     assert len(grounds(outputs)) == 2
     assert one.state.faults == {'transform': 2, 'no transform': 2}
-
-
-def test_an_empty_message(session, small_camera):
-    message = RosbagsMessages().create('tf2_msgs/msg/TFMessage')
-    for source in (TF, TF_STATIC):
-        handled = session().take(source, message)
-        assert (handled.faults, handled.warnings, handled.stamp_ns) == ((), (), 0)
 
 
 def test_time_that_jumps_back_gives_the_same_again(session, stub_tracker, small_camera, outputs):

@@ -152,16 +152,6 @@ def test_what_the_filter_publishes_is_a_body(
         assert stamps == [small_camera.stamp(i) for i in (0, 1)]
 
 
-def test_several_people(session, outputs, people):
-    one = session()
-    one.take(P2, people(0, 4))
-    one.take(P1, people(0, 1))
-    one.take(mixture_source('/lab/anna'), people(0, 3))
-    assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1', 'p2_4']
-    one.take(P2, people(1, 4, TrackState.NOBODY))
-    assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1']
-
-
 def test_people_who_are_gone_are_forgotten(session, outputs, people, monkeypatch):
     monkeypatch.setattr(hri_session, '_REMEMBERED', 3)
     one = session()
@@ -182,14 +172,6 @@ def test_who_is_silent_is_not_tracked(session, outputs, people, small_camera):
     one.take(CAMERA_INFO, small_camera.info(6))
     assert tracked(outputs) == [['p1_1'], []]
     assert one.identities == set()
-
-
-def test_the_end_of_the_stream(session, outputs, people, likelihoods):
-    one = session()
-    one.take(P1, people(0))
-    assert one.finish().published == ((TRACKED, likelihoods.stamp(0)),)
-    assert tracked(outputs) == [['p1_1'], []]
-    assert one.finish().published == ()
 
 
 def test_joint_states_and_frames_are_those_of_the_urdf(session, outputs, people, likelihoods):
@@ -355,17 +337,6 @@ def test_a_mode_is_shown_as_long_as_it_counts(session, outputs, people):
     np.testing.assert_allclose(elbows, wanted, atol=1e-3)
 
 
-def test_an_image_that_has_not_come_is_told(session, outputs, people, small_camera):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info(0))
-    handled = one.take(P1, people(0))
-    assert 'no image of' in handled.warnings[0]
-    assert one.state.faults == {'no image': 1}
-    quiet = session(publish_cropped=False)
-    quiet.take(CAMERA_INFO, small_camera.info(0))
-    assert quiet.take(P1, people(0)).warnings == ()
-
-
 def test_another_camera_is_told(session, outputs, people, small_camera):
     one = session()
     one.take(CAMERA_INFO, small_camera.info(0, frame_id='left'))
@@ -393,15 +364,6 @@ def test_what_can_not_be_used_is_told(session, outputs, people, small_camera):
     broken.components[0].weight = 2.0
     assert one.take(P1, broken).faults
     assert one.state.counts == {'received': 5, 'converted': 1, 'skipped': 4}
-
-
-def test_time_that_jumps_back(session, outputs, people):
-    one = session(reset_on_time_jump=True)
-    one.take(P2, people(9))
-    one.take(P1, people(9))
-    one.take(P1, people(0))
-    # Another body, as the track before has ended.
-    assert tracked(outputs)[-1] == ['p1_2']
 
 
 def test_the_same_messages_give_the_same_bytes(session, outputs, people, small_camera):

@@ -1,7 +1,5 @@
 """Keypoints in the plane and in space that come to the filter, and what their names mean."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -32,11 +30,6 @@ def session(stub_tracker, subject_file, outputs, small_camera):
 def seen(stub_tracker):
     """Keypoints of each image."""
     return [keypoints for _, keypoints in stub_tracker.made[0].seen]
-
-
-def tracked(outputs):
-    """Stamps of the images that were tracked."""
-    return [output.stamp_ns for output in outputs if output.topic == 'pose_mixture']
 
 
 @pytest.mark.parametrize(
@@ -102,34 +95,6 @@ def test_positions_in_space_join_the_keypoints_by_name(session, small_camera, st
     (keypoints,) = seen(stub_tracker)
     assert keypoints.names == ('head', 'pelvis', 'left_elbow')
     np.testing.assert_array_equal(keypoints.positions, [[2, 0, 0], [1, 0, 0], [np.nan] * 3])
-
-
-def test_positions_in_space_are_not_used_unless_asked_for(session, small_camera, stub_tracker):
-    one = session()
-    one.take(KEYPOINTS_3D, small_camera.keypoints_3d(0))
-    one.take(KEYPOINTS, small_camera.keypoints(0))
-    one.take(IMAGE, small_camera.image(0))
-    (keypoints,) = seen(stub_tracker)
-    assert keypoints.positions is None
-
-
-@pytest.mark.usefixtures('few_wait')
-def test_images_wait_for_positions_in_space(session, small_camera, stub_tracker, outputs):
-    one = session(use_keypoints_3d=True, input_timeout=0.25, queue_size=3)
-    for index in range(2):
-        one.take(KEYPOINTS, small_camera.keypoints(index))
-        one.take(IMAGE, small_camera.image(index))
-    assert tracked(outputs) == []
-    # Positions of nobody are an answer, and those of a later image are one for all before.
-    one.take(KEYPOINTS_3D, small_camera.keypoints_3d(1, names=()))
-    assert tracked(outputs) == [small_camera.stamp(0), small_camera.stamp(1)]
-    assert [keypoints.positions for keypoints in seen(stub_tracker)] == [None, None]
-    one.parameters = replace(one.parameters, input_timeout=60.0)
-    handled = []
-    for index in range(2, 6):
-        one.take(KEYPOINTS, small_camera.keypoints(index))
-        handled.append(one.take(IMAGE, small_camera.image(index)))
-    assert 'no keypoints_3d of its stamp has come' in handled[-1].faults[0]
 
 
 def test_positions_that_can_not_be_used_are_told(session, small_camera, stub_tracker):

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
@@ -14,8 +13,6 @@ from hmt_ros.sessions.image_inputs import DETECTIONS
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.messages.headers import header_message
-
-COCO = schemes()['coco17'].names
 
 
 @pytest.fixture
@@ -146,14 +143,6 @@ def test_detections_that_can_not_be_used_are_told(session, small_camera):
     # It counts as none: the image need not wait for it.
     one.take(IMAGE, small_camera.image(0))
     assert one.state.counts['tracked'] == 1
-
-
-@pytest.mark.parametrize('kind', [FilterParameters, BmeParameters])
-def test_parameters(kind):
-    with pytest.raises(ValueError, match=r"source must be one of .* saw 'pigeon'"):
-        kind(source='pigeon')
-    with pytest.raises(ValueError, match=r"keypoint_scheme must be one of .* saw 'coco'"):
-        kind(keypoint_scheme='coco')
 
 
 def test_where_time_begins_again_a_person_is_chosen_anew(session, seen, small_camera, stub_tracker):

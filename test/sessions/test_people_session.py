@@ -18,7 +18,6 @@ from hmt_ros.tracking import Status
 from hmt_ros.tracking.beginning import Source
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.detections import (
-    NO_KEYPOINTS,
     PEOPLE_2D,
     DetectedPerson,
     people_message,
@@ -234,16 +233,6 @@ def test_bad_people_are_told_once(session, outputs, small_camera, people, text):
     assert len(one.state.people) == 2
 
 
-def test_messages_that_contradict_themselves_are_no_detections(session, small_camera):
-    one = started(session(), small_camera)
-    message = seen(small_camera, 0, somebody_at(15))
-    message.ids.append('b')
-    (fault,) = one.take(DETECTIONS, message).faults
-    assert 'people: 2 ids with 1 keypoints, wanted 2 or none' in fault
-    assert one.take(IMAGE, small_camera.image(0)).faults == ()
-    assert StubTracker.made == []
-
-
 def test_detections_without_an_image_and_images_without_detections(session, small_camera):
     one = started(session(), small_camera)
     show(one, small_camera, 0, somebody_at(15))
@@ -255,12 +244,6 @@ def test_detections_without_an_image_and_images_without_detections(session, smal
     told = show(one, small_camera, 3, somebody_at(15))
     assert [x for x in told if 'no detections have come for the image' in x]
     assert one.state.counts['tracked'] == 4
-
-
-def test_a_few_joints_start_nobody(session, small_camera):
-    one = started(session(), small_camera)
-    show(one, small_camera, 0, somebody_at(15, names=NAMES[:4]))
-    assert one.state.followed == ()
 
 
 def test_the_same_person_twice_is_one(session, small_camera):
@@ -325,14 +308,6 @@ def test_an_empty_scene_is_learned_until_somebody_comes(session, small_camera):
     assert StubTracker.made[0].background.frames == 6
 
 
-def test_a_scene_that_was_hardly_seen_is_not_used(session, small_camera):
-    one = started(session(), small_camera)
-    show(one, small_camera, 0)
-    show(one, small_camera, 1, somebody_at(15))
-    show(one, small_camera, 2, somebody_at(15))
-    assert StubTracker.made[0].background.frames == 0
-
-
 def test_somebody_at_the_border(session, small_camera):
     one = started(session(use_keypoints=False), small_camera)
     show(one, small_camera, 0, somebody_at(-5, box=(-10.0, 5.0, 3.0, 40.0)))
@@ -373,32 +348,6 @@ def test_parameters_of_one_person_are_refused(values, text):
     with pytest.raises(ValueError, match=r'.') as error:
         with_values(PeopleParameters(), values)
     assert text in str(error.value)
-
-
-def test_a_message_and_its_people():
-    from msg_tools import RosbagsMessages
-
-    people = [somebody_at(15, 'a', box=(1.0, 2.0, 30.0, 40.0)), DetectedPerson('b', NO_KEYPOINTS)]
-    message = people_message(RosbagsMessages(), people, 5, 'lens')
-    again = people_of_message(message, 0.0)
-    assert [x.name for x in again] == ['a', 'b']
-    assert again[0].box == (1.0, 2.0, 30.0, 40.0)
-    np.testing.assert_array_equal(again[0].keypoints.pixels, people[0].keypoints.pixels)
-    assert again[1].box is None
-    assert again[1].extent is None
-
-
-def test_what_is_needed(session, small_camera):
-    one = session(fixed_frame='odom')
-    needed = [(each.sources, each.with_each) for each in one.needed_inputs()]
-    assert needed == [
-        (('image',), False),
-        (('camera_info',), False),
-        (('detections',), True),
-        (('tf', 'tf_static'), False),
-    ]
-    started(one, small_camera)
-    assert ('camera_info',) not in [each.sources for each in one.needed_inputs()]
 
 
 def test_a_moved_camera_is_told_once_for_all(session, small_camera, tmp_path):

@@ -57,22 +57,6 @@ def test_frames_that_agree_or_are_not_named_are_no_warning(one, small_camera):
     assert one.state.faults == {}
 
 
-def test_frames_without_end_are_not_remembered(one, small_camera):
-    one.take(CAMERA_INFO, small_camera.info())
-    handled = [
-        one.take(IMAGE, small_camera.image(index, frame_id=f'lens{index}')) for index in range(30)
-    ]
-    assert sum(len(each.warnings) for each in handled) == 8
-
-
-def test_an_uncalibrated_camera_is_named_with_its_topic(one, small_camera):
-    (text,) = one.take(CAMERA_INFO, small_camera.uncalibrated()).warnings
-    assert text.startswith('camera_info on /cam/camera_info has k[0] = 0: uncalibrated; ')
-    assert one.state.wants == f'a calibrated camera_info; {text}'
-    one.take(CAMERA_INFO, small_camera.info())
-    assert 'uncalibrated' not in one.state.wants
-
-
 @pytest.mark.parametrize(
     ('weights', 'nats'),
     [([1.0], 0.0), ([0.25] * 4, math.log(4)), ([0.5, 0.5, 0.0], math.log(2)), ([], math.nan)],

@@ -13,7 +13,6 @@ from hmt_ros.sessions.smoothed_messages import TOPICS
 from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.track_messages import links_of
-from hmt_ros.smoothing import MixtureSmoother
 from hmt_ros.smoothing.likelihood import counted, or_missed
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import EARLIEST_NS, header_message, time_ns
@@ -232,22 +231,6 @@ def test_a_camera_that_jumps(session, outputs, likelihoods):
     np.testing.assert_allclose(depths[15:], 6.0, atol=0.1)
 
 
-def test_one_mode_at_each_time_and_gaps(session, outputs, likelihoods):
-    """There is one motion, whatever is missing of it."""
-    one = session(fixed_lag=0.5, longest_interval=0.5)
-    seen = [*range(5), *range(20, 25), 60]
-    for index in seen:
-        mixture = likelihoods.mixture(index)[np.array([0])].normalised()
-        assert one.take(MIXTURE, likelihoods.message(index, mixture=mixture)).faults == ()
-    one.finish()
-    assert smoothed(outputs) == [likelihoods.stamp(index) for index in seen]
-    assert one.state.gaps == 2
-    for message in read(outputs, 'smoothed_pose_mixture'):
-        content = pose_mixture_of(message)
-        assert len(content.weights) == 1
-        assert np.linalg.eigvalsh(content.covariances[0]).min() > 0
-
-
 def test_a_track_that_ends_and_begins_in_a_window(session, outputs, likelihoods):
     one = session(fixed_lag=1.0)
     for index in range(4):
@@ -317,19 +300,6 @@ def test_a_motion_passes_over_an_image_that_is_all_wrong(session, outputs, likel
     assert max(turned) < 0.3
 
 
-def test_another_track_is_another_window(session, outputs, likelihoods):
-    one = session()
-    for index, track in enumerate((1, 1, 2, 2)):
-        message = likelihoods.message(index)
-        message.track_id = track
-        handled = one.take(MIXTURE, message)
-        assert bool(handled.warnings) == (index == 2)
-    assert one.state.window == 2
-    one.finish()
-    tracks = [message.track_id for message in read(outputs, 'smoothed_pose_mixture')]
-    assert tracks == [1, 1, 2, 2]
-
-
 def test_motions_have_the_same_numbers_in_both_messages(session, outputs, likelihoods):
     one = session(max_trajectories=2)
     for index in range(6):
@@ -351,18 +321,6 @@ def test_motions_have_the_same_numbers_in_both_messages(session, outputs, likeli
     one.take(MIXTURE, change(likelihoods.message(7), track_id=8))
     one.take(MIXTURE, change(likelihoods.message(8), track_id=9))
     assert min(trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1]).identities) == 1
-
-
-def test_trajectories_need_no_kinematics(session, outputs, likelihoods):
-    one = session(max_trajectories=3)
-    for index in range(3):
-        one.take(MIXTURE, likelihoods.message(index))
-    body = likelihoods.body
-    content = trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1])
-    assert content.joint_names == body.joint_names
-    joints = body.joint_positions(content.means.reshape(-1, body.dimension))
-    assert content.joint_positions.shape == (3, 3, len(body.joint_names), 3)
-    np.testing.assert_allclose(content.joint_positions.reshape(joints.shape), joints, atol=1e-12)
 
 
 def test_trajectories(session, outputs, likelihoods):
@@ -397,14 +355,6 @@ def test_same_messages_same_bytes(session, outputs, likelihoods):
     assert outputs[:half] == outputs[half:]
 
 
-def test_what_nobody_wants_is_not_made(session, outputs, likelihoods):
-    one = session(wanted=lambda topic: topic == 'smoothed_joint_states')
-    for index in range(4):
-        one.take(MIXTURE, likelihoods.message(index))
-    assert {output.topic for output in outputs} == {'smoothed_joint_states'}
-    assert one.state.counts['smoothed'] == 4
-
-
 def test_transforms_are_the_links_of_the_heaviest_pose(session, outputs, likelihoods):
     one = session(publish_tf=True)
     for index in range(4):
@@ -427,21 +377,6 @@ def test_transforms_are_the_links_of_the_heaviest_pose(session, outputs, likelih
     one.take(MIXTURE, likelihoods.message(5))
     one.finish()
     assert len(read(outputs, '/tf')) == 4
-
-
-def test_variational_smoothing_is_chosen_by_a_parameter(session, likelihoods):
-    one = session(method='variational', max_trajectories=2, fixed_lag=0.1)
-    one.take(MIXTURE, likelihoods.message(0))
-    assert type(one._window.smoother) is MixtureSmoother
-    assert one.state.counts['smoothed'] == 1
-
-
-@pytest.mark.parametrize('model', ['constant_velocity', 'learned'])
-def test_motion_models_with_velocities(model, session, outputs, likelihoods):
-    one = session(dynamics=SmootherDynamics(model=model))
-    for index in range(4):
-        assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
-    assert len(smoothed(outputs)) == 2
 
 
 def test_mixtures_without_lengths_are_about_the_model(session, outputs, likelihoods):
@@ -544,6 +479,14 @@ BAD = {
     'not finite': (nan_in_mean, 'mixture: mean has values that are not finite'),
     'not positive definite': (lambda m: covariance_of(m, 1.0), 'is not positive definite'),
     'weight': (lambda m: change(m.components[0], weight=3.0) and m, 'weights that sum to 3.4'),
+    'size of the shape': (
+        lambda m: change(m, shape_covariance=np.zeros(36)),
+        'mixture: shape_covariance has 36 values, wanted 1369',
+    ),
+    'negative shape': (
+        lambda m: change(m, shape_covariance=-np.eye(37).reshape(-1)),
+        'covariance of the shape is not positive definite',
+    ),
     'body': (
         lambda m: change(m, body_model='horse'),
         "no body 'horse': wanted one of",
@@ -566,36 +509,6 @@ def test_bad_mixtures_are_skipped(session, outputs, likelihoods, name):
     assert one.state.counts == {'received': 4, 'smoothed': 2, 'skipped': 2}
     one.finish()
     assert smoothed(outputs) == [likelihoods.stamp(0), likelihoods.stamp(3)]
-
-
-@pytest.mark.parametrize(
-    ('shape', 'text'),
-    [
-        (np.zeros(36), 'mixture: shape_covariance has 36 values, wanted 1369'),
-        (-np.eye(37), 'covariance of the shape is not positive definite'),
-        (np.full((37, 37), np.nan), 'covariance of the shape has values that are not finite'),
-    ],
-)
-def test_unknown_shapes_that_can_not_be(session, likelihoods, shape, text):
-    one = session()
-    one.take(MIXTURE, likelihoods.message(0))
-    message = change(likelihoods.message(1), shape_covariance=shape.reshape(-1))
-    (fault,) = one.take(MIXTURE, message).faults
-    assert text in fault
-    assert one.take(MIXTURE, likelihoods.message(2)).faults == ()
-
-
-def test_every_kind_of_fault_is_told_once(session, likelihoods):
-    one = session()
-    one.take(MIXTURE, likelihoods.message(0))
-    warnings = []
-    for _ in range(2):
-        for spoil, _ in BAD.values():
-            warnings += one.take(MIXTURE, spoil(likelihoods.message(1))).warnings
-        warnings += one.take(MIXTURE, likelihoods.message(0)).warnings
-    assert len(warnings) == len(BAD) + 1
-    assert one.state.faults['names'] == one.state.faults['covariances'] == 2
-    assert one.state.faults['time stands still'] == 2
 
 
 def test_time_that_stands_still_or_jumps_back_is_skipped(session, outputs, likelihoods):
@@ -688,19 +601,6 @@ def test_a_span_is_smoothed_on_demand(session, likelihoods):
     one.restart()
     with pytest.raises(ValueError, match='none is'):
         one.smooth_span()
-
-
-@pytest.mark.parametrize(
-    ('values', 'message'),
-    [
-        ({'method': 'guess'}, "method must be one of .* saw 'guess'"),
-        ({'dynamics.model': 'jump'}, 'there is no parameter dynamics.model'),
-        ({'fixed_lag': -0.5}, 'between 0'),
-    ],
-)
-def test_parameters_that_can_not_be(values, message):
-    with pytest.raises(ValueError, match=message):
-        with_values(SmootherParameters(), values)
 
 
 def test_body_in_a_message_leads_to_no_file(session, likelihoods, tmp_path):
