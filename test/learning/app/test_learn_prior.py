@@ -10,7 +10,6 @@ import pytest
 
 import hmt_learning.app
 from hmt_learning.app import learn
-from hmt_learning.app.motions import people_in
 from hmt_ros.body import load_body
 from hmt_ros.body.angle_mixture import read_pose_prior
 from hmt_ros.body.mirror import mirror
@@ -143,15 +142,6 @@ def test_the_command_learns_chooses_and_tells(
     assert again.with_suffix('.npz').read_bytes() == output.read_bytes()
     assert learn.main(['prior', *rest, '-o', str(output)]) == 1
     assert 'exists: --overwrite replaces it' in capsys.readouterr().err
-
-
-def test_people_come_from_tables(folder: Path, tmp_path: Path) -> None:
-    table = tmp_path / 'index.csv'
-    table.write_text('file,subject,more\ntrain/lab_00_walk.bvh,07?,x\nlab_01_walk.bvh,08,y\n')
-    assert people_in([table]) == {'lab_00_walk': '07', 'lab_01_walk': '08'}
-    table.write_text('name,subject\n')
-    with pytest.raises(ValueError, match=r"index.csv: no column 'file'"):
-        people_in([table])
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from hmt_learning.app import train
@@ -62,17 +61,6 @@ def test_procedural_motions_give_a_model_and_figures(
     assert train.main([*arguments, '-o', str(again), '--quiet']) == 0
     assert again.read_bytes() == output.read_bytes()
     assert capsys.readouterr().out == ''
-
-
-@pytest.mark.usefixtures('no_figures')
-@pytest.mark.parametrize('model', ['nearest', 'joint'])
-def test_models_by_name(model: str, tmp_path: Path) -> None:
-    output = tmp_path / 'model.npz'
-    arguments = ['--motions', 'walk', '--samples', '90', '--model', model, '--experts', '2']
-    assert train.main([*arguments, '-o', str(output), '--no-dynamics', '--quiet']) == 0
-    predictor = PosePredictor.load(output)
-    assert predictor.dynamics is None
-    assert predictor.notes['model'] == model
 
 
 @pytest.mark.usefixtures('no_figures')
@@ -151,19 +139,3 @@ def test_bad_input_is_one_line(
     assert 'none of the 1 motions' in _fails(given, capsys)
     assert "no motion is called 'x*'" in _fails([*given, '--without', 'x*'], capsys)
     assert not Path(output).exists()
-
-
-def test_a_network_needs_what_learns_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr('hmt_learning.training.network_learning.find_spec', lambda _: None)
-    assert train.main(['-o', str(tmp_path / 'm.npz'), '--motions', 'walk']) == 1
-    assert 'pip install jax optax' in capsys.readouterr().err
-
-
-def test_a_model_that_is_there_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / 'm.npz'
-    np.savez(output, a=np.zeros(3))
-    before = output.read_bytes()
-    assert '--overwrite' in _fails(['-o', str(output), '--motions', 'walk'], capsys)
-    assert output.read_bytes() == before

@@ -6,7 +6,6 @@ import pytest
 from hmt_learning.training.predictor_learning import (
     KINDS,
     affinities,
-    multimodality,
     new_model,
     target_basis,
 )
@@ -33,21 +32,6 @@ def test_affinities() -> None:
     np.testing.assert_allclose(np.diag(found), 1.0)
     off = found[~np.eye(20, dtype=bool)]
     assert np.median(off) == pytest.approx(np.exp(-0.5), rel=0.05)
-
-
-def test_multimodality_counts_branches() -> None:
-    rng = np.random.default_rng(1)
-    groups = np.repeat(np.arange(6), 40)
-    inputs = np.stack([10.0 * groups, 0 * groups], axis=1) + 0.01 * rng.normal(size=(240, 2))
-    branch = np.where(groups < 3, 0, np.arange(240) % 2)  # three groups have two poses each
-    targets = np.stack([10.0 * groups, 100.0 * branch], axis=1) + 0.01 * rng.normal(size=(240, 2))
-    found = multimodality(inputs, targets, 9, seed=3)
-    assert len(found) >= 2
-    assert found.sum() <= 9
-    alone = multimodality(inputs, inputs, 6, seed=3)
-    np.testing.assert_array_equal(alone, [6])
-    with pytest.raises(ValueError, match='clusters'):
-        multimodality(inputs, targets, 241)
 
 
 def test_the_metric_of_targets_is_that_of_joints() -> None:

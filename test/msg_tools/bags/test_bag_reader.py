@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import shutil
 import tempfile
 import tracemalloc
 from collections.abc import Callable
@@ -17,14 +16,12 @@ import pytest
 import yaml
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.cdr import serialise
-from msg_tools.messages.images import decode_image
 from msg_tools.messages.message_types import typestore
-from test.memory import forget_peak, peak_memory, resident_memory
 
 STRING = 'std_msgs/msg/String'
 
@@ -158,15 +155,6 @@ def test_files_compressed_as_a_whole(
     assert list(scratch.iterdir()) == []
 
 
-def test_compressed_file_that_was_cut(tmp_path: Path, small_bag: Path) -> None:
-    content = zstandard.compress((small_bag / 'small.mcap').read_bytes())
-    path = tmp_path / 'cut.mcap.zstd'
-    path.write_bytes(content[: len(content) // 2])
-    with BagReader(path) as bag:
-        assert bag.cut_off == (str(path),)
-        assert 0 < len(list(bag.messages())) < 40
-
-
 @pytest.mark.parametrize(
     'mode', [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE]
 )
@@ -221,38 +209,6 @@ def test_a_known_type_in_another_version_is_read_by_its_own_definition(tmp_path:
             # Of those of the project every field is read.
             with pytest.raises(BagError, match='recorded with another definition of this type'):
                 _ = stored.message
-
-
-def test_bytes_behind_a_message_are_ignored(tmp_path: Path, messages: RosbagsMessages) -> None:
-    path = tmp_path / 'long.mcap'
-    write_mcap(path, [(1, text(messages, 'text') + b'\xab' * 8)])
-    assert values(path) == [(1, 'text')]
-
-
-def test_big_endian_messages(tmp_path: Path, messages: RosbagsMessages) -> None:
-    path = tmp_path / 'big.mcap'
-    state = messages.create('sensor_msgs/msg/JointState', name=['a'], position=[1.5, -2.0])
-    data = bytes(typestore().serialize_cdr(state, state.__msgtype__, little_endian=False))
-    definition, _ = typestore().generate_msgdef(state.__msgtype__, ros_version=2)
-    write_mcap(path, [(1, data)], msgtype=state.__msgtype__, definition=definition.encode())
-    with BagReader(path) as bag:
-        (stored,) = bag.messages()
-        assert stored.message.position.tolist() == [1.5, -2.0]
-
-
-def test_relative_names_mean_topics_in_a_namespace(
-    tmp_path: Path, messages: RosbagsMessages
-) -> None:
-    with BagWriter(tmp_path / 'bag') as writer:
-        for topic in ('/p/body', '/p/note', '/q/note'):
-            writer.write(topic, 1, messages.create(STRING, data=topic))
-    with BagReader(tmp_path / 'bag') as bag:
-        assert [m.message.data for m in bag.messages(['body', 'q/note'])] == ['/p/body', '/q/note']
-        with pytest.raises(BagError, match='several topics note: name one of /p/note, /q/note'):
-            bag.topic('note')
-        for absolute in ('/body', '/note'):
-            with pytest.raises(BagError, match=f'has no topic {absolute}; it has /p/body, '):
-                bag.topic(absolute)
 
 
 def test_find_topic(tmp_path: Path, messages: RosbagsMessages) -> None:
@@ -492,18 +448,6 @@ def test_lengths_are_not_believed(
     assert peak < 5e6
 
 
-def test_statistics_with_a_total_only(tmp_path: Path, messages: RosbagsMessages) -> None:
-    path = tmp_path / 'total.mcap'
-    write_mcap(path, [(i, text(messages, 'text')) for i in range(3)], enable_crcs=False)
-    content = path.read_bytes()
-    place = content.rindex(b'\x0b' + (56).to_bytes(8, 'little'))
-    total = b'\x0b' + (46).to_bytes(8, 'little') + content[place + 9 : place + 51] + bytes(4)
-    path.write_bytes(content[:place] + total + content[place + 65 :])
-    with BagReader(path) as bag:
-        assert bag.message_count() == 3
-        assert len(list(bag.messages())) == 3
-
-
 def test_a_cut_is_told_in_one_line(
     tmp_path: Path, small_bag: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -597,73 +541,3 @@ def test_collected_bags_read_wholly_or_say_why_not(
                 assert len(found) == int(row['messages']), row['file']
         seen += 1
     assert seen >= 35
-
-
-def test_collected_files_cost_little_and_leave_nothing(shared: Path) -> None:
-    """All files of the conformance suite, all other recordings: memory, open files, folders."""
-    paths = [
-        path
-        for path in sorted((shared / 'mcap').rglob('*'))
-        if path.suffix in ('.mcap', '.db3', '.bag', '.zstd')
-    ]
-    assert sum('conformance' in path.parts for path in paths) == 416
-    everything_of(paths[0])
-    opened = len(list(Path('/proc/self/fd').iterdir()))
-    before = set(Path(tempfile.gettempdir()).glob('bag_reader.*'))
-    for path in paths:
-        forget_peak()
-        resident = resident_memory()
-        everything_of(path)
-        # Chunks of others may have several megabytes.
-        assert peak_memory() - resident < 64e6, path
-    assert len(list(Path('/proc/self/fd').iterdir())) == opened
-    assert set(Path(tempfile.gettempdir()).glob('bag_reader.*')) <= before
-
-
-def everything_of(path: Path) -> None:
-    """Reads a bag and keeps nothing; what is wrong with it is one line."""
-    try:
-        with BagReader(path) as bag:
-            for stored in bag.messages():
-                assert stored.message is not None
-    except BagError as error:
-        line = str(error)
-        assert '\n' not in line
-
-
-def test_collected_bags_in_detail(shared: Path, read: Callable[[Path], Any]) -> None:
-    folder = shared / 'mcap' / 'ros2_misc'
-    whole, _ = read(folder / 'rosout_diagnostics_zstd.mcap')
-    assert len(whole) == 14
-    assert read(folder / 'whole_file.mcap.zstd') == (whole, None)
-    assert len(read(folder / 'truncated.mcap')[0]) == 14
-    with BagReader(shared / 'mcap' / 'camera' / 'soccer_goal_12.mcap') as bag:
-        # Message by message compressed, and of a type without its middle part.
-        assert bag.find_topic(['sensor_msgs/msg/Image']).message_count == 2
-        for stored in bag.messages():
-            picture = decode_image(stored.message)
-            assert picture.shape == (stored.message.height, stored.message.width, 3)
-            assert picture.std() > 10
-    with pytest.raises(
-        BagError, match=r'soccer_goal_0\.mcap, which its metadata names, is missing'
-    ):
-        _open_soccer_goal(shared)
-
-
-def _open_soccer_goal(shared: Path) -> None:
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as name:
-        source = shared / 'mcap' / 'camera'
-        shutil.copy(source / 'soccer_goal_metadata.yaml', Path(name) / 'metadata.yaml')
-        BagReader(name)
-
-
-def test_agrees_with_the_reader_of_rosbags(shared: Path) -> None:
-    path = shared / 'video' / 'walk'
-    with Reader(path) as reader:
-        wanted = [(time, c.topic, bytes(data)) for c, time, data in reader.messages()]
-    with BagReader(path) as bag:
-        found = [(m.log_time_ns, m.topic, bytes(m.data)) for m in bag.messages()]
-        assert bag.message_count() == len(found) == 240
-    assert found == wanted

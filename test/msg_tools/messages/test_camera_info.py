@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera
-from msg_tools import BagReader, RosbagsMessages
+from msg_tools import RosbagsMessages
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info, camera_info_message
 
 K = [600.0, 0.0, 321.5, 0.0, 590.0, 243.25, 0.0, 0.0, 1.0]
@@ -152,12 +152,3 @@ def test_round_trip(messages: RosbagsMessages, model: str, coefficients: tuple[f
     assert message.p.tolist() == [600.0, 0, 321.5, 0, 0, 590.0, 243.25, 0, 0, 0, 1, 0]
     assert message.r.tolist() == np.eye(3).ravel().tolist()
     assert message.header.frame_id == 'camera'
-
-
-@pytest.mark.parametrize('name', ['walk', 'exercise', 'charleston', 'park_walk', 'leaflet'])
-def test_cameras_of_the_videos(shared: Any, name: str) -> None:
-    with BagReader(shared / 'video' / name) as bag:
-        topic = bag.find_topic(['sensor_msgs/msg/CameraInfo'])
-        camera = camera_from_info(next(bag.messages([topic.name])).message)
-    assert camera.width in (640, 1061, 576)
-    assert 0.5 < camera.fx / camera.width < 3

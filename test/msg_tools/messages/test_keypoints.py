@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hmt_ros.body import load_body
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.keypoints import (
@@ -42,12 +41,6 @@ def test_fields_become_arrays(messages: RosbagsMessages) -> None:
     np.testing.assert_array_equal(again.covariances, content.covariances)
 
 
-def test_what_is_empty_is_filled_in(messages: RosbagsMessages) -> None:
-    content = keypoints_of(message(messages, covariance=[], confidence=[]), 3.0)
-    np.testing.assert_array_equal(content.covariances[0], 9 * np.eye(2))
-    np.testing.assert_array_equal(content.confidences, [1, 0, 1])
-
-
 def test_what_was_not_seen_has_no_place_and_no_confidence(messages: RosbagsMessages) -> None:
     changed = message(
         messages,
@@ -61,13 +54,6 @@ def test_what_was_not_seen_has_no_place_and_no_confidence(messages: RosbagsMessa
     np.testing.assert_array_equal(content.seen, [False, False, False, True, True, False])
     np.testing.assert_array_equal(content.confidences, [0, 0, 0, 0.5, 1, 0])
     np.testing.assert_array_equal(content.covariances[[0, 1, 2, 5]], np.tile(np.eye(2), (4, 1, 1)))
-
-
-def test_covariance_of_a_joint_that_was_not_seen_does_not_matter(messages: RosbagsMessages) -> None:
-    covariance = np.tile([4.0, 1.0, 1.0, 9.0], 3)
-    covariance[4:8] = np.nan
-    content = keypoints_of(message(messages, covariance=covariance), 3.0)
-    np.testing.assert_array_equal(content.covariances[1], np.eye(2))
 
 
 @pytest.mark.parametrize(
@@ -101,14 +87,6 @@ def test_messages_that_contradict_themselves(
     with pytest.raises(MessageError, match=error) as caught:
         keypoints_of(message(messages, **changes), 3.0)
     assert '\n' not in str(caught.value)
-
-
-def test_other_names_of_joints_are_those_of_the_body(messages: RosbagsMessages) -> None:
-    body = load_body('human37')
-    changed = message(messages, names=['neck', 'left_foot_index', 'tail'])
-    known, strange = keypoints_of(changed, 3.0).named_for(body)
-    assert (known.names, strange) == (('neck', 'left_toe'), ['tail'])
-    np.testing.assert_array_equal(known.pixels, [[10, 20], [np.nan, np.nan]])
 
 
 def message_3d(messages: RosbagsMessages, **changes: Any) -> Any:

@@ -61,17 +61,6 @@ def test_heaviest_first_and_least_transparent(messages: RosbagsMessages) -> None
     assert found[2].color.r < found[2].color.b
 
 
-def test_lightest_modes_are_left_out(messages: RosbagsMessages) -> None:
-    found = markers(messages, ranks=2)
-    assert [m.ns for m in found] == ['mode_0', 'mode_0', 'mode_1', 'mode_1']
-    assert found[3].points[0].x == POSITIONS[2, 0, 0]
-
-
-def test_no_modes_delete_everything(messages: RosbagsMessages) -> None:
-    found = markers(messages, joint_positions=np.zeros((0, 3, 3)), weights=[])
-    assert [m.action for m in found] == [DELETE] * 10
-
-
 def test_defects(messages: RosbagsMessages) -> None:
     with pytest.raises(MessageError, match=r'shape \(3, 3, 3\), wanted \(2, 3, 3\)'):
         markers(messages, weights=[0.5, 0.5])

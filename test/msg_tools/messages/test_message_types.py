@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 
 import msg_tools
 from msg_tools.messages.message_types import typestore, typestore_of_definition
@@ -20,24 +20,6 @@ def test_all_definitions_are_registered() -> None:
     assert typestore() is typestore()
     for name in ('tf2_msgs/msg/TFMessage', 'visualization_msgs/msg/MarkerArray'):
         assert name in typestore().types
-
-
-def test_constants_of_the_definition() -> None:
-    constants = {
-        name: value for name, _, value in typestore().fielddefs['hmt_msgs/msg/PoseMixture'][0]
-    }
-    assert constants == {
-        'POSTERIOR': 0,
-        'LIKELIHOOD': 1,
-        'PREDICTION': 2,
-        'SMOOTHED': 3,
-        'GROUND_TRUTH': 4,
-        'FORECAST': 5,
-        'STATE_UNKNOWN': 0,
-        'STATE_TRACKING': 1,
-        'STATE_LOST': 2,
-        'STATE_NOBODY': 3,
-    }
 
 
 @pytest.mark.parametrize('distribution', [Stores.ROS2_FOXY, Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY])
@@ -119,9 +101,3 @@ def test_types_that_can_not_be_known(
 ) -> None:
     with pytest.raises(ValueError, match=error):
         typestore_of_definition(msgtype, encoding, definition)
-
-
-def test_definitions_parse_one_by_one() -> None:
-    for path in DEFINITIONS.glob('*.msg'):
-        types = get_types_from_msg(path.read_text(), f'hmt_msgs/msg/{path.stem}')
-        assert list(types) == [f'hmt_msgs/msg/{path.stem}']

@@ -200,14 +200,6 @@ def test_whose_poses_they_are() -> None:
     assert caught.value.fault == 'names'
 
 
-def test_equal_weights_keep_their_order(
-    pose_mixture: PoseMixture, messages: RosbagsMessages
-) -> None:
-    even = replace(pose_mixture, weights=np.full(3, 1 / 3))
-    back = pose_mixture_of(pose_mixture_message(messages, even))
-    np.testing.assert_array_equal(back.means, pose_mixture.means)
-
-
 def bend(path: str, value: Any) -> Callable[[Any], None]:
     """Sets a field of a message, or of a component as '0.mean'."""
 
@@ -266,33 +258,6 @@ def test_messages_that_contradict_themselves(
     with pytest.raises(MessageError, match=error) as caught:
         pose_mixture_of(message)
     assert '\n' not in str(caught.value)
-
-
-def test_another_body(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
-    message = pose_mixture_message(messages, pose_mixture)
-    with pytest.raises(MessageError, match=r'dof_names has 4 names, wanted 2'):
-        pose_mixture_of(message, ['root_x', 'bend'])
-    with pytest.raises(MessageError, match=r"dof_names has 'root_yy' at 1, wanted 'root_y'"):
-        pose_mixture_of(message, ['root_x', 'root_y', 'root_zzz', 'bend'])
-    with pytest.raises(MessageError, match=r"joint_names has 'pelvis' at 0, wanted 'head'"):
-        pose_mixture_of(message, None, ['head', 'pelvis'])
-
-
-@pytest.mark.parametrize(
-    ('changes', 'error'),
-    [
-        ({'dof_names': ('a', 'b')}, r'means has shape \(3, 4\), wanted \(3, 2\)'),
-        ({'joint_names': ('a',)}, r'joint_positions has shape \(3, 2, 3\), wanted \(3, 1, 3\)'),
-        ({'joint_positions': np.full((3, 2, 3), np.nan)}, r'joint_positions has values'),
-        ({'log_likelihoods': np.zeros(2)}, r'log_likelihoods has shape \(2,\), wanted \(3,\)'),
-        ({'weights': np.ones(3)}, r'weights that sum to 3, wanted 1'),
-    ],
-)
-def test_content_that_no_message_may_have(
-    pose_mixture: PoseMixture, changes: dict[str, Any], error: str
-) -> None:
-    with pytest.raises(MessageError, match=error):
-        replace(pose_mixture, **changes)
 
 
 def test_more_components_than_anybody_publishes(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.body import load_body
 from msg_tools import GeneratedMessages, MessageError, MessageFactory, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
-from msg_tools.messages.headers import header_message, time_message, time_ns
+from msg_tools.messages.headers import time_ns
 from msg_tools.messages.message_error import lengths_of
 from msg_tools.messages.pose_mixtures import PoseMixture
 from msg_tools.messages.states import (
@@ -23,14 +22,6 @@ from msg_tools.messages.states import (
     transforms_message,
 )
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
-
-
-@pytest.mark.parametrize('stamp', [0, 1, 999_999_999, 10**9, 1_700_000_000_123_456_789])
-def test_time_round_trip(messages: RosbagsMessages, stamp: int) -> None:
-    time = time_message(messages, stamp)
-    assert time_ns(time) == stamp
-    assert 0 <= time.nanosec < 10**9
-    assert time_ns(header_message(messages, stamp, 'camera').stamp) == stamp
 
 
 def test_joint_state_of_the_heaviest(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
@@ -118,29 +109,6 @@ def test_transforms(messages: RosbagsMessages) -> None:
     assert (second.transform.translation.x, second.transform.translation.z) == (3.0, 5.0)
     np.testing.assert_allclose(second.transform.rotation.z, np.sqrt(0.5), atol=1e-15)
     assert second.header.stamp.nanosec == 7
-
-
-@pytest.mark.parametrize(
-    ('changes', 'error'),
-    [
-        ({'parents': ['a']}, r'1 parents, 2 children'),
-        ({'rotations': np.eye(3)}, r'rotations \(3, 3\)'),
-        ({'translations': np.zeros((3, 3))}, r'translations \(3, 3\)'),
-        ({'translations': np.full((2, 3), np.nan)}, r'is not finite'),
-    ],
-)
-def test_transforms_that_do_not_fit(
-    messages: RosbagsMessages, changes: dict[str, Any], error: str
-) -> None:
-    arguments: dict[str, Any] = {
-        'parents': ['a', 'b'],
-        'children': ['b', 'c'],
-        'rotations': np.tile(np.eye(3), (2, 1, 1)),
-        'translations': np.zeros((2, 3)),
-        'stamp_ns': 0,
-    }
-    with pytest.raises(MessageError, match=error):
-        transforms_message(messages, **{**arguments, **changes})
 
 
 def test_body_message(messages: RosbagsMessages) -> None:

@@ -54,20 +54,6 @@ def test_round_trip_sorts_by_weight(messages: RosbagsMessages) -> None:
         assert getattr(back, name) == getattr(CONTENT, name)
 
 
-def test_without_joints(messages: RosbagsMessages) -> None:
-    content = replace(CONTENT, joint_names=(), joint_positions=None)
-    back = trajectory_mixture_of(trajectory_mixture_message(messages, content))
-    assert back.joint_names == ()
-    assert back.joint_positions is None
-
-
-def test_without_identities(messages: RosbagsMessages) -> None:
-    message = trajectory_mixture_message(messages, replace(CONTENT, identities=None))
-    assert trajectory_mixture_of(message).identities.tolist() == [0, 0]
-    with pytest.raises(MessageError, match=r'identities has shape \(3,\), wanted \(2,\)'):
-        replace(CONTENT, identities=np.arange(3))
-
-
 def test_without_covariances(messages: RosbagsMessages) -> None:
     content = replace(CONTENT, marginal_covariances=None)
     back = trajectory_mixture_of(trajectory_mixture_message(messages, content))
