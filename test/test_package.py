@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import os
 import re
 import runpy
@@ -15,7 +14,6 @@ import zipfile
 from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -27,7 +25,6 @@ from test.conftest import LONGEST
 
 ROOT = Path(__file__).resolve().parents[1]
 HMT_MSGS = ROOT / 'msg_tools' / 'hmt_msgs'
-INTERFACES = sorted([*HMT_MSGS.glob('msg/*.msg'), *HMT_MSGS.glob('srv/*.srv')])
 
 # An import points to the right, never to the left.
 LAYERS = [
@@ -119,21 +116,6 @@ def test_nothing_that_a_robot_has_imports_learning(module: str) -> None:
     assert names_learning(MODULES[module].read_text('utf-8')) == []
 
 
-@pytest.mark.parametrize(
-    'text',
-    [
-        'import numpy, hmt_learning.motion.rig',
-        'def f():\n    from hmt_learning.app import main',
-        "importlib.import_module('hmt_learning.app.train')",
-        "importlib.import_module(f'hmt_learning.app.{name}')",
-        "COMMANDS = {'train': ('hmt_learning.app.train', 'learn')}",
-        "__import__('hmt_learning')",
-    ],
-)
-def test_imports_of_learning_are_found(text: str) -> None:
-    assert len(names_learning(text)) == 1
-
-
 def test_every_module_belongs_to_a_layer() -> None:
     outside = {name for name in MODULES if layer_of(name) is None}
     assert outside <= {'hmt_ros', 'hmt_ros.__main__', 'hmt_ros.compiled_code'}
@@ -206,20 +188,6 @@ def test_versions_agree(setup_arguments: dict[str, Any]) -> None:
         assert xml(folder / 'package.xml').findtext('version') == hmt_ros.__version__
 
 
-def test_launch_files_and_views_are_installed(setup_arguments: dict[str, Any]) -> None:
-    files = setup_arguments['data_files']
-    installed = {f'{target}/{Path(x).name}' for target, some in files for x in some}
-    wanted = ('launch/hmt.launch.py', 'launch/camera.launch.py', 'rviz/hmt.rviz')
-    wanted += ('foxglove/hmt.json', 'foxglove/hmt_bag.json', 'config/filter_node.yaml')
-    assert {f'share/hmt_ros/{name}' for name in wanted} <= installed
-
-
-def test_tests_are_found_by_colcon(setup_arguments: dict[str, Any]) -> None:
-    # colcon runs pytest where it sees it among the extras; with tests_require it runs nothing.
-    assert 'pytest' in setup_arguments['extras_require']['test']
-    assert 'tests_require' not in setup_arguments
-
-
 def test_dependencies_of_package_xml_cover_the_ros_packages_used() -> None:
     root = xml(ROOT / 'package.xml')
     declared = {element.text for element in root.iter() if element.tag.endswith('depend')}
@@ -227,12 +195,6 @@ def test_dependencies_of_package_xml_cover_the_ros_packages_used() -> None:
     used = {name for name in imported if name.endswith(('_msgs', '_interfaces')) or name == 'rclpy'}
     # hmt_msgs is built by setup.py or, if colcon is told of it, before: see test_workspace.py.
     assert used - {'hmt_msgs'} <= declared
-
-
-def test_every_interface_is_generated() -> None:
-    text = (HMT_MSGS / 'CMakeLists.txt').read_text('utf-8')
-    listed = {word for word in text.split() if word.endswith(('.msg', '.srv'))}
-    assert listed == {str(path.relative_to(HMT_MSGS)) for path in INTERFACES}
 
 
 def test_package_data_covers_every_data_file(setup_arguments: dict[str, Any]) -> None:
@@ -272,32 +234,6 @@ def test_changelog_can_be_released(folder: Path, tmp_path: Path) -> None:
     path.write_text(released, 'utf-8')
     parsed = changelog.get_changelog_from_path(str(path), name)
     assert len(parsed.get_content_of_version(version)) > 0
-
-
-@pytest.mark.ros
-@pytest.mark.parametrize('path', INTERFACES, ids=lambda path: path.stem)
-def test_generated_interface_imports(path: Path) -> None:
-    kind = path.parent.name
-    generated = getattr(importlib.import_module(f'hmt_msgs.{kind}'), path.stem)
-    definition = path.read_text('utf-8')
-    if kind == 'srv':
-        generated, definition = generated.Request, definition.partition('---')[0]
-    lines = [line.split('#')[0].split() for line in definition.splitlines()]
-    fields = [words[1] for words in lines if len(words) == 2 and '=' not in words[1]]
-    assert list(generated.get_fields_and_field_types()) == fields
-
-
-@pytest.mark.parametrize(
-    ('command', 'there', 'wanted'),
-    [('bdist_wheel', False, True), ('bdist_wheel', True, False), ('install', False, False)],
-)
-def test_a_wheel_requires_opencv_where_there_is_none(
-    command: str, there: bool, wanted: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done = SimpleNamespace(returncode=int(not there))
-    monkeypatch.setattr(subprocess, 'run', lambda *_, **__: done)
-    required = setup_arguments_of(command, monkeypatch)['install_requires']
-    assert ('opencv-python-headless' in required) == wanted
 
 
 def test_a_wheel_has_the_library_and_one_command(tmp_path: Path) -> None:
@@ -345,30 +281,6 @@ def test_a_wheel_has_the_library_and_one_command(tmp_path: Path) -> None:
     where, dimension = ran.stderr.split()
     assert Path(where).is_relative_to(tmp_path / 'site')
     assert dimension == '37'
-
-
-@pytest.mark.ros
-def test_executables_are_installed(setup_arguments: dict[str, Any]) -> None:
-    index = importlib.import_module('ament_index_python')
-    folder = Path(index.get_package_prefix('hmt_ros')) / 'lib' / 'hmt_ros'
-    for line in setup_arguments['entry_points']['console_scripts']:
-        executable = folder / line.split('=')[0].strip()
-        assert os.access(executable, os.X_OK), executable
-
-
-@pytest.mark.ros
-def test_data_files_are_installed() -> None:
-    index = importlib.import_module('ament_index_python')
-    prefix = Path(index.get_package_prefix('hmt_ros'))
-    assert (prefix / 'share' / 'hmt_ros' / 'package.xml').is_file()
-    site = next(prefix.rglob('msg_tools/__init__.py')).parents[1]
-    for package in ('hmt_ros', 'msg_tools'):
-        sources = {
-            path.relative_to(ROOT)
-            for suffix in ('yaml', 'msg', 'srv', 'html', 'css', 'js')
-            for path in (ROOT / package).rglob(f'*.{suffix}')
-        }
-        assert {path for path in sources if not (site / path).is_file()} == set()
 
 
 def test_tests_that_begin_first_exist() -> None:

@@ -233,14 +233,6 @@ def install_definitions(prefix: Path) -> Path:
     return share
 
 
-def test_messages_of_the_ros_environment_are_not_built_twice(
-    install_messages: Any, tmp_path: Path
-) -> None:
-    install_definitions(tmp_path / 'ros')
-    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
-    assert install_messages.calls == []
-
-
 def test_messages_with_other_definitions_are_built(install_messages: Any, tmp_path: Path) -> None:
     share = install_definitions(tmp_path / 'ros')
     (share / 'msg' / 'Body.msg').write_text('string name\n', 'utf-8')
@@ -252,55 +244,12 @@ def test_messages_with_other_definitions_are_built(install_messages: Any, tmp_pa
     assert environment['DESTDIR'] == ''
 
 
-def test_what_was_built_here_is_kept_up_to_date(install_messages: Any, tmp_path: Path) -> None:
-    """Also if the environment has the same definitions: the copy in the prefix comes first."""
-    install_definitions(tmp_path / 'ros')
-    (tmp_path / 'build').mkdir()
-    (tmp_path / 'build' / 'CMakeCache.txt').touch()
-    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
-    assert len(install_messages.calls) == 3
-
-
-def test_cmake_does_not_see_the_prefix_that_colcon_gives_to_setup_py(
-    install_messages: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folders = ['/build/prefix_override', '/colcon/colcon_distutils_commands', '/opt/ros/site']
-    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(folders))
-    monkeypatch.setenv('CMAKE_ARGS', '-DCMAKE_BUILD_TYPE=Release "-DX=a b"')
-    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '/root')
-    command, environment = install_messages.calls[0]
-    assert environment['PYTHONPATH'] == '/opt/ros/site'
-    assert environment['CMAKE_PREFIX_PATH'].startswith(str(tmp_path / 'ros'))
-    assert command[-2:] == ['-DCMAKE_BUILD_TYPE=Release', '-DX=a b']
-    assert environment['DESTDIR'] == '/root'
-
-
 def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_path: Path) -> None:
     install_messages.codes.append(1)
     with pytest.raises(SystemExit, match='rosdep install') as raised:
         install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
     assert len(str(raised.value).splitlines()) == 1
     assert len(install_messages.calls) == 1
-
-
-def test_without_a_ros_environment_nothing_is_built(
-    install_messages: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv('AMENT_PREFIX_PATH')
-    with pytest.raises(SystemExit, match=r'source /opt/ros/jazzy/setup\.bash'):
-        install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
-    assert install_messages.calls == []
-
-
-def test_only_an_installation_into_ros_builds_messages(
-    install_messages: Any, tmp_path: Path
-) -> None:
-    """pip, which gives no prefix, installs the library alone."""
-    assert not install_messages.in_colcon(tmp_path / 'install' / 'hmt_ros')
-    (tmp_path / 'install').mkdir()
-    (tmp_path / 'install' / '.colcon_install_layout').write_text('isolated\n', 'utf-8')
-    assert install_messages.in_colcon(tmp_path / 'install' / 'hmt_ros')
-    assert install_messages.in_colcon(tmp_path / 'install')
 
 
 @pytest.mark.parametrize(('variable', 'code'), [('', 0), ('', 1), ('later', 0)])
@@ -403,20 +352,6 @@ def test_without_network_the_rest_goes_on(clone: Path, what: str, calls: int) ->
     assert run_detector_stage(clone)[::2] == (0, 2)
 
 
-@pytest.mark.parametrize('target', ['setup', 'demo'])
-def test_setup_and_demo_install_the_detector_if_they_can(target: str) -> None:
-    makefile = (ROOT / 'Makefile').read_text('utf-8')
-    (recipe,) = re.findall(rf'^{target}:\n((?:\t.*\n)+)', makefile, re.M)
-    lines = [line.strip() for line in recipe.splitlines()]
-    place = lines.index('@$(WITH_DETECTOR)')
-    assert 'kernels' in lines[place - 1]
-    (command,) = re.findall(r'^WITH_DETECTOR := (.*)$', makefile, re.M)
-    for code, wanted in ((0, 0), (78, 0), (130, 1), (1, 1)):
-        shell = command.replace('$(WORKSPACE) detector', f'(exit {code})').replace('$$', '$')
-        done = subprocess.run(['bash', '-e', '-o', 'pipefail', '-c', shell], check=False)
-        assert done.returncode == wanted, code
-
-
 # ---- What colcon, rosdep and bloom read ----
 
 
@@ -457,31 +392,6 @@ def test_messages_alone_are_linked_into_a_workspace(tmp_path: Path) -> None:
     home = {**os.environ, 'HOME': str(tmp_path)}
     subprocess.run(['bash', '-c', line], cwd=folder, env=home, check=True)
     assert order(folder) == ['hmt_msgs', 'consumer', 'listener']
-
-
-def test_colcon_builds_the_messages_first_where_both_are_named(tmp_path: Path) -> None:
-    write_packages(tmp_path / 'src')
-    for name in ('colcon.pkg', 'package.xml', 'setup.py', 'setup.cfg', 'msg_tools/hmt_msgs'):
-        target = tmp_path / 'src' / 'hmt_ros' / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.symlink_to(ROOT / name)
-    assert order(tmp_path) == ['hmt_ros', 'consumer', 'listener']
-    text = (ROOT / 'docs' / 'workspace.md').read_text('utf-8')
-    (options,) = re.findall(r'^colcon build (--base-paths .*)$', text, re.M)
-    both = order(tmp_path, *options.split())
-    assert both == ['hmt_msgs', 'hmt_ros', 'consumer', 'listener']
-    described = yaml.safe_load((ROOT / 'colcon.pkg').read_text('utf-8'))
-    assert described == {'dependencies': ['hmt_msgs']}
-
-
-def test_metadata_of_a_release() -> None:
-    package = pytest.importorskip('catkin_pkg.package')
-    ours, *others = (package.parse_package(str(folder)) for folder in (ROOT, HMT_MSGS, EXAMPLES))
-    assert {url.type for url in ours.urls} == {'website', 'bugtracker', 'repository'}
-    assert ours.licenses == ['Apache-2.0']
-    for other in others:
-        assert [url.url for url in ours.urls] == [url.url for url in other.urls]
-        assert (ours.version, ours.licenses) == (other.version, other.licenses)
 
 
 # ---- A file that is not run here: its one command is ----

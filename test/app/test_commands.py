@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-import hmt_ros
 from hmt_ros.app import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -19,11 +18,6 @@ def test_help_names_all_commands(option, capsys):
         assert f'  {name}' in text
         assert what in text
     assert max(len(line) for line in text.splitlines()) <= 100
-
-
-def test_version(capsys):
-    assert main(['--version']) == 0
-    assert capsys.readouterr().out == f'hmt_ros {hmt_ros.__version__}\n'
 
 
 @pytest.mark.parametrize(
@@ -52,19 +46,6 @@ def test_commands_explain_themselves(command, capsys):
     assert main([command]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f'{command}: the following arguments are required')
-
-
-def test_module_is_the_command(tmp_path):
-    result = subprocess.run(
-        [sys.executable, '-m', 'hmt_ros', 'replay', 'none', '-o', str(tmp_path / 'new' / 'bag')],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 1
-    assert result.stderr.startswith('replay: ')
-    assert not any(tmp_path.iterdir())
 
 
 def output_of_reader_that_leaves(lines, *command):

@@ -87,30 +87,6 @@ def test_runtime_and_networks_are_installed_once(
     assert capsys.readouterr() == ('', '')
 
 
-def test_networks_of_another_release_are_replaced(
-    pip: Pip, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with_runtime(monkeypatch)
-    environment, _ = folders
-    environment.mkdir(parents=True)
-    (environment / 'pose_detection.tflite').write_bytes(b'old')
-    assert install_detector.main([]) == 0
-    assert (environment / 'pose_detection.tflite').read_bytes() == b'pose_detection.tflite'
-
-
-def test_the_users_folder_where_the_environments_can_not_be_written(
-    pip: Pip, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    environment, user = folders
-    monkeypatch.setattr(blazepose_models.os, 'access', lambda path, _: path != environment)
-    assert install_detector.main([]) == 0
-    assert len(list(user.iterdir())) == len(CONTENT)
-    assert not list(environment.iterdir())
-    monkeypatch.setattr(sys, 'executable', '/usr/bin/python3')
-    with pytest.raises(DetectorError, match=r'/usr/bin/python3 has no ai-edge-litert: run "ros2'):
-        require_network('pose_detection.tflite')
-
-
 def test_without_networks_one_line_says_what_to_do(
     folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,7 @@ from scipy.special import logsumexp
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.keypoint_schemes import usual_exchanges
-from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths, carrier_of
+from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths
 from hmt_ros.image.terms.keypoints import (
     LIFTED_SCALE,
     LIFTED_WEIGHT,
@@ -76,26 +76,6 @@ def test_energy_is_the_log_density_of_depths() -> None:
     assert np.ptp(np.array(found) - wanted) < 1e-8
 
 
-def test_a_limb_that_is_elsewhere_costs_so_much_at_most() -> None:
-    poses, x = lifted(components=1), pose()
-    bent = x.copy()
-    bent[[i for i, name in enumerate(BODY.dof_names) if name.startswith('left_elbow')]] += 1.5
-    change = energy(poses, bent, NOT_EXCHANGED) - energy(poses, x, NOT_EXCHANGED)
-    assert abs(change) < 2 * 0.5 * LIFTED_WEIGHT * LIFTED_SCALE**2  # wrist and hand
-
-
-def test_exchanged_sides_read_the_poses_the_other_way_round() -> None:
-    poses, x = lifted(), pose()
-    all_exchanged = np.array([[-np.inf, 0.0, -np.inf, -np.inf]])
-    difference = energy(poses, x, all_exchanged) - energy(poses.exchanged(), x, NOT_EXCHANGED)
-    other = energy(poses, pose(3), all_exchanged) - energy(
-        poses.exchanged(), pose(3), NOT_EXCHANGED
-    )
-    assert difference == pytest.approx(other, abs=1e-9)
-    twice = poses.exchanged().exchanged()
-    assert np.array_equal(twice.means, poses.means)
-
-
 @pytest.mark.parametrize('exchanges', [NOT_EXCHANGED, usual_exchanges()])
 def test_gradient(exchanges: np.ndarray) -> None:
     poses, x = lifted(), pose()
@@ -149,18 +129,3 @@ def test_sizes_keep_directions() -> None:
     knee, hip = JOINTS.index('left_knee'), JOINTS.index('left_hip')
     bone = poses.means[:, knee] - poses.means[:, hip]
     assert np.allclose(first[:, knee] - first[:, hip], bone * own[knee] / poses.lengths[knee])
-
-
-def test_a_missing_joint_is_skipped_in_the_chain() -> None:
-    assert carrier_of('left_wrist', ('left_shoulder', 'neck')) == 'left_shoulder'
-    assert carrier_of('left_wrist', ('left_ankle',)) == ''
-    assert carrier_of('head', ('neck',)) == 'neck'
-
-
-def test_wrong_shapes_are_refused() -> None:
-    poses = lifted()
-    with pytest.raises(ValueError, match='3 poses of 14 joints'):
-        LiftedPoses(
-            poses.joints, poses.log_weights, poses.means[:, :2], poses.deviations, poses.axes,
-            poses.lengths,
-        )  # fmt: skip

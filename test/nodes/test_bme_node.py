@@ -1,15 +1,10 @@
 """The BME node itself, over DDS."""
 
-from pathlib import Path
-
 import pytest
 
 from hmt_ros.sessions.bme_parameters import BmeParameters
 
 pytestmark = pytest.mark.ros
-
-ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / 'hmt_ros' / 'config' / 'bme_node.yaml'
 
 
 @pytest.fixture
@@ -74,80 +69,3 @@ def test_parameters_are_those_of_the_file(running):
     assert running.set(max_hypotheses=1, queue_size=3) == (True, '')
     assert running.session.parameters.max_hypotheses == 1
     assert running.limit('image') == 3
-
-
-def test_one_warning_for_each_kind_and_the_node_lives(running, somebody):
-    for make, indices in (
-        (lambda index: somebody.image(index, size=(32, 24)), (1, 2)),
-        (somebody.image, (2, 2)),
-        (somebody.image, (0, 1)),
-    ):
-        for index in indices:
-            assert len(running.send('image', make(index)).faults) == 1
-    running.send('camera_info', somebody.uncalibrated())
-    assert running.send('image', somebody.image(9)).faults == ()
-    wanted = (
-        '32x24 pixels',
-        'stamps that increase',
-        'reset_on_time_jump',
-        'k[0] = 0: uncalibrated',
-    )
-    running.spin_until(lambda: len(running.warnings()) >= len(wanted))
-    for text, part in zip(running.warnings(), wanted, strict=True):
-        assert part in text
-    _, _, values = running.diagnosis()
-    assert (values['images predicted'], values['images skipped']) == ('1', '6')
-
-
-def test_diagnostics(world, somebody):
-    from hmt_msgs.msg import PoseMixture
-
-    one = world(background_file='').start()
-    assert one.diagnosis()[:2] == (1, 'waits for a calibrated camera_info')
-    one.send('camera_info', somebody.info())
-    found = one.hear({'pose_prediction': PoseMixture})['pose_prediction']
-    for index in range(16):
-        one.send('image', somebody.empty(index))
-        one.spin_until(lambda count=index: len(found) > count)
-    one.send('image', somebody.image(16))
-    one.spin_until(lambda: 'predicting' in one.diagnostics[-1].status[0].message)
-    _, _, values = one.diagnosis()
-    assert one.diagnostics[-1].status[0].name == 'bme_node: prediction'
-    assert values['images without a person'] == '16'
-    assert values['height of the silhouette, px'] == '24'
-
-
-def test_lifecycle(world, somebody):
-    from hmt_msgs.srv import PredictPose
-
-    one = world(autostart=False)
-    one.node.start()
-    assert one.state == 'unconfigured'
-    assert one.change_state('configure')
-    answer = one.call(PredictPose, 'predict_pose', image=one.of_ros(somebody.image(0)))
-    assert 'no calibrated camera_info' in answer.message
-    assert one.change_state('activate')
-    one.connect()
-    one.send('camera_info', somebody.info())
-    assert one.send('image', somebody.image(0)).faults == ()
-    assert one.change_state('deactivate')
-    assert one.change_state('cleanup')
-    assert one.state == 'unconfigured'
-
-
-def test_a_model_that_is_none_is_told(tmp_path, world_of):
-    from hmt_ros.nodes.bme_node import BmeNode
-
-    path = tmp_path / 'model.npz'
-    path.write_bytes(b'garbage')
-    one = world_of(BmeNode, 'bme_node', {}, model_file=str(path))
-    one.node.start()
-    (text,) = one.errors()
-    assert text.startswith(f'{path}: ')
-
-
-def test_ends_cleanly(executable):
-    node = executable('bme_node', '--params-file', str(CONFIG))
-    *about_kernels, last = node.stop_at('images from /image')
-    assert about_kernels
-    assert 'images from /image' in last

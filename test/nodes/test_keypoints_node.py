@@ -16,7 +16,6 @@ from test.sessions.test_keypoints_session import STUB
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / 'hmt_ros' / 'config' / 'keypoints_node.yaml'
 CLIP = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video' / 'wander'
 
 
@@ -66,19 +65,6 @@ def test_images_become_keypoints(world, somebody, monkeypatch):
     one.assert_described(KeypointsParameters())
 
 
-def test_lifecycle(world, somebody, monkeypatch):
-    monkeypatch.setitem(DETECTORS, 'mediapipe', STUB)
-    one = world(autostart=False)
-    one.node.start()
-    assert one.change_state('configure')
-    assert one.change_state('activate')
-    one.connect()
-    assert one.send('image', somebody.image(0)).faults == ()
-    assert one.change_state('deactivate')
-    assert one.change_state('cleanup')
-    assert one.state == 'unconfigured'
-
-
 def test_without_a_detector_one_line_says_what_to_do(world, monkeypatch):
     for name in ('ai_edge_litert', 'ai_edge_litert.interpreter'):
         monkeypatch.setitem(sys.modules, name, None)
@@ -113,10 +99,3 @@ def test_mediapipe_pose_itself(world, mediapipe_pose):
     _, _, _, height = cv2.boundingRect(mask)
     seen = pixels[0]
     assert height == pytest.approx(np.ptp(seen[:, 1]), rel=0.3)
-
-
-def test_ends_cleanly(executable, mediapipe_pose):
-    node = executable('keypoints_node', '--params-file', str(CONFIG))
-    *others, _ = node.stop_at('images from /image')
-    # What runs the networks says that it does.
-    assert all(line.startswith('INFO: Created TensorFlow Lite') for line in others)

@@ -160,49 +160,6 @@ def test_known_stature_narrows_the_depth(session, somebody, stub_predictor):
     assert known < unknown / 2
 
 
-def test_what_is_strange_about_a_silhouette_is_told_once(session, somebody):
-    one = session()
-    one.take(CAMERA_INFO, somebody.info())
-    warnings = [one.take(IMAGE, somebody.at_the_border(index)).warnings for index in range(2)]
-    assert warnings == [(f'image of {somebody.stamp(0)} ns: cut at the left',), ()]
-    assert one.state.faults['silhouette'] == 2
-
-
-def test_time(session, outputs, somebody, stub_predictor):
-    one = session()
-    one.take(CAMERA_INFO, somebody.info())
-    one.take(IMAGE, somebody.image(3))
-    assert 'wanted stamps that increase' in one.take(IMAGE, somebody.image(3)).faults[0]
-    assert 'with reset_on_time_jump' in one.take(IMAGE, somebody.image(2)).faults[0]
-    assert len(outputs) == 1
-    again = session(reset_on_time_jump=True)
-    again.take(CAMERA_INFO, somebody.info())
-    again.take(IMAGE, somebody.image(3))
-    handled = again.take(IMAGE, somebody.image(2))
-    assert (handled.faults, len(handled.warnings)) == ((), 1)
-    assert stub_predictor.asked[-1][1] is None
-
-
-def test_bad_input_is_told_once_and_skipped(session, outputs, somebody):
-    one = session()
-    uncalibrated = one.take(CAMERA_INFO, somebody.uncalibrated())
-    assert len(uncalibrated.warnings) == 1
-    assert one.take(CAMERA_INFO, somebody.uncalibrated()).warnings == ()
-    one.take(CAMERA_INFO, somebody.info())
-    broken = somebody.messages.create(
-        'sensor_msgs/msg/CompressedImage', header=somebody.image(0).header, format='jpeg',
-        data=np.arange(9, dtype=np.uint8),
-    )  # fmt: skip
-    small = somebody.image(1, size=(32, 24))
-    for message in (broken, small):
-        assert len(one.take(IMAGE, message).faults) == 1
-    assert one.refuse(IMAGE, 'garbage').warnings == ('message of image can not be read: garbage',)
-    assert outputs == []
-    one.take(IMAGE, somebody.image(2))
-    assert len(outputs) == 1
-    assert one.state.counts == {'received': 3, 'skipped': 2, 'predicted': 1}
-
-
 def test_failed_prediction_skips_the_image(session, outputs, somebody, stub_predictor):
     one = session()
     one.take(CAMERA_INFO, somebody.info())
@@ -409,13 +366,6 @@ def test_keypoints_have_predictions_without_images(outputs, walker):
     assert one.state.counts['predicted'] == 3
 
 
-def test_a_lifter_that_is_not_there_is_told(outputs):
-    with pytest.raises(ValueError, match=r'none\.npz'):
-        keypoint_session(outputs, lifter='none.npz')
-    with pytest.raises(ValueError, match='keypoint_scheme must be one of'):
-        keypoint_session(outputs, keypoint_scheme='none')
-
-
 @pytest.fixture
 def both(session, somebody):
     """A session of both cues, and keypoints of the person in the images of `somebody`."""
@@ -469,26 +419,6 @@ def test_silhouettes_count_where_keypoints_show_nobody(both, outputs, somebody, 
     one.take(IMAGE, somebody.image(20))
     assert len(predictions(outputs)) == 4
     assert len(stub_predictor.asked) == 3
-
-
-def test_keypoints_that_come_late_are_left(both, outputs, somebody):
-    make, keypoints = both
-    one = make()
-    for index in (0, 1):
-        one.take(IMAGE, somebody.image(index))
-    # Those of the second image end the wait for those of the first.
-    one.take('keypoints', keypoints(1))
-    assert len(outputs) == 2
-    handled = one.take('keypoints', keypoints(0))
-    assert not handled.faults
-    one.take(IMAGE, somebody.image(2))
-    assert one.take('keypoints', keypoints(2)).published
-    twice = make()
-    for index in (0, 1, 2):
-        twice.take(IMAGE, somebody.image(index))
-        if index:
-            twice.take('keypoints', keypoints(index))
-    assert outputs[-1] == outputs[2]
 
 
 def test_the_background_is_learned_where_keypoints_show_nobody(both, outputs, somebody):

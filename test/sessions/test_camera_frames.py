@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
@@ -56,21 +55,6 @@ def grounds(outputs):
     ]
 
 
-def test_gravity_of_the_parameters(session, stub_tracker, small_camera, outputs):
-    one = session(gravity_frame='', gravity=[0.0, 1.6, 1.2], camera_height=1.3)
-    one.take(CAMERA_INFO, small_camera.info())
-    for index in range(2):
-        # Nobody listens to transforms.
-        one.take(TF, at(small_camera, index))
-        one.take(IMAGE, small_camera.image(index))
-    (tracker,) = stub_tracker.made
-    np.testing.assert_allclose(tracker.known_ground.up, [0.0, -0.8, -0.6])
-    assert tracker.known_ground.camera_height == 1.3
-    assert tracker.gravities == []
-    assert len(grounds(outputs)) == 2
-    np.testing.assert_allclose(grounds(outputs)[0].plane, [0.0, -0.8, -0.6, 1.3])
-
-
 @pytest.mark.parametrize('first', [TF, IMAGE])
 def test_gravity_at_every_image(session, stub_tracker, small_camera, outputs, first):
     one = session(floor_in_gravity_frame=True, camera_height=3.0)
@@ -88,31 +72,6 @@ def test_gravity_at_every_image(session, stub_tracker, small_camera, outputs, fi
     found = [g.up for g in grounds(outputs)]
     np.testing.assert_allclose(found, [up_of(k) for k in range(3)], atol=1e-12)
     assert one.state.faults == {}
-
-
-def test_transforms_of_other_times_and_frames_are_joined(session, stub_tracker, small_camera):
-    """world - robot, which moves, - mast - lens, of a static transform."""
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(TF_STATIC, transforms(0, seen=view(0), frames=('mast', 'lens')))
-    one.take(IMAGE, small_camera.image(1))
-    for index in (0.0, 2.0):
-        turned = Rotation.from_euler('x', 0.2 * index).as_matrix()[None]
-        message = transforms_message(
-            RosbagsMessages(),
-            ['world', 'robot'],
-            ['robot', 'mast'],
-            np.concatenate([turned, np.eye(3)[None]]),
-            np.zeros((2, 3)),
-            small_camera.stamp(index),
-        )
-        assert stub_tracker.made == []
-        one.take(TF, message)
-    (tracker,) = stub_tracker.made
-    wanted = view(0).rotation @ Rotation.from_euler('x', -0.2).as_matrix() @ [0.0, 0.0, 1.0]
-    np.testing.assert_allclose(tracker.known_ground.up, wanted, atol=1e-12)
-    # The floor was not asked for.
-    assert tracker.known_ground.camera_height is None
 
 
 def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_camera, outputs):
@@ -205,17 +164,6 @@ def test_the_pose_of_the_camera_at_every_image(session, stub_tracker, small_came
         np.testing.assert_allclose(rotation, seen.rotation.T, atol=1e-12)
     assert len(tracker.poses) == 3
     assert one.state.faults == {}
-
-
-def test_height_of_a_camera_that_rises(session, stub_tracker, small_camera, outputs):
-    one = session(fixed_frame='world', floor_in_gravity_frame=True)
-    one.take(CAMERA_INFO, small_camera.info())
-    for index in range(3):
-        one.take(TF, at(small_camera, index, height=1.2 + 0.1 * index))
-        one.take(IMAGE, small_camera.image(index))
-    heights = [ground.height for ground in grounds(outputs)]
-    np.testing.assert_allclose(heights, [1.2, 1.3, 1.4], atol=1e-9)
-    assert len(stub_tracker.made[0].poses) == 3
 
 
 def test_a_missing_pose_is_told_once_and_loses_no_image(session, stub_tracker, small_camera):

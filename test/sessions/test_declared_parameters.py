@@ -2,7 +2,6 @@ import math
 from array import array
 from dataclasses import dataclass, field
 
-import numpy as np
 import pytest
 
 from hmt_ros.sessions.bme_parameters import BmeParameters
@@ -119,17 +118,6 @@ def test_values_that_do_not_go_together_are_refused():
     assert with_values(Outer(), {'low': 4.0, 'high': 5}).own == Term(2.0, 4.0, 5)
 
 
-def test_nodes_have_few_parameters():
-    declared = [[p.name for p in declared_parameters(settings)] for settings in ALL]
-    assert len(declared[0]) <= 34
-    assert len({name for names in declared for name in names}) <= 55
-    names = set(declared[0])
-    assert {'max_hypotheses', 'evaluation_budget', 'random_seed', 'gravity'} < names
-    parameters = with_values(FilterParameters(), {'camera_height': 7, 'max_hypotheses': 20})
-    assert parameters.camera_height == 7.0
-    assert parameters.tracker.max_hypotheses == 20
-
-
 @pytest.mark.parametrize(
     'settings', [*ALL, PeopleParameters()], ids=lambda settings: type(settings).__name__
 )
@@ -181,13 +169,3 @@ def test_what_is_no_list_of_numbers(given):
 def test_what_is_no_ground(values, message):
     with pytest.raises(ValueError, match=message):
         with_values(FilterParameters(), values)
-
-
-def test_ground_that_parameters_tell():
-    assert FilterParameters().known_ground.up is None
-    assert FilterParameters().known_ground.camera_height is None
-    known = with_values(
-        FilterParameters(), {'gravity': [0, 3, 4], 'camera_height': 1.25}
-    ).known_ground
-    np.testing.assert_allclose(known.up, [0, -0.6, -0.8])
-    assert known.camera_height == 1.25

@@ -23,8 +23,6 @@ from hmt_ros.sessions.hri_session import (
     mixture_source,
     published_topic,
 )
-from hmt_ros.sessions.tracking_parameters import FilterParameters
-from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.detections import person_of_skeleton
 from msg_tools.messages.images import decode_image
@@ -127,29 +125,6 @@ def test_no_identity_is_used_twice(session, outputs, people):
     one.take(P1, people(3, 1))
     one.take(P1, people(4, 2))
     assert tracked(outputs) == [['p1_3'], [], ['p1_4'], ['p1_4'], ['p1_5']]
-
-
-def test_what_the_filter_publishes_is_a_body(
-    session, outputs, small_camera, stub_tracker, subject_file
-):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info())
-    parameters = with_values(FilterParameters(), {'subject_file': str(subject_file)})
-
-    def forward(output):
-        if output.topic == 'pose_mixture':
-            one.take(P1, deserialise(output.data, 'hmt_msgs/msg/PoseMixture'))
-
-    tracks = TrackingSession(parameters, forward)
-    tracks.take(CAMERA_INFO, small_camera.info())
-    stub_tracker.empty.add(small_camera.stamp(2))
-    for index in range(3):
-        one.take(IMAGE, small_camera.image(index))
-        tracks.take(IMAGE, small_camera.image(index))
-    assert tracked(outputs) == [['p1_1'], ['p1_1'], []]
-    for name in ('roi', 'skeleton2d', 'cropped', 'joint_states'):
-        stamps = [o.stamp_ns for o in outputs if o.topic == body_topic('p1_1', name)]
-        assert stamps == [small_camera.stamp(i) for i in (0, 1)]
 
 
 def test_people_who_are_gone_are_forgotten(session, outputs, people, monkeypatch):
@@ -282,30 +257,6 @@ def test_region_and_landmarks(session, outputs, people, small_camera, likelihood
     assert crop.header == small_camera.image(1).header
 
 
-def test_landmarks_of_the_head_are_those_of_the_body(session, outputs, human37, random_poses):
-    """Nose and ears are where `keypoint_schemes.yaml` has them on a body."""
-    from hmt_ros.body.kinematics import forward
-    from hmt_ros.body.reference_human import fit_reference_human
-    from msg_tools.messages.humans import landmarks_in_space
-
-    body = human37
-    poses = random_poses(body, 20, 5)
-    # Neither model turns the head about its own axis; together the two angles of ours do a little.
-    poses[:, body.dof_names.index('neck_y')] = 0.0
-    positions = body.joint_positions(poses)
-    head = body.skeleton.segment_names.index('head')
-    turned = forward(body.skeleton, poses).rotations()[:, head]
-    scheme = schemes()['skeleton2d']
-    for pose, places in enumerate(positions):
-        human = fit_reference_human(body.joint_names, places)
-        found = landmarks_in_space(body.joint_names, places[None], human)[0]
-        for name in ('nose', 'left_ear', 'right_ear'):
-            mark = scheme.landmark(name)
-            at_head = places[body.joint_names.index('head')]
-            wanted = at_head + turned[pose] @ mark.offset
-            np.testing.assert_allclose(found[scheme.names.index(name)], wanted, atol=2e-3)
-
-
 def test_a_body_beyond_the_image_has_no_region(session, outputs, people, small_camera):
     one = session()
     one.take(CAMERA_INFO, small_camera.info(0))
@@ -335,15 +286,6 @@ def test_a_mode_is_shown_as_long_as_it_counts(session, outputs, people):
     # the second, which goes on.
     wanted = [0.5, 0.55, 0.6 + 0.8, 0.65 + 0.8]
     np.testing.assert_allclose(elbows, wanted, atol=1e-3)
-
-
-def test_another_camera_is_told(session, outputs, people, small_camera):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info(0, frame_id='left'))
-    handled = one.take(P1, people(0))
-    assert 'of p1 are in the frame lens, camera_info is that of left' in handled.warnings[0]
-    assert not any(o.topic.endswith(('roi', 'skeleton2d', 'cropped')) for o in outputs)
-    assert tracked(outputs) == [['p1_1']]
 
 
 def test_what_can_not_be_used_is_told(session, outputs, people, small_camera):

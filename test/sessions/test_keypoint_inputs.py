@@ -53,35 +53,6 @@ def test_what_names_mean(session, small_camera, stub_tracker, scheme, names, unk
     assert [each.names for each in seen(stub_tracker)] == [used]
 
 
-def test_unknown_names_are_told_once_for_each_set(session, small_camera):
-    one = session()
-    sets = [('tail', 'head'), ('wing', 'head'), ('tail', 'head')]
-    warnings = [
-        one.take(KEYPOINTS, small_camera.keypoints(index, names=names)).warnings
-        for index, names in enumerate(sets)
-    ]
-    assert [len(each) for each in warnings] == [1, 1, 0]
-    assert one.state.faults['names of keypoints'] == 3
-    # Twenty of them in all.
-    more = [
-        one.take(KEYPOINTS, small_camera.keypoints(3 + index, names=(f'tail_{index}',))).warnings
-        for index in range(100)
-    ]
-    assert [len(each) for each in more] == [1] * 18 + [0] * 82
-
-
-def test_what_was_not_seen_does_not_reach_the_tracker(session, small_camera, stub_tracker):
-    one = session()
-    place = np.array([0.0, 3.0, 4.0, np.nan, 6.0])
-    sure = np.array([1.0, 0.0, 1.0, 1.0, 0.5])
-    message = small_camera.keypoints(0, u=place, v=place, confidence=sure)
-    assert one.take(KEYPOINTS, message).warnings == ()
-    one.take(IMAGE, small_camera.image(0))
-    (keypoints,) = seen(stub_tracker)
-    assert keypoints.names == (JOINTS[2], JOINTS[4])
-    np.testing.assert_array_equal(keypoints.confidences, [1.0, 0.5])
-
-
 @pytest.mark.parametrize('order', [(0, 1, 2), (2, 1, 0), (1, 2, 0), (2, 0, 1)])
 def test_positions_in_space_join_the_keypoints_by_name(session, small_camera, stub_tracker, order):
     inputs = [

@@ -79,12 +79,6 @@ def test_who_is_lost_may_be_as_far_as_people_move(robot):
     np.testing.assert_allclose(silent.radii, before.radii + reach_after(0.75))
 
 
-def test_a_track_that_is_dropped_leaves_somebody_behind(robot):
-    robot.tell(START + SECOND_NS // 10, 'lens', KeepOutState.UNKNOWN, 3, math.nan)
-    content = robot.keep_out(0.99)
-    assert (content.state, len(content.radii) > 0) == (LOST, True)
-
-
 def test_only_an_image_without_anybody_frees_the_space(robot):
     robot.tell(START + SECOND_NS, 'lens', NOBODY, 3, 0.05)
     assert (robot.keep_out(0.99).state, len(robot.keep_out(0.99).radii)) == (NOBODY, 0)

@@ -1,12 +1,11 @@
 """The rules of the session, with a tracker that costs nothing."""
 
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hmt_ros.body import Camera, load_body
+from hmt_ros.body import load_body
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.image_inputs import (
@@ -22,7 +21,6 @@ from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking import Status
-from hmt_ros.tracking.beginning import Source
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.keep_out import KeepOutState, keep_out_of
@@ -108,20 +106,6 @@ def test_mixtures_tell_state_track_and_identities(session, outputs, small_camera
     assert [content.identities.tolist() for content in likelihoods] == [[0, 0], [0, 0], []]
 
 
-def test_joints_have_covariances_and_velocities(session, outputs, small_camera):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(IMAGE, small_camera.image(0))
-    one.take(IMAGE, small_camera.image(1))
-    first, second = mixtures_of(outputs)
-    # Nothing is known of motion in the first image.
-    assert first.joint_velocities is None
-    assert np.allclose(second.joint_velocities[0], [1.5, 0.0, 0.0])
-    assert np.allclose(second.joint_velocities[1], 0.0)
-    for content in (first, second, *mixtures_of(outputs, 'likelihood_mixture')):
-        assert np.linalg.eigvalsh(content.joint_covariances).min() > 0
-
-
 def test_a_lost_track_is_told(session, outputs, small_camera, stub_tracker, monkeypatch):
     one = session()
     one.take(CAMERA_INFO, small_camera.info())
@@ -137,17 +121,6 @@ def test_a_lost_track_is_told(session, outputs, small_camera, stub_tracker, monk
     assert [content.state for content in mixtures_of(outputs)] == [TrackState.LOST]
     assert [content.existence_probability for content in mixtures_of(outputs)] == [0.875]
     assert [len(content.cue_probabilities) for content in mixtures_of(outputs)] == [6]
-
-
-def test_a_reset_starts_a_new_track(session, outputs, small_camera):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(IMAGE, small_camera.image(0))
-    one.restart()
-    assert one.state.track_id == 1
-    one.take(IMAGE, small_camera.image(1))
-    assert [content.track_id for content in mixtures_of(outputs)] == [1, 2]
-    assert one.state.track_id == 2
 
 
 def test_same_messages_same_bytes(session, outputs, small_camera):
@@ -166,17 +139,6 @@ def test_what_nobody_wants_is_not_made(session, outputs, small_camera):
     one.take(IMAGE, small_camera.image(0))
     assert [output.topic for output in outputs] == [*STARTS, 'markers']
     assert one.state.counts['tracked'] == 1
-
-
-def test_images_wait_for_the_camera(session, outputs, small_camera):
-    one = session()
-    assert one.state.status == 'no camera'
-    for index in range(3):
-        handled = one.take(IMAGE, small_camera.image(index))
-        assert (handled.faults, handled.published) == ((), ())
-    handled = one.take(CAMERA_INFO, small_camera.info(3))
-    assert tracked(outputs) == [small_camera.stamp(i) for i in range(3)]
-    assert [stamp for topic, stamp in handled.published if topic == 'markers'] == tracked(outputs)
 
 
 @pytest.mark.usefixtures('few_wait')
@@ -402,15 +364,6 @@ def test_images_wait_for_keypoints(session, small_camera, stub_tracker, outputs)
     assert seen(stub_tracker) == [None, (), None, None, None, JOINTS]
 
 
-def test_last_keypoints_of_a_stamp_count(session, small_camera, stub_tracker):
-    one = session(use_keypoints=True)
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(KEYPOINTS, small_camera.keypoints(0, names=('head',)))
-    one.take(KEYPOINTS, small_camera.keypoints(0, names=('left_hip',)))
-    one.take(IMAGE, small_camera.image(0))
-    assert seen(stub_tracker) == [('left_hip',)]
-
-
 @pytest.mark.parametrize(
     ('fields', 'message'),
     [
@@ -584,30 +537,6 @@ def test_a_person_in_the_background_is_told(session, small_camera, stub_tracker)
     assert dict(one.state.values())['background'] == 'forgotten'
 
 
-@pytest.mark.parametrize(('weight', 'source'), [(30.0, Source.KEYPOINTS), (0.0, Source.SUBJECT)])
-def test_a_person_in_the_background_is_not_told_where_silhouettes_are_not_used(
-    session, small_camera, stub_tracker, monkeypatch, weight, source
-):
-    one = session()
-    usual = one.parameters.tracker
-    coverage = replace(usual.likelihood.coverage, weight=weight)
-    tracking = replace(usual, likelihood=replace(usual.likelihood, coverage=coverage))
-    one.parameters = replace(one.parameters, tracker=tracking)
-    one.restart()
-    one.take(CAMERA_INFO, small_camera.info())
-    step = stub_tracker.step
-
-    def doubts(self, *arguments, **named):
-        self.silhouettes.doubted, self.started_from = True, source
-        return step(self, *arguments, **named)
-
-    monkeypatch.setattr(stub_tracker, 'step', doubts)
-    assert one.take(IMAGE, small_camera.image(0)).warnings == ()
-    assert one.take(IMAGE, small_camera.image(1)).warnings == ()
-    assert one.state.trouble() == ''
-    assert one.state.faults == {}
-
-
 # Starts.
 
 
@@ -630,19 +559,6 @@ def test_predictions_start_a_track(session, small_camera, likelihoods, stub_trac
     )
     assert second is None
     assert stub_tracker.made[0].nobody_predicted == [False, True]
-
-
-def test_image_that_is_left_to_the_track_neither_waits_nor_says_nobody(
-    session, small_camera, likelihoods, stub_tracker
-):
-    one = session(use_predictions=True)
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(IMAGE, small_camera.image(0))
-    left = likelihoods.nobody(0)
-    left.state = int(TrackState.TRACKING)
-    one.take(PREDICTION, left)
-    assert stub_tracker.made[0].predictions == [None]
-    assert stub_tracker.made[0].nobody_predicted == [False]
 
 
 def test_late_filter_leaves_images_out_but_not_what_was_predicted(
@@ -723,17 +639,6 @@ def test_bad_predictions_are_told_and_not_used(session, small_camera, likelihood
     assert tracked(outputs) == [small_camera.stamp(4)]
 
 
-def test_waits_for_the_image_of_the_subject(session, outputs, small_camera):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info())
-    handled = one.take(IMAGE, small_camera.image(-1))
-    assert [topic for topic, _ in handled.published] == ROBOT
-    assert one.state.status == 'waiting'
-    assert f'image of {small_camera.stamp(0)} ns or later' in one.state.wants
-    one.take(IMAGE, small_camera.image(0))
-    assert tracked(outputs) == [small_camera.stamp(0)]
-
-
 def test_nothing_starts_without_a_subject(session, small_camera, outputs):
     one = session(subject_file='')
     one.take(CAMERA_INFO, small_camera.info())
@@ -785,20 +690,6 @@ def test_changed_parameters_take_effect_with_the_next_track(session, small_camer
     assert [t.settings.max_hypotheses for t in stub_tracker.made] == [8, 3]
 
 
-def test_restarts_from_a_mixture(session, small_camera, stub_tracker, outputs, body):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(IMAGE, small_camera.image(0))
-    data = next(o.data for o in outputs if o.topic == 'pose_mixture')
-    mixture = deserialise(data, 'hmt_msgs/msg/PoseMixture')
-    one.restart(prepare_start(one.parameters, mixture, one.state.body))
-    one.take(IMAGE, small_camera.image(1))
-    start = stub_tracker.made[1].start
-    assert np.array_equal(start.weights, [0.75, 0.25])
-    assert np.array_equal(start.means, pose_mixture_of(mixture).mixture.means)
-    assert stub_tracker.made[1].body is one.state.body
-
-
 def test_failed_start_is_told_and_not_tried_again(session, small_camera, stub_tracker, outputs):
     one = session()
     one.take(CAMERA_INFO, small_camera.info())
@@ -830,14 +721,6 @@ def test_failed_estimate_skips_the_image(session, small_camera, stub_tracker, ou
     assert one.state.faults == {'estimate': 2}
 
 
-def test_background_of_another_camera(session, small_camera, background_file):
-    one = session(background_file=str(background_file))
-    wide = Camera(60.0, 60.0, 63.5, 23.5, 128, 48)
-    one.take(CAMERA_INFO, small_camera.info(0, wide))
-    (fault,) = one.take(IMAGE, small_camera.image(0, size=(128, 48))).faults
-    assert 'background.png has 64x48 pixels, but the camera gives 128x48' in fault
-
-
 def test_files_that_vanish_do_not_end_it(session, small_camera, subject_file, outputs):
     one = session(reset_on_time_jump=True)
     one.take(CAMERA_INFO, small_camera.info())
@@ -846,43 +729,6 @@ def test_files_that_vanish_do_not_end_it(session, small_camera, subject_file, ou
     handled = one.take(IMAGE, small_camera.image(0))
     assert 'can not be read' in handled.faults[0]
     assert tracked(outputs) == [small_camera.stamp(1), small_camera.stamp(0)]
-
-
-def test_frames_are_named_by_the_image_or_the_camera(session, small_camera, outputs):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info(frame_id='sensor'))
-    one.take(IMAGE, small_camera.image(0, frame_id='lens'))
-    one.take(IMAGE, small_camera.image(1, frame_id=''))
-    one.take(CAMERA_INFO, small_camera.info(frame_id=''))
-    one.take(IMAGE, small_camera.image(2, frame_id=''))
-    frames = [
-        deserialise(o.data, 'hmt_msgs/msg/PoseMixture').header.frame_id
-        for o in outputs
-        if o.topic == 'pose_mixture'
-    ]
-    assert frames == ['lens', 'sensor', 'camera_optical_frame']
-
-
-def test_urdf_comes_again_with_other_frames(session, small_camera, outputs):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(IMAGE, small_camera.image(0))
-    one.take(IMAGE, small_camera.image(1))
-    one.parameters = replace(one.parameters, frame_prefix='anna/')
-    one.take(IMAGE, small_camera.image(2))
-    one.take(IMAGE, small_camera.image(3, frame_id='other'))
-    texts = [
-        deserialise(o.data, 'std_msgs/msg/String').data
-        for o in outputs
-        if o.topic == 'human_description'
-    ]
-    links = [ET.fromstring(text).findall('link')[:2] for text in texts]
-    assert [[link.attrib['name'] for link in pair] for pair in links] == [
-        ['lens', 'human/pelvis.root_tx'],
-        ['lens', 'anna/pelvis.root_tx'],
-        ['other', 'anna/pelvis.root_tx'],
-    ]
-    assert [o.topic for o in outputs].count('body') == 1
 
 
 def test_topics_are_those_of_the_architecture():

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hmt_ros.body import load_body
 from hmt_ros.body.skeleton import Skeleton
 from msg_tools import MessageError
 from msg_tools.messages.urdf import body_urdf, roll_pitch_yaw
@@ -110,25 +109,6 @@ def test_forward_kinematics_of_pinocchio(seed: int) -> None:
     assert (model.lowerPositionLimit == -1000.0).all()
 
 
-@pytest.mark.parametrize('name', ['human32', 'human34', 'human37'])
-def test_joints_of_a_body(name: str) -> None:
-    pinocchio = pytest.importorskip('pinocchio', reason='Pinocchio (pin) is not installed')
-    body = load_body(name)
-    skeleton = body.skeleton
-    model = pinocchio.buildModelFromXML(body_urdf(skeleton, 'camera'))
-    data = model.createData()
-    poses = np.random.default_rng(0).uniform(-1, 1, (5, body.dimension))
-    for pose, wanted in zip(poses, body.joint_positions(poses), strict=True):
-        q = np.zeros(model.nq)
-        for dof, value in zip(body.dof_names, pose, strict=True):
-            q[model.joints[model.getJointId(dof)].idx_q] = value
-        pinocchio.framesForwardKinematics(model, data, q)
-        for joint, segment in enumerate(skeleton.joint_segments):
-            frame = data.oMf[model.getFrameId(skeleton.segment_names[segment])]
-            found = frame.act(skeleton.joint_offsets[joint])
-            np.testing.assert_allclose(found, wanted[joint], atol=1e-9)
-
-
 def test_roll_pitch_yaw_gives_back_the_rotation() -> None:
     rng = np.random.default_rng(0)
     for pitch in (0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-8, -np.pi / 2 + 1e-10, 2.0):
@@ -139,25 +119,6 @@ def test_roll_pitch_yaw_gives_back_the_rotation() -> None:
             r, p, y = roll_pitch_yaw(wanted)
             again = rotation(AXES[2], y) @ rotation(AXES[1], p) @ rotation(AXES[0], r)
             np.testing.assert_allclose(again, wanted, atol=1e-14)
-
-
-def test_rods_reach_from_the_origin_to_the_points() -> None:
-    points = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.1, -0.2, 0.3]])
-    skeleton = skeleton_of([('a', -1)], [np.zeros(3)], [np.eye(3)], joints=points)
-    robot = ET.fromstring(body_urdf(skeleton, 'camera'))
-    visuals = robot.findall("./link[@name='a']/visual")
-    assert len(visuals) == 2
-    for visual, point in zip(visuals, points[[0, 2]], strict=True):
-        origin = visual.find('origin')
-        cylinder = visual.find('geometry/cylinder')
-        assert origin is not None
-        assert cylinder is not None
-        r, p, y = map(float, origin.attrib['rpy'].split())
-        turn = rotation(AXES[2], y) @ rotation(AXES[1], p) @ rotation(AXES[0], r)
-        centre = np.array(list(map(float, origin.attrib['xyz'].split())))
-        half = turn @ AXES[2] * float(cylinder.attrib['length']) / 2
-        np.testing.assert_allclose(centre - half, 0, atol=1e-12)
-        np.testing.assert_allclose(centre + half, point, atol=1e-12)
 
 
 def test_text_is_the_same_every_time_and_escaped() -> None:
