@@ -145,10 +145,10 @@ class Counts:
             self._started += max(tracker.track_id - self._tracks, 0)
         self._tracks = max(tracker.track_id, self._tracks)
         if here:
-            self._person[tracker.status.value] += 1
+            self._person[tracker.estimate.status.value] += 1
         self._since = (t if self._since is None else self._since) if empty else None
         if self._since is not None and t - self._since >= LATE - 1e-6:
-            self._late[tracker.status.value] += 1
+            self._late[tracker.estimate.status.value] += 1
 
     def result(self) -> Case:
         """The counts by name."""

@@ -54,18 +54,18 @@ def of_clip(work: Work) -> dict[str, dict[str, float]]:
             if abs(then - stamp - ahead * SECOND_NS) > NEAR * SECOND_NS:
                 continue
             interval = (then - stamp) / SECOND_NS
-            velocities = tracker.velocities
+            velocities = tracker.estimate.velocities
             moved = posterior.means.copy()
             if velocities is not None:
                 moved += interval * velocities
             made = {
-                FORECAST: (then, tracker.forecaster.at(then)),
+                FORECAST: (then, tracker.estimate.forecaster.at(then)),
                 HELD: (then, posterior),
                 CONSTANT: (then, replace(posterior, means=moved)),
                 THEN: (stamp, posterior),
             }
             for way, (at, mixture) in made.items():
-                scorers[f'{way} {ahead:g}'].take(_estimate(at, mixture, tracker.body))
+                scorers[f'{way} {ahead:g}'].take(_estimate(at, mixture, tracker.estimate.body))
     found = {name: scorer.finish().scores.summary() for name, scorer in scorers.items()}
     # None: the truth has no such time.
     scores = {

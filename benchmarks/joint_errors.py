@@ -70,15 +70,15 @@ def said_of(folder: Path, inputs: str, limit: int | None = None) -> list[Said]:
     clip = read_clip(folder, limit)
     tracker, keypoints = begun(clip, inputs)
     names = [name for name in EVALUATED_JOINTS if name in clip.truth.joint_names]
-    which = tracker.body.skeleton.joint_index([ORIGIN, *names])
+    which = tracker.estimate.body.skeleton.joint_index([ORIGIN, *names])
     result = []
     for i, (stamp, posterior, *_) in enumerate(stepped(clip, tracker, keypoints)):
         if posterior is None or i % EVERY or stamp not in clip.truth.joints:
             continue
         rows = [clip.truth.joint_names.index(name) for name in (ORIGIN, *names)]
         true = clip.truth.joints[stamp][rows]
-        joints = tracker.body.joint_positions(posterior.means)[:, which]
-        jacobians = tracker.body.joint_jacobians(posterior.means)[:, which]
+        joints = tracker.estimate.body.joint_positions(posterior.means)[:, which]
+        jacobians = tracker.estimate.body.joint_jacobians(posterior.means)[:, which]
         for relative in (True, False):
             share = float(relative)
             moved = (jacobians - share * jacobians[:, :1]) @ posterior.cholesky()[:, None]

@@ -26,7 +26,7 @@ from hmt_ros.body import Body, load_body
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.experts.pose_predictor import RATE
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.tracking.motion_states import PredictedStates
+from hmt_ros.inference.motion_states import PredictedStates
 
 Array = NDArray[np.float64]
 # What is seen before a pose: how far it may be from where it was predicted, and what that costs.

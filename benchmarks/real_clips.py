@@ -153,8 +153,8 @@ def of_visit(folder: Path, limit: int | None = None) -> dict[str, Any]:
         tracker.step(image, stamp, keypoints)
         if keypoints is not None and keypoints.seen.any():
             seen += 1
-            tracked += tracker.status is Status.TRACKING
-            nobody += tracker.status is Status.NOBODY
+            tracked += tracker.estimate.status is Status.TRACKING
+            nobody += tracker.estimate.status is Status.NOBODY
     return {'images': len(images), 'seen': seen, 'answered': tracked, 'nobody': nobody}
 
 

@@ -108,10 +108,10 @@ def scores_of(folder: Path, scene: Scene, limit: int | None = None) -> dict[str,
         if any(start <= one.index < end for start, end in scene.empty):
             empty[0] += one.tracked
             empty[1] += 1
-        if not one.tracked or one.tracker.status is not Status.TRACKING:
+        if not one.tracked or one.tracker.estimate.status is not Status.TRACKING:
             before = None
             continue
-        body, pose = one.tracker.body, one.tracker.modes.poses[:1]
+        body, pose = one.tracker.estimate.body, one.tracker.estimate.modes.poses[:1]
         joints = dict(zip(body.joint_names, body.joint_positions(pose)[0], strict=True))
         sizes.append(float(sum(body.segment_lengths.values())))
         if any(start <= one.index < end for start, end in scene.whole):
@@ -122,7 +122,7 @@ def scores_of(folder: Path, scene: Scene, limit: int | None = None) -> dict[str,
             dt = 1e-9 * (one.stamp - before[0])
             speeds += [
                 float(np.linalg.norm(feet[foot] - before[1][foot])) / dt
-                for foot, probability in one.tracker.contacts.items()
+                for foot, probability in one.tracker.estimate.contacts.items()
                 if probability > STANDS
             ]
         before = one.stamp, feet

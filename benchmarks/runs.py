@@ -252,12 +252,12 @@ def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
     return [
         Seen(
             one.stamp,
-            tracker.body,
+            tracker.estimate.body,
             one.posterior,
             one.likelihood,
-            tracker.likelihood_errors,
-            tracker.shape_covariance,
-            tracker.point_estimate,
+            tracker.estimate.likelihood.errors,
+            tracker.estimate.likelihood.shape_covariance,
+            tracker.estimate.point_estimate,
         )
         for one in stepped(clip, tracker, keypoints, gravity=gravity)
         if one.posterior is not None and one.likelihood is not None
@@ -302,16 +302,16 @@ def follow(
     points, evaluations, statuses = [], [], []
     lagged, later = LaggedWeights(LAG), list[Lagged]()
     for one in stepped(clip, tracker, keypoints, gravity=gravity):
-        statuses.append(tracker.status.value)
+        statuses.append(tracker.estimate.status.value)
         if one.posterior is None:
             continue
-        later += lagged.update(one.stamp, one.posterior, tracker.origins)
+        later += lagged.update(one.stamp, one.posterior, tracker.estimate.origins)
         if one.stamp in clip.truth.joints:
             kept.append(one)
-            bodies.append(tracker.body)
+            bodies.append(tracker.estimate.body)
             mixtures.append(one.posterior)
-            points.append(tracker.point_estimate)
-            evaluations.append(float(tracker.evaluations))
+            points.append(tracker.estimate.point_estimate)
+            evaluations.append(float(tracker.estimate.evaluations))
     record = recorded(clip, bodies, mixtures, points, [one.stamp for one in kept], seed)
     return replace(
         record,

@@ -10,6 +10,7 @@ from typing import Any
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import filter as filter_module
 from hmt_ros.tracking import observer as observer_module
+from hmt_ros.tracking import tracker as tracker_module
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps, LimbSearch
@@ -30,7 +31,7 @@ STAGES: Stages = (
     (MixtureFilter, '_weigh', 'keeping'),
     (MixtureFilter, '_select', 'keeping'),
     (MixtureFilter, '_fit_shape', 'shape'),
-    (MixtureFilter, 'likelihood', 'likelihood modes'),
+    (tracker_module, 'likelihood_modes', 'likelihood modes'),
 )
 # In these, minimisation is part of the stage.
 WHOLE = ('motion', 'start of the track', 'flesh')

@@ -99,7 +99,7 @@ def costs(folder: Path, limit: int | None = None) -> list[dict[str, Any]]:
                 opencv_work(subtractor, image)
                 floor.append(time.process_time() - middle)
                 spent.append(middle - start)
-                evaluations.append(tracker.evaluations)
+                evaluations.append(tracker.estimate.evaluations)
             if len(spent) <= STARTING:
                 continue
             # The first images start the track, and load what is compiled.

@@ -144,9 +144,9 @@ def of_clip(work: Work) -> dict[str, Any]:
             continue
         true = clip.truth.joints[stamp]
         at, centre = true[rows], true[clip.truth.joint_names.index('pelvis')]
-        capsules = keep_out_capsules(tracker.body, posterior, 0.99)
+        capsules = keep_out_capsules(tracker.estimate.body, posterior, 0.99)
         for origin, key in ((('pelvis',), 'held'), ((), 'held_absolute')):
-            (joints,) = joint_mixtures(tracker.body, [posterior], names, origin=origin)
+            (joints,) = joint_mixtures(tracker.estimate.body, [posterior], names, origin=origin)
             wanted = at - centre if origin else at
             density = joints.density()
             drawn = stratified_samples(density, SAMPLES, rng)

@@ -10,8 +10,8 @@ import pytest
 
 from hmt_learning.motion import rig
 from hmt_ros.body import model_file
+from hmt_ros.image import subject
 from hmt_ros.sessions import camera_session, parameter_file
-from hmt_ros.tracking import subject
 from msg_tools.bags import bag_metadata
 from msg_tools.files import array_file
 from msg_tools.messages import detections, images, keypoints, pose_mixtures

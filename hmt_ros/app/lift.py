@@ -48,9 +48,9 @@ from hmt_ros.sessions.camera_session import CAMERA_INFO
 from hmt_ros.sessions.image_inputs import PREDICTION
 from hmt_ros.sessions.track_reports import reversed_gravity
 from hmt_ros.tracking import read_subject
-from hmt_ros.tracking.existence import SAME_PERSON
 from hmt_ros.tracking.ground import GroundEstimator, KnownGround
 from hmt_ros.tracking.initialisation import start_from_keypoints
+from hmt_ros.tracking.track_state import SAME_PERSON
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.detections import NO_KEYPOINTS

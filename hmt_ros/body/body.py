@@ -25,6 +25,7 @@ from hmt_ros.body import kinematics
 from hmt_ros.body.flesh import Flesh, Superquadric
 from hmt_ros.body.skeleton import Skeleton, sided_pairs
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.markov_chain import MarkovChain
 
 # How a part of the flesh differs from that of the model, column by column: logarithms of factors on
 # the x and y radii, distances by which it exceeds the start and the end of its segment more than
@@ -353,9 +354,14 @@ class Symmetry:
         if not 0.0 < self.rate < math.inf:
             raise ValueError(f'the rate of a symmetry must be positive, saw {self.rate} 1/s')
 
+    @cached_property
+    def chain(self) -> MarkovChain:
+        """The pose and the mapped one, as two states."""
+        return MarkovChain.of_two(self.rate, self.rate)
+
     def probability(self, dt: float) -> float:
         """p(dt) that the mapped pose is the one dt seconds later, (1)."""
-        return -0.5 * math.expm1(-2.0 * self.rate * dt)
+        return float(self.chain.transition(dt)[0, 1])
 
     def price(self, dt: float) -> float:
         """-log p(dt), nats; of no time it is infinite."""

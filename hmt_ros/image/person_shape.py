@@ -118,3 +118,12 @@ def fill_hull(mask: NDArray[np.uint8], pixels: Array) -> None:
 def counted(mask: Mask) -> int:
     """Number of the pixels of a mask."""
     return cv2.countNonZero(mask.view(np.uint8))
+
+
+def resized(area: Mask, margin: float) -> Mask:
+    """An area (H, W) with a margin, as a fraction of its height; negative: without it."""
+    pixels = area.view(np.uint8)
+    size = max(round(abs(margin) * cv2.boundingRect(pixels)[3]), 1)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
+    change = cv2.dilate if margin > 0 else cv2.erode
+    return np.asarray(change(pixels, kernel), dtype=np.uint8) > 0

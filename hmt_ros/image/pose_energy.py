@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmt_ros.body.body import Body
 from hmt_ros.body.ground_kernel import Constants
 from hmt_ros.body.ground_terms import GroundTerm
 from hmt_ros.body.kinematics import forward, placing_of
@@ -39,6 +40,18 @@ from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, ad
 from hmt_ros.inference.threads import in_threads
 
 Term = TypeVar('Term')
+
+# Length of a moderate step of an angle, rad, and of a place, m.
+ROTATION_STEP, PLACE_STEP = 0.4, 0.3
+# First damping of a minimisation, and gain by a step below which a minimum is found, nats.
+DAMPING, TOLERANCE = 1.0, 1e-3
+# Maximum number of steps of a minimisation that is not limited otherwise.
+MAX_ITERATIONS = 40
+
+
+def scale_of(body: Body) -> Array:
+    """Length (d,) of a moderate step of each variable, rad or m."""
+    return np.where(body.skeleton.dof_is_rotation, ROTATION_STEP, PLACE_STEP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,17 +179,24 @@ class PoseEnergy:
         self,
         x: ArrayLike,
         *,
-        step_scale: ArrayLike,
-        damping: float,
-        max_iterations: int,
-        tolerance: float,
+        step_scale: ArrayLike | None = None,
+        damping: float = DAMPING,
+        max_iterations: int = MAX_ITERATIONS,
+        tolerance: float = TOLERANCE,
     ) -> Minimum:
         """Minima from starts x (n, f) within the limits of the body; see `bounded_newton.minimise`.
+
+        Args:
+            x: starts.
+            step_scale: (f,) or a scalar; None: that of the body.
+            damping, max_iterations, tolerance: as for `bounded_newton.minimise`.
 
         Raises:
             ValueError: x has not f columns, or is not finite.
         """
         body = self.likelihood.body
+        if step_scale is None:
+            step_scale = scale_of(body)[self._free]
         lower, upper = body.lower[self._free], body.upper[self._free]
         if self._strange:
             return minimise(

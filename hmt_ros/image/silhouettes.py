@@ -25,6 +25,7 @@ from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.background import BackgroundModel, SceneWatch, Silhouette, one_person
 from hmt_ros.image.empty_scene import EmptyScene
 from hmt_ros.image.observation import Box
+from hmt_ros.image.person_shape import resized
 from hmt_ros.inference.arrays import Array, Image, Mask
 
 # Shift of the still scene, px, above which a background belongs to another view.
@@ -51,14 +52,12 @@ class Silhouettes:
 
     Attributes:
         scene: the empty scene, as far as it is known.
-        share: f, the share of the person that was foreground when it was last asked; NaN: never.
         watch: tells whether the camera has moved since the background was taken.
         doubted: whether the background was learned with the person in it, and is not known again.
     """
 
     def __init__(self, background: BackgroundModel, *, shared: bool = False) -> None:
         self.scene = EmptyScene(background, trusted=shared)
-        self.share = np.nan
         self.doubted = False
         self.watch = SceneWatch()
         self._shared = shared
@@ -83,7 +82,7 @@ class Silhouettes:
     def forget(self) -> None:
         """Begins anew without a background: the camera sees another scene."""
         self.scene = EmptyScene(BackgroundModel(self.background.settings), trusted=self._shared)
-        self.share, self.doubted, self._learning = np.nan, False, not self._shared
+        self.doubted, self._learning = False, not self._shared
         self.watch = SceneWatch()
 
     def see_from(self, pose: CameraPose, camera: Camera) -> None:
@@ -153,11 +152,10 @@ class Silhouettes:
         """
         if not self.background.frames or not self._learning:
             return
-        inside = _resized(_area(body, camera, poses), -INNER_MARGIN)
+        inside = resized(_area(body, camera, poses), -INNER_MARGIN)
         if not inside.any():
             return
-        self.share = float(self.background.foreground(image)[inside].mean())
-        if self.share < MIN_FOREGROUND_FRACTION:
+        if self.background.foreground(image)[inside].mean() < MIN_FOREGROUND_FRACTION:
             self._doubt()
 
     def _doubt(self) -> None:
@@ -170,7 +168,7 @@ class Silhouettes:
         if self.background.unknown is None:
             return
         area = _area(body, camera, poses)
-        around = _resized(area, OUTER_MARGIN)
+        around = resized(area, OUTER_MARGIN)
         self.background.complete(image, around)
         unknown = self.background.unknown
         known = unknown is None or (unknown & around).sum() <= MAX_UNKNOWN_FRACTION * area.sum()
@@ -209,12 +207,3 @@ def region_of(
 def _area(body: Body, camera: Camera, poses: Array) -> Mask:
     """Where some of the poses (K, d) have the body, (H, W)."""
     return np.asarray(render_silhouettes(body, poses, camera).any(0), dtype=np.bool_)
-
-
-def _resized(area: Mask, margin: float) -> Mask:
-    """An area (H, W) with a margin, as a fraction of its height; negative: without it."""
-    pixels = area.view(np.uint8)
-    size = max(round(abs(margin) * cv2.boundingRect(pixels)[3]), 1)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
-    change = cv2.dilate if margin > 0 else cv2.erode
-    return np.asarray(change(pixels, kernel), dtype=np.uint8) > 0

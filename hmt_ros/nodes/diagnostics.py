@@ -6,7 +6,6 @@ Without these events a publisher of an incompatible quality of service goes unno
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -20,6 +19,8 @@ from hmt_ros.nodes.estimating_thread import Duration
 from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.sessions.session import SessionState
 
+_LOST = 'messages lost'
+
 
 class Rates:
     """Rates in the last period of the diagnostics.
@@ -30,81 +31,76 @@ class Rates:
 
     Attributes:
         name: of the messages.
-        dropped, faults, lost: of the period.
+        change: of the counts in the period.
         computing: time that a message takes, in words.
     """
 
     def __init__(self, name: str, done: str) -> None:
-        self.dropped = 0
-        self.faults = 0
-        self.lost = 0
-        self.computing = 'computing takes too long'
         self.name, self._done = name, done
-        self._received = self._used = 0.0
-        self._latencies: list[float] = []
-        self._stages, self._waiting = (math.nan, math.nan), 0
+        self.computing = 'computing takes too long'
         self._counts: Counter[str] = Counter()
-        self._began = time.monotonic()
+        self.change: Counter[str] = Counter()
+        self._durations: list[Duration] = []
+        self._waiting, self._seconds, self._began = 0, 1.0, time.monotonic()
 
-    def next_period(
-        self, counts: Counter[str], latencies: list[float], durations: list[Duration], waiting: int
-    ) -> None:
+    def next_period(self, counts: Counter[str], durations: list[Duration], waiting: int) -> None:
         """Ends a period.
 
         Args:
             counts: 'received', 'dropped', 'faults', 'lost' and those used, since the start.
         """
-        self._waiting, self._stages = waiting, (math.nan, math.nan)
-        if durations:
-            mean, publishing = (1e3 * sum(x) / len(durations) for x in zip(*durations, strict=True))
-            self._stages = mean - publishing, publishing
-            self.computing = f'computing takes {mean:.0f} ms for one of the {self.name}'
         now = time.monotonic()
+        self._seconds, self._began = max(now - self._began, 1e-3), now
         # A node that was configured anew counts anew.
-        change = counts - self._counts
-        duration = max(now - self._began, 1e-3)
-        self._received = change['received'] / duration
-        self._used = change[self._done] / duration
-        self.dropped, self.faults = change['dropped'], change['faults']
-        self.lost = change['lost']
-        self._latencies, self._counts, self._began = latencies, counts, now
+        self.change, self._counts = counts - self._counts, counts
+        self._waiting, self._durations = waiting, durations
+        if durations:
+            mean = self._means().whole
+            self.computing = f'computing takes {mean:.0f} ms for one of the {self.name}'
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
-        known = self._latencies or [math.nan]
+        latency, whole, publishing = self._means()
+        largest = max((one.latency for one in self._durations), default=math.nan)
         return [
-            (f'{self.name} received a second', f'{self._received:.1f}'),
-            (f'{self.name} {self._done} a second', f'{self._used:.1f}'),
-            ('latency, mean, ms', f'{1e3 * sum(known) / len(known):.1f}'),
-            ('latency, largest, ms', f'{1e3 * max(known):.1f}'),
-            ('estimating, mean, ms', f'{self._stages[0]:.1f}'),
-            ('publishing, mean, ms', f'{self._stages[1]:.1f}'),
+            (f'{self.name} received a second', f'{self._rate("received"):.1f}'),
+            (f'{self.name} {self._done} a second', f'{self._rate(self._done):.1f}'),
+            ('latency, mean, ms', f'{latency:.1f}'),
+            ('latency, largest, ms', f'{1e3 * largest:.1f}'),
+            ('estimating, mean, ms', f'{whole - publishing:.1f}'),
+            ('publishing, mean, ms', f'{publishing:.1f}'),
             ('messages waiting', str(self._waiting)),
         ]
 
     def line(self) -> str:
         """The rates as a line for the console."""
-        latency = ''
-        if self._latencies:
-            mean = 1e3 * sum(self._latencies) / len(self._latencies)
-            latency = f', latency {mean:.0f} ms'
-        dropped = f', {self.dropped} dropped' if self.dropped else ''
+        dropped = self.change['dropped']
         return (
-            f'{self._received:.1f} {self.name} a second, {self._used:.1f} {self._done}'
-            f'{latency}{dropped}'
+            f'{self._rate("received"):.1f} {self.name} a second, '
+            f'{self._rate(self._done):.1f} {self._done}'
+            f'{f", latency {self._means().latency:.0f} ms" if self._durations else ""}'
+            f'{f", {dropped} dropped" if dropped else ""}'
         )
+
+    def _rate(self, what: str) -> float:
+        return self.change[what] / self._seconds
+
+    def _means(self) -> Duration:
+        """Means of the period, ms."""
+        known = self._durations or [Duration(math.nan, math.nan, math.nan)]
+        return Duration(*(1e3 * sum(each) / len(known) for each in zip(*known, strict=True)))
 
 
 def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -> str:
     """Trouble of the last period, the reason first; '' if there was none."""
     name, why = rates.name, '; '.join(silent.texts.values())
-    if rates.dropped:
+    if rates.change['dropped']:
         held_up = f'waits for {state.held_up}' if state.held_up else rates.computing
-        return f'{why or held_up}; late: {rates.dropped} {name} dropped in a second'
-    if rates.faults:
+        return f'{why or held_up}; late: {rates.change["dropped"]} {name} dropped in a second'
+    if rates.change['faults']:
         return state.last_fault
-    if rates.lost:
-        return f'{rates.lost} messages lost on their way in a second'
+    if rates.change['lost']:
+        return f'{rates.change["lost"]} messages lost on their way in a second'
     if silent.silence:
         return f'no {name} for {silent.silence:.0f} s; {why}'.removesuffix('; ')
     if state.wants:
@@ -113,25 +109,24 @@ def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -
 
 
 class MiddlewareEvents:
-    """Counts lost messages and partners that do not fit, and warns of the first of each kind."""
+    """Counts lost messages and partners that do not fit, and warns of the first of each kind.
+
+    Callbacks and `forget` are for the thread of the executor, the others for any.
+    """
 
     def __init__(self, warn: Callable[[str], None]) -> None:
         self._warn = warn
         self._counts: Counter[str] = Counter()
-        self._lost: Counter[str] = Counter()
+        # That the last partner which does not fit has another of, by partners and topic.
         self._policies: dict[str, str] = {}
-        # The thread that estimates makes diagnostics, too.
-        self._lock = threading.Lock()
 
     def of_subscription(self, topic: str) -> SubscriptionEventCallbacks:
         """Callbacks for a subscription to a topic, by its full name."""
 
         def lost(event: Any) -> None:
             count = event.total_count_change
-            with self._lock:
-                self._lost[topic] += count
             text = f'{topic}: {count} messages were lost on their way'
-            self._count(f'messages lost of {topic}', count, text)
+            self._count(f'{_LOST} of {topic}', count, text)
 
         callbacks = self._misfits(
             topic,
@@ -158,9 +153,7 @@ class MiddlewareEvents:
         wants, than, has = words
 
         def incompatible(event: Any) -> None:
-            policy = _policy(event)
-            with self._lock:
-                self._policies[f'{partners} {topic}'] = policy
+            policy = self._policies[f'{partners} {topic}'] = _policy(event)
             self._count(
                 f'{partners} {topic} with another {policy}',
                 event.total_count_change,
@@ -175,17 +168,12 @@ class MiddlewareEvents:
 
         return {'incompatible_qos': incompatible, 'incompatible_type': other_type}
 
-    def refused_policy(self, topic: str) -> str:
-        """The policy of the last publisher that did not fit; '' where all fit."""
-        with self._lock:
-            return self._policies.get(f'publishers of {topic}', '')
-
     def deaf_topic(self, subscriptions: Iterable[Any]) -> str:
         """A topic whose publishers all have a quality of service that does not fit, and why."""
         try:
             for subscription in list(subscriptions):
                 topic = subscription.topic_name
-                policy = self.refused_policy(topic)
+                policy = self._policies.get(f'publishers of {topic}')
                 if policy and not subscription.get_publisher_count():
                     return f'{topic}: publishers offer another {policy} than is asked for'
         except InvalidHandle:
@@ -196,26 +184,22 @@ class MiddlewareEvents:
     @property
     def lost(self) -> int:
         """Number of messages lost so far, over all topics."""
-        with self._lock:
-            return self._lost.total()
+        counts = dict(self._counts)
+        return sum(count for what, count in counts.items() if what.startswith(_LOST))
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
-        with self._lock:
-            counts = [(what, str(count)) for what, count in sorted(self._counts.items())]
-        return [('messages lost', str(self.lost)), *counts]
+        counts = sorted(dict(self._counts).items())
+        return [(_LOST, str(self.lost)), *((what, str(count)) for what, count in counts)]
 
     def forget(self) -> None:
         """Forgets the publishers that did not fit; those that still exist will be found again."""
-        with self._lock:
-            self._policies.clear()
+        self._policies.clear()
 
     def _count(self, what: str, count: int, text: str) -> None:
-        with self._lock:
-            first = what not in self._counts
-            self._counts[what] += count
-        if first:
+        if what not in self._counts:
             self._warn(f'{text} (more of the kind are counted in /diagnostics)')
+        self._counts[what] += count
 
 
 def _policy(event: Any) -> str:

@@ -76,10 +76,12 @@ class Duration(NamedTuple):
     """Times that an estimate took.
 
     Attributes:
+        latency: from the arrival of its message, s.
         whole: from the bytes of its message to the last one that it led to, s.
         publishing: part of it for making messages into bytes and publishing them, s.
     """
 
+    latency: float
     whole: float
     publishing: float
 
@@ -310,7 +312,6 @@ class Estimator:
         session.interrupted = lambda: bool(len(self.queue))
         self._tell, self._tell_change = tell, tell_change
         self._inner_faults, self._log_error = inner_faults, log_error
-        self._latencies: deque[float] = deque(maxlen=1000)
         self._durations: deque[Duration] = deque(maxlen=1000)
         self._arrivals: dict[int, float] = {}
         thread.serve(self)
@@ -328,12 +329,8 @@ class Estimator:
         """Takes from the session how many images or mixtures may wait."""
         self.queue.limit(self._session.COUNTED, self._session.most_waiting)
 
-    def take_latencies(self) -> list[float]:
-        """Times from the arrival of messages to their estimates, s, since the last call."""
-        return [self._latencies.popleft() for _ in range(len(self._latencies))]
-
     def take_durations(self) -> list[Duration]:
-        """Times that estimates took by themselves since the last call."""
+        """Times that estimates took since the last call."""
         return [self._durations.popleft() for _ in range(len(self._durations))]
 
     def stop(self, timeout: float | None = None) -> bool:
@@ -401,7 +398,6 @@ class Estimator:
             newest = max(stamps, default=0)
             arrival = self._arrivals.get(newest, waiting.arrival)
             now = time.monotonic()
-            self._latencies.append(now - arrival)
             published = (session.publishing - publishing) / more_done
-            self._durations.append(Duration((now - began) / more_done, published))
+            self._durations.append(Duration(now - arrival, (now - began) / more_done, published))
         self._tell(handled)

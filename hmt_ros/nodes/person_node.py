@@ -64,7 +64,8 @@ def nodes_together(names: Sequence[str], **options: Any) -> list[SessionNode[Any
     Args:
         options: of all of them, see `SessionNode`.
     """
-    values, nodes = used_of_each_other(names), []
+    values = used_of_each_other(names)
+    nodes: list[SessionNode[Any, Any]] = []
     for name in sorted(names, key=_ORDER.index):
         defaults = replace(NODES[name].DEFAULTS, **values[name])
         nodes.append(NODES[name](defaults, nodes[0] if nodes else None, **options))

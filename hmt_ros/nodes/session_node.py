@@ -129,7 +129,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._outputs: dict[str, Any] = {}
         self._handled: Any = None
         self._offered: list[Any] = []
-        self._threads = EstimatingThreads() if beside is None else beside._threads
+        self._threads: EstimatingThreads = (
+            EstimatingThreads() if beside is None else beside._threads
+        )
         # The nodes of this process, in the order of their turns.
         self._nodes: list[SessionNode[Any, Any]] = [] if beside is None else beside._nodes
         self._local_names: dict[str, str] = {}
@@ -139,8 +141,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._heard: dict[str, SubscribedTopic] = {}
         self._connected: dict[str, Any] = {}
         self._nodes.append(self)
-        # Topics that the node both publishes and subscribes to, and its own messages there.
-        self._returning: set[str] = set()
+        # On topics that the node both publishes and subscribes to.
         self._own = OwnMessages()
         self._failure = ''
         self._inner_faults = InnerFaults()
@@ -279,7 +280,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             inner_faults=self._inner_faults,
             log_error=self.get_logger().error,
         )
-        self._returning = {one.topic for one in inputs} & self._outputs.keys()
         session.topic_names = {one.source: self.resolve_topic_name(one.topic) for one in inputs}
         self._silent.listen(inputs, self.SESSION.COUNTED)
         for one in inputs:
@@ -327,8 +327,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         wanted = self._heard[name]
 
         def receive(data: bytes) -> None:
-            if wanted.topic not in self._returning or not self._own.is_own(data):
-                self._hand_on(name, received(data, wanted))
+            if wanted.topic not in self._outputs or not self._own.is_own(data):
+                waiting = received(data, wanted)
+                for one in self._listeners(name):
+                    one._hear(name, waiting)
 
         self._connected[name] = self.create_subscription(
             message_class(wanted.msgtype),
@@ -353,12 +355,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """The nodes of this process that listen to a topic."""
         return [one for one in self._nodes if name in one._heard]
 
-    def _hand_on(self, name: str, waiting: Waiting) -> None:
-        """Gives a message to the nodes of this process; for any thread."""
-        for one in self._nodes:
-            one._hear(name, waiting)
-
     def _hear(self, name: str, waiting: Waiting) -> None:
+        """Takes a message on a topic; for any thread."""
         wanted, estimator = self._heard.get(name), self._estimator
         if wanted is not None and estimator is not None:
             self._silent.arrived(wanted.source, waiting.arrival)
@@ -439,9 +437,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self._handled.publish(serialise(handled_message(RosbagsMessages(), handled)))
 
     def _publish(self, output: Output) -> None:
-        if output.topic in self._returning:
-            self._own.sent(output.data)
         publisher, name = self._outputs[output.topic], self._local_name(output.topic)
+        if name in self._heard:
+            self._own.sent(output.data)
         inside = self._inside(output.topic)
         # What only nodes of this process want is not even made into bytes.
         if not inside or publisher.get_subscription_count():
@@ -479,10 +477,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             counts['faults'] = state.faults.total()
         counts['lost'] = self._events.lost
         estimator = self._estimator
-        latencies = [] if estimator is None else estimator.take_latencies()
         durations = [] if estimator is None else estimator.take_durations()
         waiting = 0 if estimator is None else len(estimator.queue)
-        self._rates.next_period(counts, latencies, durations, waiting)
+        self._rates.next_period(counts, durations, waiting)
         if self._session is not None and self._heard:
             self._silent.look(self._session.needed_inputs())
         self._diagnose()

@@ -36,8 +36,6 @@ class HriParameters(NodeParameters):
         added_joints: If true, the kinematic model has four joints beyond the reference of REP 155
             and passes through all joint positions. If false, the trunk only leans, and the
             shoulders are fixed to it.
-        longest_silence: Time without a mixture after which a body is not tracked any more, by the
-            stamps of camera_info, s.
         queue_size: Maximum number of mixtures that wait; when the node is late the oldest are
             dropped.
     """
@@ -48,7 +46,6 @@ class HriParameters(NodeParameters):
     publish_cropped: bool = parameter_field(True, NEXT_CONFIGURE)
     publish_links: bool = parameter_field(True, AT_ONCE)
     added_joints: bool = parameter_field(True, AT_ONCE)
-    longest_silence: float = parameter_field(2.0, AT_ONCE, (0.1, 3600.0))
     queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
 
     def __post_init__(self) -> None:

@@ -7,7 +7,7 @@ The rules, besides those of `Session`:
   person who is found again by a new track is a new body; no identity is used twice.
 - /humans/bodies/tracked lists the bodies that are tracked. A body that the filter calls lost is not
   in the list until the same track goes on; it ends with the track, with a mixture without
-  components, and `longest_silence` after its last mixture.
+  components, and `LONGEST_SILENCE` after its last mixture.
 - A body is shown in one pose, its heaviest mode. While that mode lasts another one replaces it only
   with twice its weight.
 - Regions, landmarks and cropped images need the calibrated camera_info of the frame of the mixture,
@@ -72,6 +72,8 @@ MIXTURE = 'pose_mixture'
 _KEPT = 0.5
 # Change of a length above which a body is described anew, m.
 _RESHAPED = 0.005
+# Time without a mixture after which a body is not tracked any more, by stamps of camera_info, s.
+LONGEST_SILENCE = 2.0
 # Number of people without a body who are remembered, for the numbers of their tracks.
 _REMEMBERED = 1000
 # A filter that is further behind drops images itself.
@@ -220,7 +222,7 @@ class HriSession(Session[HriParameters, HriState]):
         except CameraInfoError as error:
             text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
             self._log.fault('camera_info', text)
-        longest = self.parameters.longest_silence * SECOND_NS
+        longest = LONGEST_SILENCE * SECOND_NS
         silent = [p for p in self._people.values() if p.identity and stamp - p.heard > longest]
         for person in silent:
             person.end()

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body
+from hmt_ros.image.association import Sighting
 from hmt_ros.image.keypoint_evidence import FEWEST_KEYPOINTS
 from hmt_ros.image.keypoint_schemes import Scheme
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.tracking_parameters import PeopleParameters
-from hmt_ros.tracking.association import Sighting
 from msg_tools import MessageError
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,

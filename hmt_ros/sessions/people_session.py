@@ -4,7 +4,7 @@ The rules, besides those of `CameraSession`:
 
 - An image waits for its detections (`image_inputs`).
 - Identities of the detector are kept. People without one are told apart by their last place
-  and motion (`hmt_ros.tracking.association`).
+  and motion (`hmt_ros.image.association`).
 - A detection that matches nobody who is followed starts a track, the largest first, up to
   `max_people`. A person without a track, or no longer in view (`Tracker.status`), is dropped.
 - The nearest person is tracked first. For each person the pixels of nearer people are unknown, and
@@ -23,6 +23,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hmt_ros.body import Camera
+from hmt_ros.body.camera_pose import CameraPose
+from hmt_ros.image.association import (
+    GATE,
+    ImageTrack,
+    Sighting,
+    assigned,
+    grown,
+    hull,
+    moved,
+    unknown_area,
+)
 from hmt_ros.image.background import BackgroundModel, SceneWatch
 from hmt_ros.image.person_shape import covered
 from hmt_ros.image.silhouettes import Silhouettes, region_of
@@ -45,18 +56,7 @@ from hmt_ros.sessions.track_start import TrackStart
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking import Status
-from hmt_ros.tracking.association import (
-    GATE,
-    ImageTrack,
-    Sighting,
-    assigned,
-    grown,
-    hull,
-    moved,
-    unknown_area,
-)
-from hmt_ros.tracking.camera_motion import CameraPose
-from hmt_ros.tracking.hypotheses import LIKELY
+from hmt_ros.tracking.settings import LIKELY_NATS
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,
     PEOPLE_2D,
@@ -135,16 +135,20 @@ class _Person(Track):
     @property
     def depth(self) -> float:
         """Distance of the person along the optical axis, m; infinite without a track."""
-        return float(self.tracker.modes.poses[0, 2]) if self.begun and self.tracker else np.inf
+        return (
+            float(self.tracker.estimate.modes.poses[0, 2])
+            if self.begun and self.tracker
+            else np.inf
+        )
 
     def area(self, camera: Camera, shift: Array | None = None) -> Mask | None:
         """Where likely modes have the body (H, W), moved by a shift (2,) px; None: no track."""
         if not self.begun or self.tracker is None:
             return None
-        modes = self.tracker.modes
+        modes = self.tracker.estimate.modes
         result = np.zeros((camera.height, camera.width), dtype=np.bool_)
-        for pose in modes.poses[modes.log_weights > -LIKELY]:
-            result |= covered(self.tracker.body, camera, pose)
+        for pose in modes.poses[modes.log_weights > -LIKELY_NATS]:
+            result |= covered(self.tracker.estimate.body, camera, pose)
         return grown(result if shift is None else moved(result, shift))
 
     def expected_area(self, camera: Camera, one: Found | None, stamp: int) -> Mask:
@@ -155,8 +159,8 @@ class _Person(Track):
         """
         shift = self.place.shift(stamp)
         if one is not None and self.begun and self.tracker is not None:
-            body = self.tracker.body
-            pixels = camera.project(body.joint_positions(self.tracker.modes.poses[:1]))[0]
+            body = self.tracker.estimate.body
+            pixels = camera.project(body.joint_positions(self.tracker.estimate.modes.poses[:1]))[0]
             names = dict(zip(body.joint_names, pixels, strict=True))
             shifts = Sighting(names, one.sighting.corners).shifts_to(one.sighting)
             shift = np.nan_to_num(np.median(shifts, axis=0))
@@ -354,11 +358,11 @@ class PeopleSession(TrackingSession):
             tracker = person.tracker
             if tracker is None or not person.begun:
                 continue
-            names, pose = tracker.body.joint_names, tracker.point_estimate[None]
-            pixels = camera.project(tracker.body.joint_positions(pose))[0]
+            names, pose = tracker.estimate.body.joint_names, tracker.estimate.point_estimate[None]
+            pixels = camera.project(tracker.estimate.body.joint_positions(pose))[0]
             unknown = np.full((len(names), 2, 2), np.nan)
             keypoints = Keypoints(names, pixels, unknown, np.ones(len(names)))
-            box = region_of(tracker.body, camera, pose, margin=0.0)
+            box = region_of(tracker.estimate.body, camera, pose, margin=0.0)
             people.append(DetectedPerson(person.person, keypoints, box))
         stamp, frame = waiting.stamp_ns, waiting.frame_id
         self._publish(PEOPLE, stamp, people_message(self._messages, people, stamp, frame))

@@ -154,7 +154,7 @@ class Track:
     @property
     def status(self) -> Status:
         """Of the tracker."""
-        return Status.WAITING if self.tracker is None else self.tracker.status
+        return Status.WAITING if self.tracker is None else self.tracker.estimate.status
 
     @property
     def begun(self) -> bool:
@@ -186,7 +186,7 @@ class Track:
                 depth=waiting.depth,
             )
             report_change(log, before, tracker, self.start.initial, stamp)
-            if waiting.depth is not None and not tracker.validity.believes('depth'):
+            if waiting.depth is not None and not tracker.estimate.validity.believes('depth'):
                 log.note(
                     'depth of something else',
                     f'depth of {stamp} ns does not show the person where the image does: depth '
@@ -199,7 +199,7 @@ class Track:
                 published = self._publish(tracker, waiting, posterior, likelihood)
             elif len(self.weights):
                 self._publish_nobody(tracker, waiting)
-            if not starts and tracker.status is Status.WAITING:
+            if not starts and tracker.estimate.status is Status.WAITING:
                 # The track was of nobody.
                 self.robot.forget()
             answered = True
@@ -268,11 +268,11 @@ class Track:
         likelihood: GaussianMixture,
     ) -> bool:
         p, fixed = self._parameters, self._fixed_frame()
-        starts = self.body is None or not _looks_like(tracker.body, self.body)
+        starts = self.body is None or not _looks_like(tracker.estimate.body, self.body)
         if starts:
-            self.body = tracker.body
+            self.body = tracker.estimate.body
         if fixed is not None:
-            self._turn = fixed.turn_of(tracker.body, posterior.means[0])
+            self._turn = fixed.turn_of(tracker.estimate.body, posterior.means[0])
         elif p.publish_in_fixed_frame:
             self._shared.log.fault(
                 'no pose of the camera',
@@ -322,21 +322,24 @@ class Track:
         state, seen, existence = KeepOutState.UNKNOWN, None, math.nan
         reason = 'the image can not be tracked'
         if tracker is not None:
-            state, existence = _STATES[tracker.status], tracker.existence_probability
-            reason = tracker.reason
-            if tracker.status is Status.WAITING and self.start.initial is not None:
+            state, existence = (
+                _STATES[tracker.estimate.status],
+                tracker.estimate.existence_probability,
+            )
+            reason = tracker.estimate.reason
+            if tracker.estimate.status is Status.WAITING and self.start.initial is not None:
                 reason = f'waiting for {self.start.wants(())}'
-            if state is KeepOutState.NOBODY and not tracker.nobody_shown:
+            if state is KeepOutState.NOBODY and not tracker.estimate.nobody_shown:
                 # An earlier image showed that nobody is there; this one shows nothing.
                 state = KeepOutState.UNKNOWN
             elif state is KeepOutState.TRACKING:
-                if placed and posterior is not None and not tracker.foreseen:
+                if placed and posterior is not None and not tracker.estimate.foreseen:
                     seen = LastSeen(
                         waiting.stamp_ns,
                         waiting.frame_id,
-                        tracker.body,
+                        tracker.estimate.body,
                         posterior,
-                        tracker.forecaster,
+                        tracker.estimate.forecaster,
                         fixed,
                         p.keep_out_probability,
                         p.focal_length_sigma,

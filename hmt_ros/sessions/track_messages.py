@@ -117,7 +117,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     posterior = track.posterior
     body, point = _against_camera(tracker)
     skeleton = body.skeleton
-    joints = forward(tracker.body.skeleton, posterior.means).joints().transpose(2, 0, 1)
+    joints = forward(tracker.estimate.body.skeleton, posterior.means).joints().transpose(2, 0, 1)
     ground = _ground_state(track)
     # Both are made before anything is published: either may be invalid for a message.
     made = {
@@ -132,7 +132,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     for topic, mixture in mixtures.items():
         yield topic, pose_mixture_message(MESSAGES, mixture)
     if wanted('person_pose'):
-        pose, its_frame = person_pose(tracker.body, posterior), frame
+        pose, its_frame = person_pose(tracker.estimate.body, posterior), frame
         if track.fixed is not None:
             pose, its_frame = pose.seen_from(*track.fixed.camera), track.fixed.name
         yield 'person_pose', person_pose_message(MESSAGES, pose, stamp, its_frame)
@@ -176,9 +176,9 @@ def nobody_messages(
 
     The overlay shows the image without modes; markers of all ranks are removed.
     """
-    body, stamp = tracker.body, waiting.stamp_ns
+    body, stamp = tracker.estimate.body, waiting.stamp_ns
     frame = f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id
-    state = TrackState.NOBODY if tracker.status is Status.NOBODY else TrackState.UNKNOWN
+    state = TrackState.NOBODY if tracker.estimate.status is Status.NOBODY else TrackState.UNKNOWN
     kinds = {'pose_mixture': MixtureKind.POSTERIOR, 'likelihood_mixture': MixtureKind.LIKELIHOOD}
     for topic, kind in kinds.items():
         if wanted(topic):
@@ -190,8 +190,8 @@ def nobody_messages(
                 frame,
                 state=state,
                 track_id=tracker.track_id,
-                existence_probability=tracker.existence_probability,
-                reason=tracker.reason,
+                existence_probability=tracker.estimate.existence_probability,
+                reason=tracker.estimate.reason,
             )
             yield topic, pose_mixture_message(MESSAGES, content)
     if wanted('markers'):
@@ -233,8 +233,9 @@ def robot_messages(
 
 def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
     """The posterior, with joints (K, J, 3) in the camera frame."""
-    tracker, posterior, velocities = track.tracker, track.posterior, track.tracker.velocities
-    body, frame, positions = tracker.body, track.waiting.frame_id, joints
+    tracker, posterior = track.tracker, track.posterior
+    velocities = tracker.estimate.velocities
+    body, frame, positions = tracker.estimate.body, track.waiting.frame_id, joints
     if (fixed := track.fixed) is not None:
         posterior, velocities = fixed.placed(body, posterior, velocities)
         body = body.levelled(np.eye(3))
@@ -246,13 +247,13 @@ def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
         track.waiting.stamp_ns,
         frame,
         joint_positions=positions,
-        log_likelihoods=tracker.published.log_likelihoods,
+        log_likelihoods=tracker.estimate.published.log_likelihoods,
         state=_state(tracker),
         track_id=tracker.track_id,
-        existence_probability=tracker.existence_probability,
-        cue_probabilities=_in_range(tracker.validity.shown),
-        reason=tracker.reason,
-        identities=tracker.published.identities,
+        existence_probability=tracker.estimate.existence_probability,
+        cue_probabilities=_in_range(tracker.estimate.validity.shown),
+        reason=tracker.estimate.reason,
+        identities=tracker.estimate.published.identities,
         velocities=velocities,
     )
 
@@ -262,7 +263,8 @@ def _likelihood(track: TrackedImage) -> PoseMixture:
     tracker, likelihood, frame = track.tracker, track.likelihood, track.waiting.frame_id
     # The focal length errs alike in all images, as the shape does.
     focal = depth_covariances(track.posterior.means[:1], track.parameters.focal_length_sigma)[0]
-    body, shape, errors = tracker.body, tracker.shape_covariance + focal, tracker.likelihood_errors
+    body, found = tracker.estimate.body, tracker.estimate.likelihood
+    shape = found.shape_covariance + focal
     if (fixed := track.fixed) is not None:
         likelihood, _ = fixed.placed(body, likelihood)
         at_best = GaussianMixture(np.ones(1), track.posterior.means[:1], shape[None])
@@ -276,29 +278,29 @@ def _likelihood(track: TrackedImage) -> PoseMixture:
         frame,
         state=_state(tracker),
         track_id=tracker.track_id,
-        existence_probability=tracker.existence_probability,
-        log_likelihoods=tracker.log_likelihoods,
-        error_share=errors.independent,
-        error_time=errors.time,
+        existence_probability=tracker.estimate.existence_probability,
+        log_likelihoods=found.values,
+        error_share=found.errors.independent,
+        error_time=found.errors.time,
         shape_covariance=shape,
-        reason=tracker.reason,
+        reason=tracker.estimate.reason,
     )
 
 
 def _against_camera(tracker: Tracker) -> tuple[Body, Array]:
     """The body and its point estimate (d,), root angles measured against the camera."""
-    body, point = tracker.body, tracker.point_estimate
+    body, point = tracker.estimate.body, tracker.estimate.point_estimate
     upright = body.levelled(np.eye(3))
     return upright, point if upright is body else turned(body, point[None], upright)[0]
 
 
 def _state(tracker: Tracker) -> TrackState:
-    return TrackState.LOST if tracker.status is Status.LOST else TrackState.TRACKING
+    return TrackState.LOST if tracker.estimate.status is Status.LOST else TrackState.TRACKING
 
 
 def _ground_state(track: TrackedImage) -> GroundState:
     """Gravity and floor, as a message holds them."""
-    ground = track.tracker.ground
+    ground = track.tracker.estimate.ground
     return GroundState(
         track.waiting.stamp_ns,
         track.waiting.frame_id,
@@ -306,7 +308,7 @@ def _ground_state(track: TrackedImage) -> GroundState:
         ground.up_sigma,
         ground.height,
         math.nan if ground.height is None else ground.height_sigma,
-        _in_range(track.tracker.contacts),
+        _in_range(track.tracker.estimate.contacts),
     )
 
 
@@ -322,8 +324,8 @@ def _link_transforms(track: TrackedImage) -> Any:
     parents = [camera] * len(names)
     children = [f'{prefix}{name}' for name in names]
     more = []
-    if tracker.vertical is not None:
-        more.append((camera, f'{prefix}{UPRIGHT}', upright(tracker.vertical)))
+    if tracker.estimate.vertical is not None:
+        more.append((camera, f'{prefix}{UPRIGHT}', upright(tracker.estimate.vertical)))
     if track.fixed is not None:
         more.append((track.fixed.name, track.fixed.optical, FROM_OPTICAL))
     for parent, child, rotation in more:

@@ -43,14 +43,14 @@ class TrackCondition(NamedTuple):
             return cls()
         silhouettes = tracker.silhouettes
         return cls(
-            tracker.status,
+            tracker.estimate.status,
             silhouettes.doubted
             and tracker.settings.likelihood.coverage.weight > 0.0
-            and tracker.started_from is not Source.KEYPOINTS,
+            and tracker.estimate.started_from is not Source.KEYPOINTS,
             silhouettes.watch.moved,
-            tracker.gravity_contradicted,
+            tracker.estimate.gravity_contradicted,
             tracker.track_id,
-            tracker.gravity_reversed,
+            tracker.estimate.gravity_reversed,
         )
 
 
@@ -82,8 +82,8 @@ def report_change(
         log.note(
             'direction of gravity',
             f'the lines of the scene, or the person, contradict the gravity that is given, '
-            f'{_numbers(-tracker.ground.up)}, at the image of {stamp_ns} ns; it is used all the '
-            'same: check that it is in the optical frame (x right, y down, z forward), or '
+            f'{_numbers(-tracker.estimate.ground.up)}, at the image of {stamp_ns} ns; it is used '
+            'all the same: check that it is in the optical frame (x right, y down, z forward), or '
             'gravity_frame and how the camera is mounted',
             warn=True,
         )
@@ -91,7 +91,7 @@ def report_change(
     if now.reversed and not before.reversed:
         log.note(
             'direction of gravity',
-            f'{reversed_gravity(tracker.ground.up)} ({stamp_ns} ns)',
+            f'{reversed_gravity(tracker.estimate.ground.up)} ({stamp_ns} ns)',
             warn=True,
         )
     if newer or now.status is not before.status:
@@ -121,7 +121,7 @@ def _report_status(
     initial: Subject | GaussianMixture | None,
     stamp_ns: int,
 ) -> None:
-    now, track = tracker.status, f'track {tracker.track_id}'
+    now, track = tracker.estimate.status, f'track {tracker.track_id}'
     at = f'at the image of {stamp_ns} ns'
     if now is Status.NOBODY:
         log.tell(f'nobody in view {at}: {track} ends, another starts when somebody comes')
@@ -130,14 +130,18 @@ def _report_status(
     elif tracker.track_id == before.track_id and before.status is Status.LOST:
         log.tell(f'{track} is found again {at}')
     elif tracker.track_id != before.track_id:
-        origin = 'what was given' if tracker.started_from is None else tracker.started_from.value
+        origin = (
+            'what was given'
+            if tracker.estimate.started_from is None
+            else tracker.estimate.started_from.value
+        )
         log.tell(f'{track} starts from {origin} {at}')
         if isinstance(initial, Subject) and before.status is Status.WAITING:
             _report_age(log, stamp_ns - initial.stamp_ns)
     if now is Status.LOST:
         log.note(
             'loss of the track',
-            f'{track} is lost {at}: {tracker.reason}; it is searched for',
+            f'{track} is lost {at}: {tracker.estimate.reason}; it is searched for',
             warn=True,
         )
 

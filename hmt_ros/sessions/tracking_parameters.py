@@ -18,10 +18,10 @@ from hmt_ros.sessions.declared_parameters import (
 )
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.ground import KnownGround
-from hmt_ros.tracking.settings import LIVE_BUDGET
 
-# Standard deviation of the parameter gravity: of a level or a protractor, rad.
-GRAVITY_SIGMA = math.radians(2.0)
+# Evaluations of an image that let the node keep up with a camera.
+# Source: benchmarks/tracking_budgets.py.
+LIVE_BUDGET = 300
 # Settings that are parameters, with their limits.
 _TRACKER = {
     'evaluation_budget': (1, 100_000),
@@ -49,8 +49,9 @@ class FilterParameters(CameraNodeParameters):
         use_predictions: If true, predictions of bme_node start a track without subject_file and are
             hypotheses.
         gravity: Direction of gravity in the camera optical frame, three numbers of any length,
-            [0.0, 1.0, 0.0] for a level camera; lines of the scene refine it within 2 degrees. If
-            empty, these lines show it where they can.
+            [0.0, 1.0, 0.0] for a level camera; if empty, lines of the scene show it where they can.
+        gravity_sigma: Standard deviation of the parameter gravity, degrees; lines of the scene
+            refine it within that.
         camera_height: Height of the camera above the floor, m; 0 if unknown.
         focal_length_sigma: Relative standard deviation of the focal length in camera_info, which
             makes the published depths uncertain; 0 for a calibrated camera, 0.2 for a guess.
@@ -86,6 +87,7 @@ class FilterParameters(CameraNodeParameters):
     use_depth: bool = parameter_field(False, AT_ONCE)
     use_predictions: bool = parameter_field(False, AT_ONCE)
     gravity: tuple[float, ...] = parameter_field((), NEXT_TRACK)
+    gravity_sigma: float = parameter_field(2.0, NEXT_TRACK, (0.1, 45.0))
     camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))
     focal_length_sigma: float = parameter_field(0.0, AT_ONCE, FRACTION)
     gravity_frame: str = parameter_field('', NEXT_CONFIGURE)
@@ -137,7 +139,7 @@ class FilterParameters(CameraNodeParameters):
     def known_ground(self) -> KnownGround:
         """Gravity and floor from the parameters, without transforms."""
         up = -unit_vector(self.gravity, 'gravity') if self.gravity else None
-        return KnownGround(up, self.camera_height or None, GRAVITY_SIGMA)
+        return KnownGround(up, self.camera_height or None, math.radians(self.gravity_sigma))
 
 
 # Inputs of a single person, whose topics can not tell which person it is.

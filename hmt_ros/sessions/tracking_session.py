@@ -255,21 +255,21 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
     def _present_state(self) -> SessionState:
         track = self.tracks[0]
         known, tracker = track.tracker, track.tracker if len(track.weights) else None
-        source = None if known is None else known.started_from
+        source = None if known is None else known.estimate.started_from
         return TrackingState(
             *self._status_and_wants(),
             **self._totals(track.weights),
             body=track.body,
             modes=len(track.weights),
-            misfit=math.nan if tracker is None else tracker.misfit,
-            evaluations=0 if tracker is None else tracker.evaluations,
+            misfit=math.nan if tracker is None else tracker.estimate.misfit,
+            evaluations=0 if tracker is None else tracker.estimate.evaluations,
             background='unknown' if known is None else known.silhouettes.known,
             doubted=TrackCondition.of(known).doubted,
             moved=known is not None and known.silhouettes.watch.moved,
             track_id=track.track_id,
-            existence=math.nan if known is None else known.existence_probability,
+            existence=math.nan if known is None else known.estimate.existence_probability,
             started_from='' if source is None else source.value,
-            beliefs={} if tracker is None else tracker.validity.shown,
+            beliefs={} if tracker is None else tracker.estimate.validity.shown,
         )
 
     def _status(self) -> tuple[str, str]:

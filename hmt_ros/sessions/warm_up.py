@@ -83,7 +83,7 @@ def warm_up_tracking() -> None:
         tracker.step(image, _stamp(t), shown.keypoints(t))
         depth = np.where(mask, DISTANCE, 2.0 * DISTANCE).astype(np.float32)
         other.step(image, _stamp(t), depth=usable_depths(depth))
-    keep_out_capsules(tracker.body, tracker.posterior)
+    keep_out_capsules(tracker.estimate.body, tracker.estimate.posterior)
 
 
 def likelihoods(body: Body) -> list[Any]:

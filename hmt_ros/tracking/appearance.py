@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera import NEAR, Camera
 from hmt_ros.body.keep_out import RUNNING_SPEED
 from hmt_ros.image.person_colours import LEARNING_INTERVAL, MEMORY_TIME, Colours, Motion
 from hmt_ros.image.person_shape import (
@@ -33,10 +33,6 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.error_model import seconds
 from hmt_ros.tracking.settings import MAJORITY, UNDECIDED_FRACTION
 from hmt_ros.tracking.view import View
-
-__all__ = ['MOST', 'Appearance', 'Motion']
-
-MOST = MAJORITY
 
 
 class Silhouetted(NamedTuple):
@@ -158,7 +154,7 @@ class Appearance:
         dt = 0.0 if self._model is None else seconds(stamp - self._stamp)
         gain = -math.expm1(-dt / MEMORY_TIME)
         self._model = model = covered(body, camera, pose, raster_step(camera.height))
-        self._depth, self._stamp = max(float(pose[2]), 0.1), stamp
+        self._depth, self._stamp = max(float(pose[2]), NEAR), stamp
         self._magnification = camera.magnification(self._depth) / raster_step(camera.height)
         free = self.open_to_view(view.others)
         if free < MAJORITY:

@@ -11,7 +11,7 @@
 
 A track starts once
 
-    log odds of existence + sure + log p(distance) >= log odds of PRESENT
+    log odds of existence + sure + log p(distance) >= log odds of PRESENT_PROBABILITY
 
 p(distance) is log-normal, wide, and never a limit: people are seen at 0.4 to 15 m by a lens of 60
 degrees, at distances that grow with the focal length. After a track has ended a silhouette before
@@ -48,7 +48,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.existence import CLEAR, PRESENT, Existence
+from hmt_ros.tracking.existence import CLEAR, Existence
 from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.initialisation import (
     mixture_from_box,
@@ -56,13 +56,13 @@ from hmt_ros.tracking.initialisation import (
     poses_from_outline,
     start_from_keypoints,
 )
-from hmt_ros.tracking.proposals import PosePrediction
-from hmt_ros.tracking.settings import MAX_STARTS, SAME_MOMENT
+from hmt_ros.tracking.pose_prediction import PosePrediction
+from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOMENT
 from hmt_ros.tracking.view import View
 
 # What a prediction is sure of by itself, nats: in the first image nothing else has spoken.
 AT_ONCE = 1.5 * CLEAR.nats
-PRESENT_LOG_ODDS = math.log(PRESENT / (1.0 - PRESENT))
+PRESENT_LOG_ODDS = math.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY))
 # Share of the best poses from keypoints whose reversals in depth are searched, too.
 REVERSED = MAX_STARTS // 4
 
@@ -111,28 +111,22 @@ class Shown:
 
     Attributes:
         view: of the image.
-        stamp: of the image, ns.
         model: of a person; a subject's lengths replace the model's.
         body: of the poses of a mixture.
         camera: that sees the person.
         upright: gravity; None: unknown.
         given: subject or mixture that the track starts from; None: the images start it.
         box: (left, top, right, bottom) of the person, px; None: unknown.
-        prediction: by the image, if any.
-        masked: whether the silhouette is a segmenter's.
         observed: makes the observation of the image.
     """
 
     view: View
-    stamp: int
     model: Body
     body: Body
     camera: Camera
     upright: Gravity | None
     given: Subject | GaussianMixture | None
     box: Box | None
-    prediction: PosePrediction | None
-    masked: bool
     observed: Callable[[], Observation]
 
     @property
@@ -144,7 +138,7 @@ class Shown:
 def _from_subject(shown: Shown) -> Beginning:
     subject = shown.given
     assert isinstance(subject, Subject)
-    fresh = seconds(shown.stamp - subject.stamp_ns) <= SAME_MOMENT
+    fresh = seconds(shown.view.stamp - subject.stamp_ns) <= SAME_MOMENT
     begun = start_from_keypoints(
         shown.model,
         shown.camera,
@@ -167,18 +161,20 @@ def _from_keypoints(shown: Shown) -> Beginning:
         shown.model, camera, Subject(0, keypoints, {}), upright=shown.upright, depths=depths
     )
     more = [lifted_poses(begun.body, camera, keypoints)]
-    if shown.prediction is not None:
-        more.append(shown.prediction.seen_as(begun.body).means)
+    if shown.view.prediction is not None:
+        more.append(shown.view.prediction.seen_as(begun.body).means)
     poses = [moved_to_depth(begun.body, camera, x, depths) for x in more]
     own = with_reversals(begun.body, begun.poses)
     return Beginning(Source.KEYPOINTS, begun.body, np.concatenate([own, *poses]))
 
 
 def _from_prediction(shown: Shown) -> Beginning:
-    assert shown.prediction is not None
-    body = shown.prediction.body
-    both = _mixture_at(shown.prediction.both_ways(body), body, shown.camera, shown.depths)
-    return Beginning(Source.PREDICTION, body, both)
+    prediction = shown.view.prediction
+    assert prediction is not None
+    both = _mixture_at(
+        prediction.both_ways(prediction.body), prediction.body, shown.camera, shown.depths
+    )
+    return Beginning(Source.PREDICTION, prediction.body, both)
 
 
 def _from_box(shown: Shown) -> Beginning:
@@ -199,8 +195,8 @@ def _from_mask(shown: Shown) -> Beginning | None:
 
 
 def _masked(shown: Shown) -> bool:
-    silhouette = shown.view.silhouette
-    return shown.masked and silhouette is not None and looks_like_person(silhouette)
+    silhouette, mask = shown.view.silhouette, shown.view.mask
+    return mask is not None and silhouette is not None and looks_like_person(silhouette)
 
 
 class StartKind(NamedTuple):
@@ -219,7 +215,9 @@ class StartKind(NamedTuple):
 
 STARTS = (
     StartKind(
-        lambda x: isinstance(x.given, Subject) and x.box is None and x.stamp >= x.given.stamp_ns,
+        lambda x: (
+            isinstance(x.given, Subject) and x.box is None and x.view.stamp >= x.given.stamp_ns
+        ),
         math.inf,
         _from_subject,
     ),
@@ -227,7 +225,7 @@ STARTS = (
         lambda x: isinstance(x.given, GaussianMixture) and x.box is None, math.inf, _from_mixture
     ),
     StartKind(lambda x: suffices(x.view.keypoints, x.model), 0.0, _from_keypoints),
-    StartKind(lambda x: x.prediction is not None, AT_ONCE, _from_prediction),
+    StartKind(lambda x: x.view.prediction is not None, AT_ONCE, _from_prediction),
     StartKind(lambda x: shows_a_part(x.view.keypoints, x.model), 0.0, _from_keypoints),
     StartKind(lambda x: x.box is not None, math.inf, _from_box),
     StartKind(_masked, 0.0, _from_mask),
@@ -245,7 +243,7 @@ def first_start(shown: Shown, existence: Existence) -> Beginning | None:
         return None
     sure = math.inf if shown.box is not None else kind.sure
     log_odds = existence.log_odds + sure
-    if log_odds < PRESENT_LOG_ODDS or (not sure and existence.llr <= 0.0):
+    if log_odds < PRESENT_LOG_ODDS or (not sure and existence.last.llr <= 0.0):
         return None
     begun = kind.begin(shown)
     if begun is not None:

@@ -23,10 +23,9 @@ from hmt_ros.body.camera_pose import CameraPose
 from hmt_ros.body.mirror import propagated, turn_jacobians, turned
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds
+from hmt_ros.tracking.classes import ways
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
-
-__all__ = ['CameraMotion', 'CameraPath', 'CameraPose']
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,7 @@ class CameraMotion:
         return result
 
     def modes(self, body: Body, modes: Modes) -> Modes:
-        """Modes in the new camera frame: poses, velocities and covariances."""
+        """Modes in the new camera frame: poses, velocities, covariances, soles and ways to face."""
         poses = self.poses(body, modes.poses)
         jacobians = self.jacobians(body, modes.poses, poses)
         count = modes.state_covariances.shape[1] // body.dimension
@@ -97,7 +96,9 @@ class CameraMotion:
         return replace(
             modes,
             poses=poses,
+            back=ways(body, poses, poses[0]),
             expected=self.poses(body, modes.expected),
+            soles=self.points(modes.soles),
             velocities=(jacobians @ modes.velocities[..., None])[..., 0],
             covariances=propagated(jacobians, modes.covariances),
             filtered=propagated(jacobians, modes.filtered),

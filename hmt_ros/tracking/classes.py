@@ -1,4 +1,6 @@
-"""Facing direction of the person: a two-state chain, whose evidence lasts as long as the track.
+"""Classes of a hypothesis that are chains: the way that it faces, and the sides of the detector.
+
+Facing direction of the person: a two-state chain, whose evidence lasts as long as the track.
 
     S_t- = max(logit [exp(Q dt)] p_(t-1), max min(log t(x_k, x_j), log h(x_k, x_j))),
                                                                    j as the track faces, k not  (1)
@@ -15,6 +17,16 @@ transition of the joints (`weighting`), h that of the heading, which wanders at 
 body. The best motion of either way stands for it (2), as the number of its modes is no evidence,
 nor is a motion that was not followed. An image shows the facing direction with the probability v,
 else something unrelated, like a flash or a covered lens (3): no single image turns a track about.
+A mode holds the odds of its own way: -S, or S where it faces back.
+
+Exchange of left and right by the detector, in each mode from image to image:
+
+    p(e_t | m) = sum_e' p(e_t | e') p(e' | ancestor of m),     p(e_t | e') = [exp(Q dt)]_e'e    (4)
+    p(e_t | m, keypoints) ~ p(e_t | m) exp(-E_e(x_m))                                           (5)
+
+Q are the rates at which detectors begin and cease to exchange sides (`image.keypoint_schemes`). A
+person who is turned about and whose sides are exchanged looks the same to the keypoints as one who
+is not: the two differ in that people turn slowly and detectors change their mind at once.
 """
 
 from __future__ import annotations
@@ -22,106 +34,117 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import faces_back, left_directions, root_rotation_dofs
+from hmt_ros.image.keypoint_schemes import exchange_rates, usual_exchanges
+from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Mask
+from hmt_ros.inference.markov_chain import MarkovChain
+from hmt_ros.tracking.hypotheses import Modes
+from hmt_ros.tracking.settings import FACING_VALID, LEAST_EXCHANGE, MAX_FACING_NATS
 
-# Probability v that the evidence of an image for a facing direction is about the person.
-VALID = 0.9
-# Largest log odds that are counted, nats: those against a way that a start does not contain.
-MOST = 10.0
+EXCHANGES = MarkovChain(exchange_rates())
 
 
-class Facing:
-    """Facing direction of the person of one track.
+# The way to face.
 
-    Attributes:
-        log_odds: S, that the person faces the other way than the leading mode, the heaviest.
-        back: (K,) modes that face the other way than that one.
+
+def ways(body: Body, poses: Array, reference: Array) -> Mask:
+    """Whether poses (N, d) face the other way than a pose (d,); a body without a trunk never."""
+    if not body.trunk_pairs:
+        return np.zeros(len(poses), dtype=np.bool_)
+    return np.asarray(faces_back(body, poses, reference), dtype=np.bool_)
+
+
+def first_facing(body: Body, poses: Array, log_weights: Array) -> Array:
+    """Log odds (N,) of the way that each of poses (N, d) faces at the start of a track."""
+    back = ways(body, poses, poses[np.argmax(log_weights)])
+    log_odds = -MAX_FACING_NATS
+    if back.any():
+        log_odds = max(float(log_weights[back].max() - log_weights[~back].max()), -MAX_FACING_NATS)
+    return np.where(back, log_odds, -log_odds)
+
+
+def lost_a_facing(back: Mask, log_weights: Array) -> bool:
+    """Whether no mode of comparable weight faces one of the two ways.
+
+    Args:
+        back: (K,) modes that face the other way than the heaviest.
+        log_weights: (K,) of the modes in the image.
     """
+    one_way = not back.any() or back.all()
+    return bool(one_way or log_weights[back].max() > log_weights[~back].max() + MAX_FACING_NATS)
 
-    def __init__(self) -> None:
-        self.log_odds = -MOST
-        self.back: Mask = np.zeros(0, dtype=np.bool_)
-        self._lead: Array | None = None
 
-    def start(self, body: Body, poses: Array, log_weights: Array) -> None:
-        """Takes in poses (N, d) at the start of a track, with their log weights (N,)."""
-        self.log_odds = -MOST
-        self._lead = poses[np.argmax(log_weights)]
-        if not body.trunk_pairs:
-            return
-        back = faces_back(body, poses, self._lead)
-        if back.any():
-            self.log_odds = max(float(log_weights[back].max() - log_weights[~back].max()), -MOST)
+def best_of_the_other_way(body: Body, poses: Array, log_weights: Array, least: float) -> list[int]:
+    """The heaviest of poses (N, d) that faces the other way than the heaviest of all, if any.
 
-    def lacks_a_way(self, log_weights: Array) -> bool:
-        """Whether the modes, log weights (K,), have lost one of the two ways.
+    It is kept as long as its way has any mass: small steps do not lead back to it.
 
-        A way is lost if it has no mode, or none that the odds could make up for.
-        """
-        back = self.back
-        one_way = not back.any() or back.all()
-        return bool(one_way or log_weights[back].max() > log_weights[~back].max() + MOST)
+    Args:
+        body: of the poses.
+        poses, log_weights: (N, d), (N,).
+        least: log weight relative to the heaviest below which a way has no mass.
+    """
+    best = int(np.argmax(log_weights))
+    back = np.flatnonzero(ways(body, poses, poses[best]))
+    back = back[log_weights[back] >= log_weights[best] + least]
+    return [int(back[np.argmax(log_weights[back])])] if len(back) else []
 
-    def lead(self, body: Body, poses: Array) -> None:
-        """Makes the first of the modes, poses (K, d), the reference for the facing direction."""
-        before = self._lead
-        if before is not None and body.trunk_pairs and faces_back(body, poses[:1], before)[0]:
-            self.log_odds = -self.log_odds
-        self.carry(body, poses)
 
-    def carry(self, body: Body, poses: Array) -> None:
-        """Takes in the same modes, (K, d), in the frame of a camera that has moved."""
-        self._lead = poses[0]
-        if body.trunk_pairs:
-            self.back = faces_back(body, poses, self._lead)
+def weigh_ways(
+    body: Body,
+    modes: Modes,
+    predicted: Array,
+    poses: Array,
+    transitions: Array,
+    log_weights: Array,
+    evidence: Array,
+    followed: Mask,
+    dt: float,
+) -> tuple[Array, Array]:
+    """Log weights (N,) of poses (N, d), in which either way has the weight of its history.
 
-    def weigh(
-        self,
-        body: Body,
-        poses: Array,
-        transitions: Array,
-        log_weights: Array,
-        evidence: Array,
-        followed: Mask,
-        dt: float,
-        predicted: Array,
-    ) -> Array:
-        """Log weights (N,) of poses (N, d), in which either way has the weight of its history.
+    Args:
+        body: of the poses.
+        modes: of the image before, K.
+        predicted: (K, d) poses that they are moved to.
+        poses: (N, d).
+        transitions: (K, N) log t(x_n, x_k) from the modes.
+        log_weights: (N,); only their ratios within a way are used.
+        evidence: (N,) energies of the image, nats.
+        followed: (N,) whether each has moved on from a mode.
+        dt: time since the image before, s.
 
-        Args:
-            body: of the poses.
-            poses: (N, d).
-            transitions: (K, N) log t(x_n, x_k) from the modes.
-            log_weights: (N,); only their ratios within a way are used.
-            evidence: (N,) energies of the image, nats.
-            followed: (N,) whether each has moved on from a mode.
-            dt: time since the image before, s.
-            predicted: (K, d) poses that the modes are moved to.
-        """
-        if self._lead is None or not body.trunk_pairs:
-            return log_weights
-        back = faces_back(body, poses, self._lead)
-        across = np.minimum(
-            transitions[np.ix_(~self.back, back)],
-            log_turns(body, predicted[~self.back], poses[back], dt),
-        )
-        stayed = body.symmetries['reversal'].after(self.log_odds, dt)
-        log_odds = max(stayed, float(across.max(initial=-np.inf)))
-        on, off = followed & ~back, followed & back
-        if on.any() and off.any():
-            log_odds += believed(float(evidence[on].min() - evidence[off].min()))
-        self.log_odds = log_odds = float(np.clip(log_odds, -MOST, MOST))
-        if back.all():
-            # All modes went over: the track is as sure of this way as it was of the other one.
-            self.log_odds = abs(log_odds)
-        if back.all() or not back.any():
-            return log_weights
-        result = log_weights.copy()
-        for which, odds in ((back, log_odds), (~back, -log_odds)):
-            share = -np.logaddexp(0.0, -odds)
-            result[which] += share - np.logaddexp.reduce(log_weights[which])
-        return result
+    Returns:
+        The log weights, and the log odds (N,) of the way that each faces.
+    """
+    log_odds = -float(modes.facing[0])
+    if not body.trunk_pairs:
+        return log_weights, np.full(len(poses), -log_odds)
+    back = ways(body, poses, modes.poses[0])
+    across = np.minimum(
+        transitions[np.ix_(~modes.back, back)],
+        log_turns(body, predicted[~modes.back], poses[back], dt),
+    )
+    stayed = body.symmetries['reversal'].after(log_odds, dt)
+    log_odds = max(stayed, float(across.max(initial=-np.inf)))
+    on, off = followed & ~back, followed & back
+    if on.any() and off.any():
+        log_odds += believed(float(evidence[on].min() - evidence[off].min()))
+    log_odds = float(np.clip(log_odds, -MAX_FACING_NATS, MAX_FACING_NATS))
+    if back.all():
+        # All modes went over: the track is as sure of this way as it was of the other one.
+        log_odds = abs(log_odds)
+    facing = np.where(back, log_odds, -log_odds)
+    if back.all() or not back.any():
+        return log_weights, facing
+    result = log_weights.copy()
+    for which, odds in ((back, log_odds), (~back, -log_odds)):
+        share = -np.logaddexp(0.0, -odds)
+        result[which] += share - np.logaddexp.reduce(log_weights[which])
+    return result, facing
 
 
 def log_turns(body: Body, first: Array, last: Array, dt: float) -> Array:
@@ -137,5 +160,35 @@ def log_turns(body: Body, first: Array, last: Array, dt: float) -> Array:
 
 def believed(evidence: float) -> float:
     """Evidence for a facing direction, bounded as an image may show something else, (3)."""
-    valid, other = np.log(VALID), np.log1p(-VALID)
+    valid, other = np.log(FACING_VALID), np.log1p(-FACING_VALID)
     return float(np.logaddexp(valid + evidence, other) - np.logaddexp(valid, other + evidence))
+
+
+# The sides.
+
+
+def predicted_exchanges(exchanges: Array, dt: float) -> Array:
+    """Log probabilities (K, E) of exchanges of sides a time dt, s, later, (4)."""
+    return np.log(np.maximum(EXCHANGES.predict(np.exp(exchanges), dt), LEAST_EXCHANGE))
+
+
+def known_exchanges(exchanges: Array) -> Array:
+    """Log probabilities (N, E) of exchanges of sides, where nothing is known the usual ones."""
+    return np.where(np.isnan(exchanges), usual_exchanges(), exchanges)
+
+
+def seen_exchanges(
+    likelihood: ImageLikelihood, observation: Observation, poses: Array, exchanges: Array
+) -> Array:
+    """Log probabilities (K, E) of exchanges of sides after an image, (5).
+
+    Args:
+        likelihood: of the body.
+        observation: of the image; without keypoints nothing changes.
+        poses: (K, d) modes.
+        exchanges: (K, E) of the modes, before the image.
+    """
+    if observation.keypoints is None or likelihood.settings.keypoints.weight == 0:
+        return exchanges
+    term = likelihood.keypoint_term(observation, known_exchanges(exchanges))
+    return term.exchanged(forward(likelihood.body.skeleton, poses), np.arange(len(poses)))

@@ -1,114 +1,43 @@
-"""Contact of the feet: a hidden Markov chain for every point of the soles of every mode.
-
-    prior      P = s + (c_(t-1) - s) exp(-(enter + leave) dt),    s = enter / (enter + leave)
-    height     log N(h; 0, s_h) - log(1 / LIFT)
-    motion     log(1 - q + q N(m; 0, S_rest) / N(m; 0, S_free)),  q = c_(t-1) exp(-leave dt) / P
-    posterior  logit c_t = logit P + a(dt) (height + motion)
-
-c is the probability that the point rests, m how far it moved since the image before and h its
-height over the floor. A point that rests has stayed with the probability q, and else has come to
-rest since that image. Along the line of sight an image shows little of m, so there both deviations
-are wider and nearer to each other. Errors of a pose last, so an image counts with its share a(dt)
-in time (`hmt_ros.inference.error_model`), and the errors of images that are close differ little.
-"""
+"""Contact of the feet of the modes, as far as the ground is known; see `body.foot_contact`."""
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.special import expit, logit
+from dataclasses import replace
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.foot_contact import contacts, first_contacts
 from hmt_ros.body.ground_terms import FEET, FloorPlane, sole_points
-from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.error_model import ERRORS, share_of_time
-from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
 
-# Rates at which a resting foot leaves the floor, and another comes to rest: those of walking, 1/s.
-LEAVES, ENTERS = 1.5, 2.5
-# How far errors of poses that are long apart move a point that rests, across and along the line of
-# sight, m.
-REST_ACROSS, REST_ALONG = 0.013, 0.033
-# Speed of a foot that does not rest, m/s: deviation of each component.
-FREE_SPEED = 1.0
-# Deviation of the height of a resting point from that of the floor, besides that of the floor
-# itself; height up to which a free foot is lifted, m.
-REST_HIGH, LIFT = 0.04, 0.25
+
+def contacts_of(
+    body: Body, plane: FloorPlane, modes: Modes, before: Modes | None, dt: float, *, still: bool
+) -> Modes:
+    """Modes with their soles, and the probabilities that these rest.
+
+    Args:
+        body: of the modes.
+        plane: gravity and floor.
+        modes: of an image.
+        before: modes of the image before, in the same camera frame, where the ancestors are; None:
+            the modes come from nothing before.
+        dt: time since then, s.
+        still: whether the motion of the camera is known.
+    """
+    points = sole_points(body, modes.poses)
+    if before is None:
+        return replace(modes, soles=points, contacts=first_contacts(plane, points))
+    rested, soles = before.contacts[modes.ancestors], before.soles[modes.ancestors]
+    found = contacts(plane, points, rested, soles, dt, still=still)
+    return replace(modes, soles=points, contacts=found)
 
 
-class FootContacts:
-    """Contact of the feet of the modes of a filter."""
+def by_foot(modes: Modes) -> dict[str, float]:
+    """Probability that the heaviest mode rests on a foot, by 'left_foot' and 'right_foot'.
 
-    def __init__(self) -> None:
-        self._probabilities = np.zeros((0, 0))
-        self._points = np.zeros((0, 0, 3))
-
-    def begin(self, body: Body, plane: FloorPlane, modes: Modes) -> None:
-        """Starts with modes that come from nothing before."""
-        self._points = sole_points(body, modes.poses)
-        usual = logit(ENTERS / (ENTERS + LEAVES))
-        self._probabilities = expit(usual + _height_evidence(plane, self._points))
-
-    def update(
-        self, body: Body, plane: FloorPlane, modes: Modes, dt: float, *, still: bool
-    ) -> None:
-        """Takes in the modes of the next image.
-
-        Args:
-            body: of the modes.
-            plane: gravity and floor.
-            modes: whose ancestors are the modes that were taken in before.
-            dt: time since then, s.
-            still: whether the motion of the camera is known; if not, that of a foot is no evidence.
-        """
-        points = sole_points(body, modes.poses)
-        before = self._probabilities[modes.ancestors]
-        usual = ENTERS / (ENTERS + LEAVES)
-        prior = usual + (before - usual) * np.exp(-(ENTERS + LEAVES) * dt)
-        evidence = _height_evidence(plane, points)
-        if still:
-            stayed = before * np.exp(-LEAVES * dt) / prior
-            moved = _motion_evidence(self._points[modes.ancestors], points, dt)
-            evidence += np.log1p(stayed * np.expm1(moved))
-        share = share_of_time(dt, ERRORS['image'].time)
-        self._probabilities = expit(logit(prior) + share * evidence)
-        self._points = points
-
-    def carry(self, motion: CameraMotion) -> None:
-        """Takes the places of the soles into the camera frame of the next image."""
-        self._points = motion.points(self._points)
-
-    def by_foot(self) -> dict[str, float]:
-        """Probability that the heaviest mode rests on a foot, by 'left_foot' and 'right_foot'.
-
-        Empty before the first image, and for a body without feet.
-        """
-        if not self._probabilities.size:
-            return {}
-        best = self._probabilities[0].reshape(len(FEET), -1).max(1)
-        return {f'{side}_foot': float(p) for side, p in zip(FEET, best, strict=True)}
-
-
-def _height_evidence(plane: FloorPlane, points: Array) -> Array:
-    """Log odds (K, P) of rest by the heights of points (K, P, 3)."""
-    if plane.height is None:
-        return np.zeros(points.shape[:2])
-    sigma = np.hypot(REST_HIGH, plane.height_sigma)
-    z = (points @ plane.up + plane.height) / sigma
-    result: Array = -0.5 * z * z - np.log(np.sqrt(2.0 * np.pi) * sigma / LIFT)
-    return result
-
-
-def _motion_evidence(before: Array, points: Array, dt: float) -> Array:
-    """Log odds (K, P) of rest by how far points (K, P, 3) moved in a time dt, s."""
-    ray = points / np.linalg.norm(points, axis=2, keepdims=True)
-    moved = points - before
-    along = (moved * ray).sum(2)
-    across = (moved * moved).sum(2) - along**2
-    differs = np.sqrt(-np.expm1(-dt / ERRORS['image'].time))
-    result = np.zeros(points.shape[:2])
-    for square, axes, error in ((across, 2, REST_ACROSS), (along**2, 1, REST_ALONG)):
-        rest = error * differs
-        free = np.hypot(rest, FREE_SPEED * dt)
-        result += axes * np.log(free / rest) - 0.5 * square * (rest**-2 - free**-2)
-    return result
+    Empty without modes, where the ground is not used, and for a body without feet.
+    """
+    if not modes.contacts.size:
+        return {}
+    best = modes.contacts[0].reshape(len(FEET), -1).max(1)
+    return {f'{side}_foot': float(p) for side, p in zip(FEET, best, strict=True)}

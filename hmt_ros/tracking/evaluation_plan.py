@@ -12,9 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.inference.arrays import Array
-from hmt_ros.tracking.settings import SURPRISING_RATIO, EvaluationPlan
-
-__all__ = ['EvaluationPlan', 'is_surprising']
+from hmt_ros.tracking.settings import SURPRISING_RATIO
 
 
 def is_surprising(moved: Array, precision: Array, hessian: Array) -> bool:

@@ -28,46 +28,38 @@ An image that has changed for the most part is no evidence: a covered lens, a fl
 colours of a track are no evidence against somebody when the camera has moved: they may have been
 those of a thing. For a person hidden by others, only evidence for the person counts. So only an
 image that shows the place empty ends a track: without it r tends to b / (b + l), which is far above
-`ABSENT`.
+`ABSENT_PROBABILITY`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import Enum
+from types import MappingProxyType
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
-from hmt_ros.inference.arrays import Array
+from hmt_ros.image.keypoint_evidence import keypoint_evidence, suffices
+from hmt_ros.image.person_colours import Motion
+from hmt_ros.image.still_picture import StillPicture
 from hmt_ros.inference.error_model import seconds, share_of_time
 from hmt_ros.inference.markov_chain import MarkovChain, of_log_odds, update
-from hmt_ros.tracking.appearance import MOST, Appearance, Motion
-from hmt_ros.tracking.keypoint_evidence import keypoint_evidence, suffices
+from hmt_ros.tracking.appearance import Appearance
+from hmt_ros.tracking.settings import (
+    ABSENT_PROBABILITY,
+    EXISTENCE_CUES,
+    MAJORITY,
+    PART_FRACTION,
+    PRESENT_PROBABILITY,
+    RATES,
+)
 from hmt_ros.tracking.view import View
 
-# Rates at which somebody comes into an empty view, and leaves it, per second.
-BIRTH, LEAVING = 0.1, 0.2
-CHAIN = MarkovChain.of_two(BIRTH, LEAVING)
-# Whether who comes is who was seen last: another takes the place once in so many seconds, unseen.
-SAME_PERSON = MarkovChain.of_two(0.0, 1.0 / 3600.0)
-# Above the first probability somebody is there, and a new track may start; below the second nobody
-# is, if the image says so. Between them it is undecided.
-PRESENT, ABSENT = 0.85, 0.03
-# Fraction of a cue that is left to a silhouette which a side of the image may cut, and to keypoints
-# of a part of a person.
-PART = 0.6
-
-
+CHAIN = MarkovChain.of_two(*RATES['existence'])
 NO_MOTION = Motion(moved=False, still=False)
-# Blur of images that are compared, px; least change of a pixel that noise does not make, grey
-# levels; share of the pixels around keypoints that change when a person breathes or sways within
-# tenths of a second (0.003 and more on ten clips of people, 0 on a table); least contrast.
-BLUR, CHANGED, MOVING, CONTRAST = 1.5, 10.0, 0.002, 4.0
 
 
 class Status(Enum):
@@ -91,15 +83,39 @@ class Cue(NamedTuple):
     tau: float
 
 
-# A clear image is wrong in 1 of 3,000 cases, by some lasting cause that is not modelled. A detector
-# misses a badly visible person in about 1 of 100 images, for longer.
-CLEAR = Cue(8.0, 0.2)
-DOUBTFUL = Cue(5.0, 0.25)
-
+CLEAR, DOUBTFUL = (Cue(*EXISTENCE_CUES[name]) for name in ('clear', 'doubtful'))
 
 # Probability before the first image, as after one clear image of nobody; a given start counts like
 # one clear image of somebody.
 NOBODY_YET, GIVEN = of_log_odds([-CLEAR.nats, CLEAR.nats])[:, 1].tolist()
+
+
+class Sighting(NamedTuple):
+    """Whom an image shows, by all cues.
+
+    Attributes:
+        said: log likelihood ratios by cue, nats; positive: somebody.
+        seen: whether it shows a filter something to follow: a cue shows somebody, or none shows
+            nobody and the image can be used.
+        blank: whether nothing is there to fit modes to, as others hide most of the person or as the
+            silhouette is that of nobody.
+        hidden: whether others hide most of the person.
+        elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
+            of no use: the track has to search.
+        there: whether it shows the person, or the same as an image that did.
+    """
+
+    said: Mapping[str, float] = MappingProxyType({})
+    seen: bool = False
+    blank: bool = False
+    hidden: bool = False
+    elsewhere: bool = False
+    there: bool = True
+
+    @property
+    def llr(self) -> float:
+        """Sum of the cues, nats; positive: it shows somebody."""
+        return sum(self.said.values())
 
 
 class Existence:
@@ -109,36 +125,23 @@ class Existence:
         probability: before the first image.
 
     Attributes:
-        said: log likelihood ratios of the last image by cue, nats; positive: somebody.
-        seen: whether the last image shows a filter something to follow: a cue shows somebody, or
-            none shows nobody and the image can be used.
-        hidden: whether others hid most of the person in the last image.
-        met: stamp of the last image that showed the person, ns; None: nobody is known.
-        elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
-            of no use: the track has to search.
+        last: what the last image shows.
+        told: when each cue spoke last, ns.
+        appearance: of the person.
     """
 
     def __init__(self, probability: float = NOBODY_YET) -> None:
         self._p = np.array([1.0 - probability, probability])
-        self.said: dict[str, float] = {}
-        self.seen = self.hidden = self.elsewhere = False
-        self.met: int | None = None
+        self.last = Sighting()
+        self.told: dict[str, int] = {}
+        self.appearance = Appearance()
         self._stamps: tuple[int, int] | None = None  # of the first and of the last image
-        # Whether the last image showed the person, or the same as one that did.
-        self._followed = True
-        self._asked: dict[str, int] = {}  # when each cue spoke last
-        self._appearance = Appearance()
-        self._counted: NDArray[np.float32] | None = None  # the picture in which keypoints counted
+        self._still = StillPicture()
 
     @property
     def probability(self) -> float:
         """R, given all images so far."""
         return float(self._p[1])
-
-    @property
-    def llr(self) -> float:
-        """Sum of the cues of the last image, nats; positive: it shows somebody."""
-        return sum(self.said.values())
 
     @property
     def log_odds(self) -> float:
@@ -147,71 +150,63 @@ class Existence:
         return float(somebody - nobody)
 
     @property
-    def told(self) -> bool:
-        """Whether any cue has spoken."""
-        return bool(self._asked)
-
-    @property
     def somebody(self) -> bool:
         """Whether a person is there."""
-        return self.probability >= PRESENT
+        return self.probability >= PRESENT_PROBABILITY
 
     @property
     def nobody(self) -> bool:
         """Whether nobody is there, and the last image has said so."""
-        return self.probability < ABSENT and self.llr < 0.0
+        return self.probability < ABSENT_PROBABILITY and self.last.llr < 0.0
 
-    def meet(self) -> None:
-        """Forgets the usual appearance of the person: another one may come."""
-        self._appearance = Appearance()
-
-    def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
-        """Learns the appearance from the last image, in which the person is at a pose (d,)."""
-        self.met = stamp
-        self._appearance.learn(view, stamp, body, camera, pose)
-
-    def look(self, view: View, stamp: int, body: Body, *, waiting: bool = False) -> None:
+    def look(self, view: View, body: Body, *, waiting: bool = False) -> None:
         """Takes the next image.
 
         Args:
-            view: of the image.
-            stamp: of the image, ns; later than the one before.
+            view: of the image, later than the one before.
             body: of the person.
             waiting: whether a track has still to start.
         """
+        stamp = view.stamp
         # Nothing but the image tells, so that its changes are worth a look.
         alone = view.anywhere is None and view.keypoints is None and not waiting
-        motion = self._appearance.motion(view) if alone else NO_MOTION
-        still = motion.still and self._followed
+        motion = self.appearance.motion(view) if alone else NO_MOTION
+        still = motion.still and self.last.there
         if self._stamps is not None and not still:
             self._p = CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
         # After so long a time the person who was seen last may have gone.
-        forgotten = CHAIN.transition(self._appearance.unseen(stamp))[1, 1] < MOST
-        self.hidden = self._appearance.open_to_view(view.others) < 1.0 - MOST
-        cues, usable, apart = self._cues(view, stamp, body)
+        forgotten = CHAIN.transition(self.appearance.unseen(stamp))[1, 1] < MAJORITY
+        hidden = self.appearance.open_to_view(view.others) < 1.0 - MAJORITY
+        cues, usable, apart = self._cues(view, body)
         denied = min((value * cue.nats for value, cue in cues.values()), default=0.0)
         if motion.moved and denied > -0.5 * DOUBTFUL.nats:
             cues['motion'] = 1.0, DOUBTFUL
-        if waiting and cues.get('detector', (0.0, CLEAR))[0] > 0.0 and self._is_counted(view):
+        detected = cues.get('detector', (0.0, CLEAR))[0] > 0.0
+        keypoints = view.keypoints if waiting and detected else None
+        if keypoints is not None and self._still.shows_again(view.image, keypoints):
             del cues['detector']
-        if self.hidden:
+        if hidden:
             cues = {name: cue for name, cue in cues.items() if cue[0] > 0.0}
-        self.said = {
+        said = {
             name: value * cue.nats * share_of_time(self._time_since(name, stamp), cue.tau)
             for name, (value, cue) in cues.items()
         }
-        self._p = update(self._p, [0.0, self.llr])
         values = [value for value, _ in cues.values()]
         shown = any(value > 0.0 for value in values)
-        self._followed = shown or still
-        self.seen = shown or (usable and not any(value < 0.0 for value in values))
-        self.elsewhere = shown and (forgotten or apart)
-        self._asked |= dict.fromkeys(cues, stamp)
+        seen = shown or (usable and not any(value < 0.0 for value in values))
+        self.last = Sighting(
+            said,
+            seen=seen,
+            blank=not seen and (hidden or view.silhouette is not None),
+            hidden=hidden,
+            elsewhere=shown and (forgotten or apart),
+            there=shown or still,
+        )
+        self._p = update(self._p, [0.0, self.last.llr])
+        self.told |= dict.fromkeys(cues, stamp)
         self._stamps = stamp if self._stamps is None else self._stamps[0], stamp
 
-    def _cues(
-        self, view: View, stamp: int, body: Body
-    ) -> tuple[dict[str, tuple[float, Cue]], bool, bool]:
+    def _cues(self, view: View, body: Body) -> tuple[dict[str, tuple[float, Cue]], bool, bool]:
         """Values of the cues by name, from -1, nobody, to 1, and two facts about the image.
 
         Returns:
@@ -220,24 +215,24 @@ class Existence:
         """
         cues, apart = {}, False
         usable = view.anywhere is None
-        found = self._appearance.silhouetted(view, stamp)
+        found = self.appearance.silhouetted(view, view.stamp)
         if found is not None:
             usable = True
-            part = PART if found.cut and found.by_place <= 0.0 < found.by_area else 1.0
+            part = PART_FRACTION if found.cut and found.by_place <= 0.0 < found.by_area else 1.0
             cues['silhouette'] = part * found.evidence, CLEAR
             apart = found.by_place < 0.0 < found.by_area
         if view.keypoints is not None:
             value = keypoint_evidence(view.keypoints, body)
             if value > 0.0:
-                part = 1.0 if suffices(view.keypoints, body) else PART
+                part = 1.0 if suffices(view.keypoints, body) else PART_FRACTION
                 cues['detector'] = part * value, CLEAR
-                apart = apart or self._appearance.is_apart(view, stamp)
+                apart = apart or self.appearance.is_apart(view, view.stamp)
             else:
                 cues['detector'] = value, DOUBTFUL
         if view.predicted is not None and (not view.predicted or view.anywhere is None):
             cues['predictor'] = (1.0, CLEAR) if view.predicted else (-1.0, DOUBTFUL)
         if found is None and not any(value > 0.0 for value, _ in cues.values()):
-            colours = self._appearance.colour_evidence(view)
+            colours = self.appearance.colour_evidence(view)
             # Where most of the image has changed, the colours may have, too.
             if colours is not None and (usable or colours[0]):
                 there, part = colours
@@ -245,25 +240,8 @@ class Existence:
                 cues['colours'] = 1.0 if there else -1.0, DOUBTFUL._replace(nats=nats)
         return cues, usable, apart
 
-    def _is_counted(self, view: View) -> bool:
-        """Whether keypoints lie on the picture in which they were counted last; else it counts."""
-        assert view.keypoints is not None
-        grey = cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY)
-        picture = cv2.GaussianBlur(grey, (0, 0), BLUR).astype(np.float32)
-        before, (height, width) = self._counted, grey.shape[:2]
-        if before is not None and before.shape == picture.shape:
-            pixels = view.keypoints.pixels[view.keypoints.seen]
-            left, top = np.clip(np.floor(pixels.min(0)), 0, [width - 1, height - 1]).astype(int)
-            right, bottom = np.clip(np.ceil(pixels.max(0)) + 1, 1, [width, height]).astype(int)
-            here = (slice(top, max(bottom, top + 1)), slice(left, max(right, left + 1)))
-            changed = np.abs(picture[here] - before[here]) > CHANGED
-            if picture[here].std() > CONTRAST and changed.mean() < MOVING:
-                return True
-        self._counted = picture
-        return False
-
     def _time_since(self, cue: str, stamp: int) -> float:
         """Time since a cue spoke, s; infinite in the first image."""
         if self._stamps is None:
             return math.inf
-        return seconds(stamp - self._asked.get(cue, self._stamps[0]))
+        return seconds(stamp - self.told.get(cue, self._stamps[0]))

@@ -32,17 +32,13 @@ from hmt_ros.inference.error_model import seconds
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.settings import (
-    AXIS_DEPTH_SIGMA,
     AXIS_SIGMA,
-    FIRST_LEVEL_SIGMA,
     GIVEN_UP_SIGMA,
     HEAD_DOWN_IMAGES,
-    HEAD_UP_COSINE,
     LEVEL_QUANTILE,
     LEVEL_SIGMA,
     LEVEL_TIME,
     LOOK_NATS,
-    MAX_TILT,
     MEASURED_SIGMA,
     RIGHT_VERTICAL_NATS,
     TURN_NOISE,
@@ -51,8 +47,6 @@ from hmt_ros.tracking.settings import (
     UPRIGHT_CONCENTRATION,
     VERTICAL_TIME,
 )
-
-__all__ = ['GIVEN_UP_SIGMA', 'Ground', 'GroundEstimator', 'GroundSettings', 'KnownGround']
 
 
 @dataclass(frozen=True)
@@ -236,8 +230,7 @@ class GroundEstimator:
         if self.known.up is not None:
             trunk = keypoints.trunk
             length = max(float(np.linalg.norm(trunk)), np.finfo(np.float64).eps)
-            cosine = float(trunk @ self.known.up[:2]) / length
-            self._by_keypoints += cosine if abs(cosine) > HEAD_UP_COSINE else 0.0
+            self._by_keypoints += float(trunk @ self.known.up[:2]) / length
             self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
@@ -262,6 +255,15 @@ class GroundEstimator:
     def vertical_known(self) -> bool:
         """Whether the vertical is given, or the lines of the scene show it; else it is guessed."""
         return self.known.up is not None or self._seen is not None
+
+    @property
+    def vertical(self) -> Array | None:
+        """(3,) the vertical, camera frame, as given or as the lines show it; None: unknown."""
+        return self.estimate.up if self.vertical_known else None
+
+    def gravity(self, weight: float) -> Gravity | None:
+        """Gravity for a start, with a factor on its energy; None: it is unknown, or not used."""
+        return Gravity(self.plane, weight) if self.vertical_known and weight > 0 else None
 
     @property
     def plane(self) -> FloorPlane:
@@ -316,17 +318,18 @@ class GroundEstimator:
             return
         ray = place / np.linalg.norm(place)
         along = np.outer(ray, ray)
-        error = AXIS_SIGMA**2 * (AXES - along) + AXIS_DEPTH_SIGMA**2 * along
+        error = AXIS_SIGMA**2 * (AXES - along) + (2.0 * AXIS_SIGMA) ** 2 * along
         error = error * max(VERTICAL_TIME / (resting * dt), 1.0)
         covariance = self._covariance + UP_DRIFT**2 * dt * AXES
         gain = covariance @ np.linalg.inv(covariance + error)
         mean = self._mean + gain @ (axis / length - self._mean)
         mean = mean / np.linalg.norm(mean)
         angle = float(np.arccos(np.clip(mean @ IMAGE_UP, -1.0, 1.0)))
-        if angle > MAX_TILT:
+        most = 2.0 * UP_SIGMA
+        if angle > most:
             aside = mean - IMAGE_UP * (mean @ IMAGE_UP)
             aside = aside / np.linalg.norm(aside)
-            mean = np.cos(MAX_TILT) * IMAGE_UP + np.sin(MAX_TILT) * aside
+            mean = np.cos(most) * IMAGE_UP + np.sin(most) * aside
         self._mean = mean
         values, vectors = np.linalg.eigh(covariance - gain @ covariance)
         values = np.clip(values, AXIS_SIGMA**2, UP_SIGMA**2)
@@ -360,7 +363,7 @@ class GroundEstimator:
             return None, np.inf
         levels = np.array([level for _, level in self._levels])
         low, high = np.quantile(levels, [0.5, LEVEL_QUANTILE])
-        few = FIRST_LEVEL_SIGMA / np.sqrt(len(levels))
+        few = 2.0 * LEVEL_SIGMA / np.sqrt(len(levels))
         return float(high), float(np.sqrt(LEVEL_SIGMA**2 + (high - low) ** 2 + few**2))
 
 

@@ -8,22 +8,20 @@ is locally optimal and a weight; if it is selected it is a mode, with covariance
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.image.keypoint_schemes import usual_exchanges
+from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-# Modes whose log weight is less than that of the heaviest by at most this, nats, show places where
-# the person may be.
-LIKELY = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +34,8 @@ class Hypotheses:
         ancestors: (N,) mode of the image before that each comes from.
         expected: (N, d) pose that the motion prior is centred at.
         jumped: (N, d) degrees of freedom that did not move there, but jumped.
+        exchanges: (N, E) log probabilities that the detector exchanges sides: before the image; of
+            modes after it. NaN: nothing is known of the detector.
     """
 
     poses: Array
@@ -43,22 +43,48 @@ class Hypotheses:
     ancestors: Index
     expected: Array
     jumped: NDArray[np.bool_]
+    exchanges: Array
 
     def __len__(self) -> int:
         return len(self.poses)
 
-    def __getitem__(self, rows: Index) -> Self:
+    def __getitem__(self, rows: Index | slice) -> Self:
         """Some of them."""
         parts: dict[str, Any] = {x.name: getattr(self, x.name)[rows] for x in fields(self)}
         return replace(self, **parts)
 
-    def joined(self, other: Self) -> Self:
-        """These and others."""
-        parts: dict[str, Any] = {
-            x.name: np.concatenate([getattr(self, x.name), getattr(other, x.name)])
-            for x in fields(self)
-        }
-        return replace(other, **parts)
+    def proposed(
+        self, rows: Index, poses: Array, jumped: Mask, expected: Array | None = None
+    ) -> Hypotheses:
+        """Hypotheses at other poses (N, d).
+
+        One that has jumped with all degrees of freedom says that the track was wrong: of the
+        detector nothing is known then.
+
+        Args:
+            rows: (N,) of these hypotheses, that they come from.
+            poses: (N, d).
+            jumped: (N, d) degrees of freedom that have jumped.
+            expected: (N, d) centres of the motion prior; None: where they have jumped to, else
+                those of the hypotheses that they come from.
+        """
+        if expected is None:
+            expected = np.where(jumped, poses, self.expected[rows])
+        anew = np.all(jumped, axis=1, keepdims=True)
+        return Hypotheses(
+            poses,
+            self.log_weights[rows],
+            self.ancestors[rows],
+            expected,
+            jumped,
+            np.where(anew, np.nan, self.exchanges[rows]),
+        )
+
+
+def joined(parts: Sequence[Hypotheses]) -> Hypotheses:
+    """All hypotheses of some proposals."""
+    arrays = {x.name: [getattr(one, x.name) for one in parts] for x in fields(Hypotheses)}
+    return Hypotheses(**{name: np.concatenate(each) for name, each in arrays.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +102,6 @@ class Optimised:
     def __getitem__(self, rows: Index) -> Optimised:
         return Optimised(self.hypotheses[rows], self.minima[rows])
 
-    def joined(self, other: Optimised) -> Optimised:
-        """These and others."""
-        return Optimised(self.hypotheses.joined(other.hypotheses), self.minima.joined(other.minima))
-
 
 @dataclass(frozen=True, eq=False)
 class Modes(Hypotheses):
@@ -96,6 +118,10 @@ class Modes(Hypotheses):
         identities: (N,) see `Identities`.
         origins: (N, M) probability that each continues mode m of the image before; M is 0 where
             the modes begin.
+        back: (N,) modes that face the other way than the heaviest, which is the first.
+        facing: (N,) log odds of the way that each faces, see `classes`.
+        soles: (N, P, 3) points of the soles, m.
+        contacts: (N, P) probabilities that these rest on the floor, see `contact`.
     """
 
     velocities: Array
@@ -105,6 +131,30 @@ class Modes(Hypotheses):
     state_covariances: Array
     identities: Index
     origins: Array
+    back: Mask
+    facing: Array
+    soles: Array
+    contacts: Array
+
+    @classmethod
+    def blank(cls, count: int, dimension: int) -> Modes:
+        """K modes of which nothing is known yet; none where there is no track."""
+        numbers, vectors = np.zeros(count), np.zeros((count, dimension))
+        matrices, nothing = np.zeros((count, dimension, dimension)), np.zeros((count, 0))
+        return cls(
+            **vars(new_hypotheses(vectors, numbers)),
+            velocities=vectors,
+            covariances=matrices,
+            filtered=matrices,
+            log_likelihoods=numbers,
+            state_covariances=matrices,
+            identities=np.zeros(count, dtype=np.intp),
+            origins=nothing,
+            back=np.zeros(count, dtype=np.bool_),
+            facing=numbers,
+            soles=nothing[:, :, None].repeat(3, axis=2),
+            contacts=nothing,
+        )
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -133,14 +183,16 @@ class Identities:
         first, self._last = self._last + 1, self._last + count
         return np.arange(first, self._last + 1)
 
-    def inherited(self, before: Index, ancestors: Index, jumped: NDArray[np.bool_]) -> Index:
-        """Numbers (N,) of the modes of an image, heaviest first.
+    def of(self, hypotheses: Hypotheses, before: Modes | None) -> Index:
+        """Numbers (N,) of hypotheses that become modes, heaviest first.
 
         Args:
-            before: (K,) of the modes of the image before.
-            ancestors: (N,) mode of that image that each comes from.
-            jumped: (N, d) degrees of freedom that did not move, but jumped.
+            hypotheses: N.
+            before: modes of the image before; None: they begin.
         """
+        if before is None:
+            return self.new(len(hypotheses))
+        ancestors, jumped = hypotheses.ancestors, hypotheses.jumped
         heirs: dict[int, int] = {}
         for candidates in (~jumped.any(1), ~jumped.all(1)):
             taken = set(heirs)
@@ -149,14 +201,21 @@ class Identities:
                     heirs.setdefault(int(ancestors[k]), int(k))
         result = np.zeros(len(ancestors), dtype=np.intp)
         for ancestor, heir in heirs.items():
-            result[heir] = before[ancestor]
+            result[heir] = before.identities[ancestor]
         fresh = np.flatnonzero(result == 0)
         result[fresh] = self.new(len(fresh))
         return result
 
 
-def new_hypotheses(poses: Array, log_weights: Array) -> Hypotheses:
-    """Hypotheses (N, d) that come from nothing before: each its own ancestor."""
+def new_hypotheses(poses: Array, log_weights: Array, exchanges: Array | None = None) -> Hypotheses:
+    """Hypotheses (N, d), each its own ancestor.
+
+    Args:
+        poses, log_weights: (N, d), (N,).
+        exchanges: (N, E) log probabilities of exchanged sides; None: nothing is known.
+    """
     everyone = np.arange(len(poses))
     still = np.zeros(poses.shape, dtype=np.bool_)
-    return Hypotheses(poses, log_weights, everyone, poses, still)
+    if exchanges is None:
+        exchanges = np.full((len(poses), usual_exchanges().shape[1]), np.nan)
+    return Hypotheses(poses, log_weights, everyone, poses, still, exchanges)

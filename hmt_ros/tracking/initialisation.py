@@ -26,7 +26,7 @@ from hmt_ros.flips.interpretation_tree import distinct_poses, enumerate_flips
 from hmt_ros.image.joint_depths import MIN_JOINTS, JointDepths, joint_depths
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Box, Observation
-from hmt_ros.image.pose_energy import PoseEnergy
+from hmt_ros.image.pose_energy import DAMPING, MAX_ITERATIONS, TOLERANCE, PoseEnergy, scale_of
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.subject import Subject
 from hmt_ros.image.terms.depth import DEPTH
@@ -62,14 +62,10 @@ class Start:
     Attributes:
         body: with the person's lengths.
         poses: (M, d) distinct poses, best first.
-        energies: (M,) of joints and soft prior.
-        hessians: (M, d, d).
     """
 
     body: Body
     poses: Array
-    energies: Array
-    hessians: Array
 
 
 def start_from_keypoints(
@@ -127,7 +123,7 @@ def _start(
     spread = np.linalg.inv(fits.hessian[best[0]])[d:, d:]
     body = replace(body, length_covariance=0.5 * (spread + spread.T))
     solved = _with_flips(body, camera, keypoints, prior_weight, upright, depths, fits.x[:, :d])
-    return Start(body, solved.x, solved.value, solved.hessian)
+    return Start(body, solved.x)
 
 
 def _with_flips(
@@ -153,14 +149,14 @@ def _with_flips(
     terms = (*likelihood.seen(observation, exchanges=NOT_EXCHANGED), *likelihood.priors)
     energy = PoseEnergy(likelihood, terms if upright is None else (*terms, upright.term(body)))
 
-    heads = _distinct(_solve(energy, guesses, body), body, 4)
+    heads = _distinct(energy.minimise(guesses), body, HEADINGS // 2)
     if len(heads.x) == 0:
         raise ValueError(NO_POSE)
     trees = [enumerate_flips(body, heads.x, c)[0] for c in (*body.chains, *body.chain_pairs)]
     flips = np.concatenate([heads.x, *trees])
     raw = energy.energy(flips, derivatives=Derivatives.NONE).value
     keep = np.argsort(raw, kind='stable')[: 2 * MAX_STARTS]
-    solved = _distinct(_solve(energy, flips[keep], body), body, MAX_STARTS)
+    solved = _distinct(energy.minimise(flips[keep]), body, MAX_STARTS)
     return solved[np.argsort(solved.value, kind='stable')]
 
 
@@ -362,26 +358,18 @@ def _fit_with_lengths(
         ],
         axis=1,
     )
-    lower = np.concatenate([body.lower, np.minimum(default - 5 * sigma, 0.5 * default)])
-    upper = np.concatenate([body.upper, np.maximum(default + 5 * sigma, 2.0 * default)])
-    positive = (
-        skeleton.length_names.index('shoulder_rise')
-        if 'shoulder_rise' in skeleton.length_names
-        else None
-    )
-    lower[d:] = np.where(
-        np.arange(count) == positive, default - 5 * sigma, np.maximum(lower[d:], 0.02)
-    )
-    scale = np.concatenate([np.where(skeleton.dof_is_rotation, 0.4, 0.3), np.full(count, 0.05)])
+    reach = 5.0 * sigma
+    # A length that varies by more than itself may be negative.
+    least = np.where(sigma < default, np.finfo(np.float64).eps, -np.inf)
     return minimise(
         EnergyFunction(energy),
         starts,
-        lower,
-        upper,
-        step_scale=scale,
-        damping=10.0,
-        max_iterations=80,
-        tolerance=1e-3,
+        np.concatenate([body.lower, np.maximum(np.minimum(default - reach, 0.5 * default), least)]),
+        np.concatenate([body.upper, np.maximum(default + reach, 2.0 * default)]),
+        step_scale=np.concatenate([scale_of(body), np.full(count, 0.05)]),
+        damping=10.0 * DAMPING,
+        max_iterations=2 * MAX_ITERATIONS,
+        tolerance=TOLERANCE,
     )
 
 
@@ -418,16 +406,6 @@ def _first_guesses(
     turned = body.joint_positions(result)[:, body.skeleton.joint_index(names)]
     result[:, :3] = middle - turned.mean(1)
     return result
-
-
-def _solve(energy: PoseEnergy, poses: Array, body: Body) -> Minimum:
-    return energy.minimise(
-        poses,
-        step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
-        damping=1.0,
-        max_iterations=40,
-        tolerance=1e-3,
-    )
 
 
 def _distinct(solved: Minimum, body: Body, count: int) -> Minimum:

@@ -16,12 +16,14 @@ images; its covariance is passed on beside the likelihood.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmt_ros.image.observation import Observation
-from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.image.pose_energy import PoseEnergy
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.error_model import (
     LIFTED_AS_KEYPOINTS,
     TOGETHER,
@@ -30,10 +32,10 @@ from hmt_ros.inference.error_model import (
 )
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.inference.motion_states import PredictedStates, fused
 from hmt_ros.tracking.hypotheses import Modes, Optimised
-from hmt_ros.tracking.motion_states import PredictedStates, fused
 from hmt_ros.tracking.posterior import ImageFit, Posterior, free_covariances
-from hmt_ros.tracking.settings import GATE_SIGMAS
+from hmt_ros.tracking.settings import MAX_MODE_SHIFT
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.weighting import at_least, normalised
 
@@ -68,10 +70,9 @@ def posterior_modes(
     shape: ShapeEstimate,
     dynamics: LinearGaussianDynamics,
     states: PredictedStates | None,
-    identities: Index,
     dt: float,
 ) -> Modes:
-    """The modes of the posterior.
+    """The modes of the posterior, without their identities and classes.
 
     Args:
         selected: K hypotheses at their optima, heaviest first.
@@ -82,7 +83,6 @@ def posterior_modes(
         shape: of the person, as far as it is known.
         dynamics: how modes move by themselves.
         states: of the ancestors, predicted; None: the modes begin, at rest.
-        identities: (K,) of the modes.
         dt: time since the image before, s; infinite: there is none.
     """
     h, solved = selected.hypotheses, selected.minima
@@ -92,9 +92,9 @@ def posterior_modes(
     covariances = alone = filtered
     measured = bool(observation.evidence) or observation.keypoints is not None
     if measured:
-        alone = posterior.covariances(fit, solved.free, dt)
+        alone = fit.lasting(solved.free, dt)
         covariances = TOGETHER * alone + shape.considered(
-            posterior.likelihood, observation, poses, posterior.given_way(poses, observation)[1]
+            posterior.likelihood, observation, poses, fit.given_way()[1]
         )
     if states is None:
         velocities = np.zeros_like(poses)
@@ -105,7 +105,8 @@ def posterior_modes(
             # Errors of images last: the propagated covariance uses a share of them, too.
             found = fused(states.covariances_of(h.ancestors, h.jumped), alone)
         velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, found)
-    return Modes(
+    return replace(
+        Modes.blank(*poses.shape),
         poses=poses,
         log_weights=log_weights,
         ancestors=h.ancestors,
@@ -116,7 +117,6 @@ def posterior_modes(
         filtered=filtered,
         log_likelihoods=-fit.image_energy,
         state_covariances=state_covariances,
-        identities=identities,
         origins=origins,
     )
 
@@ -142,13 +142,14 @@ def likelihood_modes(
     covariances = fit.covariances
     gradient = np.where(fit.free, fit.energy.derivatives()[0], 0.0)
     step = -np.einsum('kij,kj->ki', covariances, gradient)
-    limit = GATE_SIGMAS * np.sqrt(np.einsum('kii->ki', modes.covariances))
+    limit = MAX_MODE_SHIFT * np.sqrt(np.einsum('kii->ki', modes.covariances))
     step = np.clip(step, -limit, limit)
     means = np.clip(poses + step, body.lower, body.upper)
     volumes = 0.5 * np.linalg.slogdet(covariances)[1]
     weights = np.exp(at_least(normalised(volumes - fit.energy.value), MIN_LOG_WEIGHT))
     mixture = GaussianMixture(weights, means, covariances).sorted()
-    values = posterior.log_likelihoods(mixture.means, observation)
+    seen = PoseEnergy(posterior.likelihood, posterior.likelihood.seen(observation))
+    values = -seen.energy(mixture.means, derivatives=Derivatives.NONE).value
     gives_way = covariances[:1] * (fit.free[:1, :, None] & fit.free[:1, None, :])
     unknown = shape.considered(posterior.likelihood, observation, poses[:1], gives_way)[0]
     return Likelihood(mixture, values, _errors(fit, covariances, weights), unknown)

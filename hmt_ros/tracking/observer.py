@@ -11,20 +11,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.person_shape import raster_step
+from hmt_ros.image.silhouettes import Silhouettes, region_of
 from hmt_ros.image.terms.depth import DEPTH
-from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
-from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.tracking.misfit import SILHOUETTE
-from hmt_ros.tracking.person_shape import raster_step
 from hmt_ros.tracking.settings import TrackerSettings
-from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 from hmt_ros.tracking.validity import Validity
 from hmt_ros.tracking.view import View
 
@@ -47,65 +43,58 @@ class Observer:
         self._settings = settings
         self._silhouettes = silhouettes
 
-    def check_sizes(
-        self,
-        image: Image,
-        mask: Mask | None,
-        others: Mask | None,
-        depth: NDArray[np.floating] | None,
-    ) -> None:
-        """Raises ValueError where an array does not have the size of the camera's images."""
-        size = (self._camera.height, self._camera.width)
-        named = ((image, ''), (mask, 'a mask of '), (others, 'a mask of '), (depth, 'depths of '))
-        for each, name in named:
-            if each is not None and each.shape[:2] != size:
-                raise ValueError(f'the camera gives images of {size}, saw {name}{each.shape[:2]}')
+    def check(self, given: View, body: Body, last: int | None) -> None:
+        """Checks the inputs of an image.
 
-    def view(
-        self,
-        image: Image,
-        stamp: int,
-        keypoints: Keypoints | None,
-        mask: Mask | None,
-        body: Body,
-        poses: Array | None,
-        dt: float,
-        *,
-        predicted: bool | None,
-        others: Mask | None = None,
-        depth: NDArray[np.floating] | None = None,
-    ) -> View:
+        Args:
+            given: the image with its inputs.
+            body: that a prediction has to be of.
+            last: stamp of the image before, ns; None: there was none.
+
+        Raises:
+            ValueError: an array that does not have the size of the camera's images, a stamp that
+                does not increase, or a prediction of a body with other degrees of freedom.
+        """
+        if given.prediction is not None:
+            given.prediction.seen_as(body)
+        if last is not None and given.stamp <= last:
+            raise ValueError(f'stamps must increase, saw {given.stamp} after {last} ns')
+        size = (self._camera.height, self._camera.width)
+        masks = {'a mask of ': (given.mask, given.others), 'depths of ': (given.depth,)}
+        for name, arrays in {'': (given.image,), **masks}.items():
+            for each in arrays:
+                if each is not None and each.shape[:2] != size:
+                    raise ValueError(
+                        f'the camera gives images of {size}, saw {name}{each.shape[:2]}'
+                    )
+
+    def view(self, given: View, body: Body, poses: Array | None, dt: float) -> View:
         """The view of a person in an image.
 
         Args:
-            image: (H, W, 3) BGR uint8.
-            stamp: of the image, ns.
-            keypoints: of a detector, if any.
-            mask: (H, W) of a segmenter, if any.
+            given: the image with its inputs, without silhouettes.
             body: of the person.
             poses: (K, d) in an image before; None: the person may be anywhere.
             dt: time since that image, s.
-            predicted: whether a predictor expects somebody; None: it does not say.
-            others: (H, W) pixels that somebody else covers; None: none.
-            depth: (H, W) of a depth camera, m, if any.
         """
-        s = self._settings
+        if self._settings.likelihood.coverage.weight == 0:
+            return given
+        region = None if poses is None else region_of(body, self._camera, poses, dt=dt)
+        image, mask, others = given.image, given.mask, given.others
         silhouettes = self._silhouettes
-        found, anywhere, changed = None, None, 0.0
-        if s.likelihood.coverage.weight > 0:
-            region = None if poses is None else region_of(body, self._camera, poses, dt=dt)
-            found = silhouettes.silhouette(image, stamp, mask, region, others)
-        if found is not None:
-            anywhere = silhouettes.anywhere(image, mask, others, raster_step(self._camera.height))
-            changed = silhouettes.background.changed if mask is None else 0.0
-        foreground, unsure = (None, None) if found is None else found
-        return View(
-            image, foreground, anywhere, changed, keypoints, predicted, unsure, others, depth
+        found = silhouettes.silhouette(image, given.stamp, mask, region, others)
+        if found is None:
+            return given
+        return given._replace(
+            silhouette=found.foreground,
+            unsure=found.unsure,
+            anywhere=silhouettes.anywhere(image, mask, others, raster_step(self._camera.height)),
+            changed=silhouettes.background.changed if mask is None else 0.0,
         )
 
-    def seen_anywhere(self, view: View, stamp: int, mask: Mask | None) -> View:
+    def seen_anywhere(self, view: View) -> View:
         """The same view, with the silhouette of somebody who may be anywhere in it."""
-        found = self._silhouettes.silhouette(view.image, stamp, mask, None, view.others)
+        found = self._silhouettes.silhouette(view.image, view.stamp, view.mask, None, view.others)
         if found is None:
             return view
         return view._replace(silhouette=found.foreground, unsure=found.unsure)

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
-from hmt_ros.tracking.evaluation_plan import EvaluationPlan
-from hmt_ros.tracking.hypotheses import Hypotheses, Optimised
-from hmt_ros.tracking.motion_states import PredictedStates
+from hmt_ros.inference.motion_states import PredictedStates
+from hmt_ros.tracking.hypotheses import Hypotheses, Modes, Optimised
+from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.posterior import Posterior
+from hmt_ros.tracking.settings import EvaluationPlan
 from hmt_ros.tracking.weighting import Continuity
 
 
@@ -28,6 +29,9 @@ class Search:
         precisions: (K, d, d) inverse covariances of their poses.
         continuity: with the modes of the image before.
         plan: allocation of the evaluations of the image.
+        modes: of the image before.
+        contradicted: whether these missed more than a quarter of the keypoints there.
+        prediction: pose hypotheses from an external predictor, if any.
     """
 
     posterior: Posterior
@@ -36,6 +40,9 @@ class Search:
     precisions: Array
     continuity: Continuity
     plan: EvaluationPlan
+    modes: Modes
+    contradicted: bool
+    prediction: PosePrediction | None
 
     @property
     def dt(self) -> float:
@@ -51,11 +58,11 @@ class Search:
         posterior = self.posterior
         # Each has a precision of its own, where it jumped a lower one.
         own = self.states.precisions_of(hypotheses.ancestors, hypotheses.jumped, self.precisions)
-        term = posterior.given(self.observation, hypotheses, own)
+        term = posterior.given(self.observation, hypotheses.expected, own, hypotheses.exchanges)
         solved = posterior.minimise(term, hypotheses.poses, self.plan.iterations)
         return Optimised(hypotheses, solved)
 
     def evidence(self, optimised: Optimised) -> Array:
         """Energies (N,) that the image adds to minus the log weights, nats."""
-        exchanges = self.posterior.exchanges_of(optimised.hypotheses)
+        exchanges = optimised.hypotheses.exchanges
         return self.posterior.evidence(optimised.minima.x, self.observation, exchanges, self.dt)

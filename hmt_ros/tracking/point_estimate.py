@@ -24,7 +24,7 @@ from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.camera_motion import CameraMotion
-from hmt_ros.tracking.classes import VALID
+from hmt_ros.tracking.settings import FACING_VALID
 
 
 class PointEstimate:
@@ -92,7 +92,7 @@ class PointEstimate:
         turns = False
         if not begins:
             alike = _faces_as(body, posterior.means, self._leader)
-            turns = not alike.any() or weights[~alike].sum() > VALID * weights.sum()
+            turns = not alike.any() or weights[~alike].sum() > FACING_VALID * weights.sum()
             alike = ~alike if turns else alike
         self._leader = posterior.means[int(np.argmax(np.where(alike, weights, -1.0)))]
         return turns

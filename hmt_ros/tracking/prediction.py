@@ -24,8 +24,9 @@ from hmt_ros.inference.energy import Quadratic
 from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.inference.motion_states import PredictedStates
+from hmt_ros.tracking.classes import predicted_exchanges
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
-from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.posterior import Posterior
 
 
@@ -48,7 +49,8 @@ def predict(
     """
     states = predicted_states(modes, modes.state_covariances, body, dynamics, dt)
     moved = np.clip(states.poses, body.lower, body.upper)
-    return new_hypotheses(moved, modes.log_weights), states
+    exchanges = predicted_exchanges(modes.exchanges, dt)
+    return new_hypotheses(moved, modes.log_weights, exchanges), states
 
 
 def predicted_states(

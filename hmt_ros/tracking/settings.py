@@ -1,16 +1,17 @@
 """How poses are tracked: the settings of a tracker, and the numbers of its model.
 
 Settings are what users choose. The numbers below are the same for all of them. Each has its unit
-and its source: `physical` follows from people or from sensors, `chosen` was set by hand and kept on
-the clips of docs/tracking.md, `KJS` and other names are papers. Numbers of a concept of a lower
-layer stand with it: the person in `body`, silhouettes, colours and keypoints in `image`, errors of
-cues in `inference.error_model`.
+and its source: `Physical` follows from people or from sensors, `Chosen` was set by hand, by tracked
+clips. Numbers of a concept of a lower layer stand with it: the person in `body`, silhouettes,
+colours and keypoints in `image`, errors of cues in `inference.error_model`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 
@@ -24,9 +25,8 @@ PROPOSALS = ('kjs', 'css', 'ss')
 
 # --- Search
 
-# Evaluations of an image: of the nodes, which keep up with a camera, and of everything else.
-# Source: benchmarks/tracking_budgets.py.
-LIVE_BUDGET, ACCURATE_BUDGET = 300, 400
+# Evaluations of an image, where more hardly help. Source: benchmarks/tracking_budgets.py.
+ACCURATE_BUDGET = 400
 # Ratio of the squared motion of the heaviest mode to the expected one above which an image is
 # surprising: the motion prior is wider than most motions. Chosen.
 SURPRISING_RATIO = 0.3
@@ -50,10 +50,11 @@ MAX_JOINT_DISTANCE = 0.3
 TRANSITION_SPREAD, TRANSITION_TAILS = 0.01, 2.0
 # A mode ends where all its continuations are less likely than exp(-c); c in nats. Chosen.
 END_NATS = 5.0
+# Largest shift of a mode of the posterior to that of the likelihood, in standard deviations of the
+# posterior: the likelihood alone may be flat. Chosen.
+MAX_MODE_SHIFT = 5.0
 # Standard deviations beyond which a measurement is not explained, and a value not believed. Chosen.
 GATE_SIGMAS = 4.0
-# Variance of a pose that may be anywhere, as it jumped, rad^2 or m^2: as good as infinite.
-UNKNOWN_VARIANCE = 1e6
 
 # --- Start of a track
 
@@ -85,12 +86,11 @@ MAX_ANGLE_SHIFT = 0.2
 # Standard deviation of a given direction of gravity whose own is unknown, rad: how well a camera is
 # mounted. Physical.
 GIVEN_UP_SIGMA = np.radians(2.0)
-# Standard deviation of gravity from the y axis of an image, and its limit, rad: how people hold
-# cameras. Chosen.
-UP_SIGMA, MAX_TILT = np.radians(15.0), np.radians(35.0)
-# Deviation of the axis of a standing body from the vertical, across and along the line of sight,
-# rad. That of the vertical never undercuts the first. Chosen.
-AXIS_SIGMA, AXIS_DEPTH_SIGMA = np.radians(4.0), np.radians(9.0)
+# Standard deviation of gravity from the y axis of an image, rad: how people hold cameras. Chosen.
+UP_SIGMA = np.radians(15.0)
+# Deviation of the axis of a standing body from the vertical, rad; along the line of sight it is
+# twice as large. That of the vertical never undercuts it. Chosen.
+AXIS_SIGMA = np.radians(4.0)
 # Time for which an error of the vertical lasts, by the axis of a body and by the lines of the
 # scene, s. Chosen.
 VERTICAL_TIME = 1.0
@@ -98,16 +98,15 @@ VERTICAL_TIME = 1.0
 UP_DRIFT = np.radians(1.0)
 # Time over which the lowest sole is followed, s, and its quantile that is the floor. Chosen.
 LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
-# Deviation of the floor from that quantile, and of one image's, m. Chosen.
-LEVEL_SIGMA, FIRST_LEVEL_SIGMA = 0.04, 0.10
+# Deviation of the floor from that quantile, m; that of one image is twice as large. Chosen.
+LEVEL_SIGMA = 0.04
 # Change of a given direction of gravity that no noise of a sensor makes: the camera turns, rad.
 # Physical.
 TURN_NOISE = 0.003
-# Images from the start on that show a person head down by a given vertical, above which it is the
-# wrong way round though it points up in the image: handstands are shorter. Chosen.
+# Images from the start on that show a person head down by a given vertical, counted by the cosine
+# between trunk and vertical, above which it is the wrong way round though it points up in the
+# image: handstands are shorter. Chosen.
 HEAD_DOWN_IMAGES = 30.0
-# Cosine between trunk and vertical in an image from which it is upright or head down. Chosen.
-HEAD_UP_COSINE = 0.7
 # Log odds against a given vertical before any image, for a camera that is about upright, nats; as
 # much is the most that somebody who lies says: some do. Chosen.
 RIGHT_VERTICAL_NATS = 3.5
@@ -116,7 +115,7 @@ LOOK_NATS = 2.0
 # Concentration of the axes of people who do not lie about the vertical. Chosen.
 UPRIGHT_CONCENTRATION = 8.0
 
-# --- Camera, appearance and people
+# --- Camera and appearance
 
 # Time for which the last known motion of the camera is taken to go on, s. Chosen.
 MAX_EXTRAPOLATION_TIME = 0.5
@@ -125,17 +124,6 @@ MAJORITY = 0.5
 # Fraction of the usual value at which a silhouette is no evidence; at 0 it says that somebody is
 # absent, at twice this fraction present. Chosen.
 UNDECIDED_FRACTION = 0.25
-# Distance up to which a person and a detection are paired, in sizes of the person; it doubles
-# within `EXPECTED_TIME`. Chosen.
-ASSOCIATION_GATE = 0.4
-# Time for which a person is taken to go on as before, and to keep the size though less is seen now,
-# s. Chosen.
-EXPECTED_TIME = 1.0
-# Time constant of the velocity of a person in the images, s. Chosen.
-VELOCITY_TIME = 0.25
-# Margin around the area of a person, or around the hull of keypoints, that is masked for others, as
-# a fraction of the height: the radius of a limb. Physical.
-LIMB_MARGIN = 0.05
 
 
 @dataclass(frozen=True)
@@ -288,7 +276,7 @@ class TrackerSettings:
     def _planned(self, budget: int) -> EvaluationPlan:
         """The plan that keeps to an evaluation budget, and to the bounds of the settings."""
         hypotheses = min(self.max_hypotheses, max(budget // 25, 1))
-        limbs = budget // 65  # groups, or configurations of a limb
+        limbs, eighth = budget // 65, max(budget // 8, 1)
         searched = max(round(budget / ACCURATE_BUDGET), 1)
         return EvaluationPlan(
             hypotheses=hypotheses,
@@ -298,12 +286,78 @@ class TrackerSettings:
             rated=2 * budget // 5,
             rated_alone=2 * budget // 3,
             alternatives=min(self.alternatives, max(limbs, 2)),
-            combinations=min(self.combinations, max(budget // 8, 4)),
+            combinations=min(self.combinations, eighth),
             # With less than a quarter no limb is searched.
             searched_chains=min(self.searched_chains, searched)
             if SURPRISING_FACTOR * budget >= ACCURATE_BUDGET
             else 0,
-            samples=min(self.search.samples, budget // 8),
+            samples=min(self.search.samples, eighth),
             refined=min(self.search.refined, max(limbs // 2, 1)),
             surprising=False,
         )
+
+
+# --- Beliefs of a track
+
+# Rates at which chains of two states begin and end, 1/s.
+RATES: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {
+        # Somebody comes into an empty view, and leaves it. Chosen.
+        'existence': (0.1, 0.2),
+        # Another takes the place of who was seen last, unseen, once in an hour. Chosen.
+        'same person': (0.0, 1.0 / 3600.0),
+        # A track follows again, and fails; a cue shows the person again, or something else.
+        # Chosen.
+        'track and cues': (1.0, 0.05),
+        # A detector as a whole shows the person again, and somebody else. Chosen.
+        'detector': (1.0, 0.02),
+    }
+)
+# Largest log likelihood ratio of somebody against nobody in an image, nats, and how long its errors
+# last, s. A clear image is wrong in 1 of 3,000 cases, by some lasting cause that is not modelled. A
+# detector misses a badly visible person in about 1 of 100 images, for longer. Chosen.
+EXISTENCE_CUES: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {'clear': (8.0, 0.2), 'doubtful': (5.0, 0.25)}
+)
+# Probability of existence above which somebody is there, and a new track may start, and below which
+# nobody is, if the image says so. Between them it is undecided. Chosen.
+PRESENT_PROBABILITY, ABSENT_PROBABILITY = 0.85, 0.03
+# Fraction of a cue that is left to a silhouette which a side of the image may cut, and to keypoints
+# of a part of a person. Chosen.
+PART_FRACTION = 0.6
+# Evidence of a cue that is wholly explained against one that is not at all, nats, and the number of
+# its measurements that give it: neighbours err together. Chosen.
+VALIDITY_NATS, VALIDITY_COUNT = 16.0, 4
+# How long misfits of the modes to a cue last, s. Chosen.
+MISFIT_TIME = 0.1
+# Maximum evidence of one image about a cue, nats: it may be wrong in unforeseen ways. Chosen.
+MAX_CUE_NATS = 3.5
+# Probability that a mode has a part of the body where it is: limbs lag behind, and hide before the
+# trunk. Chosen.
+PLACED_PROBABILITY = 0.8
+# Probability that the evidence of an image for a facing direction is about the person. Chosen.
+FACING_VALID = 0.9
+# Largest log odds of a facing direction, nats: those against a way that a start lacks. Chosen.
+MAX_FACING_NATS = 10.0
+# Least probability of an exchange of sides by a detector. Chosen.
+LEAST_EXCHANGE = 1e-6
+# Log weight below that of the heaviest mode up to which modes show where the person may be, nats.
+# Chosen.
+LIKELY_NATS = 4.0
+# Share of the time for which somebody stands on both feet, where contact is unknown. Chosen.
+RESTING_SHARE = 0.3
+
+# --- Modes
+
+# Gain by a step below which a minimum is found, nats. Chosen.
+MINIMUM_TOLERANCE = 0.02
+# Largest standard deviation of a variable of a mode, where an image shows nothing, and that of one
+# which rests on its limit (3 degrees), rad or m. Chosen.
+MAX_SIGMA, LIMIT_SIGMA = 2.0, 0.05
+# How often the shape is fitted to the first image, and the number of the heaviest modes that it is
+# estimated from. Chosen.
+FIRST_SHAPE_FITS, SHAPE_MODES = 3, 4
+# Newton steps from the reversal of a mode to its optimum, before candidates are compared. Chosen.
+REVERSAL_ITERATIONS = 8
+# Bits of an identity below the number of the posture of unseen limbs.
+POSTURE_BITS = 20

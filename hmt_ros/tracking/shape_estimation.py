@@ -59,7 +59,6 @@ class ShapeEstimate:
 
     Attributes:
         covariance: (P, P) of the shape.
-        images: number of images that have been used.
     """
 
     def __init__(self, body: Body) -> None:
@@ -72,7 +71,6 @@ class ShapeEstimate:
         self._offset = np.zeros(size)
         # The offset of the person, who follows the estimate in steps.
         self._taken = self._offset
-        self.images = 0
         self._seen: Observation | None = None
         self._known: tuple[Array, Linearised] | None = None
 
@@ -80,13 +78,6 @@ class ShapeEstimate:
     def body(self) -> Body:
         """The person."""
         return self._space.body
-
-    @property
-    def deviations(self) -> dict[str, tuple[float, float]]:
-        """Difference from the start and standard deviation, by the name of the variable."""
-        sigma = np.sqrt(np.diagonal(self.covariance))
-        rows = zip(self._space.names, self._offset, sigma, strict=True)
-        return {name: (float(x), float(s)) for name, x, s in rows}
 
     def update(
         self,
@@ -137,7 +128,6 @@ class ShapeEstimate:
         if np.abs(ahead / self._spread).max() > REBUILDING_CHANGE:
             self._space, self._taken = ShapeSpace(self._space.moved(ahead)), self._offset
             self._known = None
-        self.images += 1
         return self._space.body
 
     def considered(

@@ -13,7 +13,8 @@ outline of the silhouette for the track, whether the silhouette is whole or not:
 colours of the room leave holes in it, and the rest of it is where the person is.
 
 A part of the body may be misplaced in a mode of a track that is right, and cover anything: the e_g
-of parts is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way.
+of parts is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way,
+w = `PLACED_PROBABILITY`. Where a track begins the pose was given.
 A silhouette of something else leads the modes x to itself, which then explain it. Where they leave
 more than a quarter of the keypoints, a pose x' by keypoints alone (`proposals.keypoint_poses`)
 stands for the states without the silhouette:
@@ -45,35 +46,29 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.inference.markov_chain import MarkovChain, update
 from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SILHOUETTE, Misfit
+from hmt_ros.tracking.settings import (
+    MAX_CUE_NATS,
+    MISFIT_TIME,
+    PLACED_PROBABILITY,
+    RATES,
+    VALIDITY_COUNT,
+    VALIDITY_NATS,
+)
 
-# Rates at which a cue ceases to show the person, or a track to follow, and the rates back, 1/s.
-FAILS, RECOVERS = 0.05, 1.0
-CHAIN = MarkovChain.of_two(RECOVERS, FAILS)
-# The same of a detector as a whole, which sees somebody else, 1/s.
-DETECTOR_CHAIN = MarkovChain.of_two(RECOVERS, 0.02)
-# Evidence of a cue that is wholly explained or not at all, N u and N (1 - u), nats in all, and the
-# number of its measurements that give it: neighbours err together.
-NATS, ENOUGH = 16.0, 4
-# How long misfits last, s.
-TAU = 0.1
-# Maximum evidence of one image about a cue, nats: it may be wrong in unforeseen ways.
-MOST = 3.5
+CHAIN = MarkovChain.of_two(*RATES['track and cues'])
 
 DEPTH = 'depth'
 # Misfit u at which a cue is as likely to be of something else: between those of images that show
 # the person and those that do not. Clothes in the colours of the room leave holes in a silhouette.
 UNDECIDED = {SILHOUETTE: 0.4, OUTLINE: 0.4, KEYPOINTS: 0.25, DEPTH: 0.15}
-# Probability w that a mode has a part of the body where it is: limbs lag behind, and hide before
-# the trunk. Where a track begins the pose was given.
-PLACED = 0.8
 # Axes of the joint probability: the track, the detector of keypoints, and the cues.
-TRACK, DETECTOR = 0, 1
+TRACK, DETECTOR = range(2)
 AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
 CHAINS = AXES[KEYPOINTS].stop
 # States (2^n, n) of the chains, and validity v in each: groups of a failed detector are invalid.
 STATES = np.array(np.unravel_index(np.arange(2**CHAINS), (2,) * CHAINS)).T
 AXIS_CHAINS = [CHAIN] * CHAINS
-AXIS_CHAINS[DETECTOR] = DETECTOR_CHAIN
+AXIS_CHAINS[DETECTOR] = MarkovChain.of_two(*RATES['detector'])
 VALID = STATES.copy()
 VALID[:, AXES[KEYPOINTS]] *= STATES[:, [DETECTOR]]
 WITHOUT_SILHOUETTE = (VALID[:, AXES[SILHOUETTE]] == 0).all(1)
@@ -172,9 +167,9 @@ class Validity:
             dt: time since the image before, s; infinite: there is none.
             alone: the pose by keypoints alone; None: the modes explain enough of them.
         """
-        share, begun = share_of_time(dt, TAU), bool(np.isfinite(dt))
+        share, begun = share_of_time(dt, MISFIT_TIME), bool(np.isfinite(dt))
         says = {
-            name: np.clip(share * evidence_of(name, x, begun=begun), -MOST, MOST)
+            name: np.clip(share * evidence_of(name, x, begun=begun), -MAX_CUE_NATS, MAX_CUE_NATS)
             for name, x in misfits.items()
         }
         if DEPTH in says:
@@ -189,6 +184,10 @@ class Validity:
             log_ratios = _divided(of_track, share, alone)
         log_ratios = np.where(VALID[:, TRACK] == 1, log_ratios, 0.0)
         self.joint = update(self.joint.ravel(), log_ratios).reshape(self.joint.shape)
+
+    def update_depths(self, share: float, dt: float) -> None:
+        """Takes in the share of depths that no pose explains; dt as for `update`."""
+        self.update({DEPTH: Misfit(np.array([share]), np.array([VALIDITY_COUNT]))}, dt)
 
     @property
     def _chains(self) -> Array:
@@ -220,9 +219,11 @@ def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
         misfit: of its groups.
         begun: whether there was an image before.
     """
-    certainty = np.minimum(misfit.counts / ENOUGH, 1.0)
-    e = np.asarray(NATS * certainty * (UNDECIDED[cue] - misfit.shares))
-    return _mixed(PLACED, e) - _mixed(1.0 - PLACED, e) if cue == KEYPOINTS and begun else e
+    certainty = np.minimum(misfit.counts / VALIDITY_COUNT, 1.0)
+    e = np.asarray(VALIDITY_NATS * certainty * (UNDECIDED[cue] - misfit.shares))
+    if cue != KEYPOINTS or not begun:
+        return e
+    return _mixed(PLACED_PROBABILITY, e) - _mixed(1.0 - PLACED_PROBABILITY, e)
 
 
 def _mixed(p: Array | float, evidence: Array) -> Array:

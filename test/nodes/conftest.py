@@ -116,7 +116,7 @@ class World:
 
         wanted = {one.source: (name, one) for name, one in self.node._heard.items()}
         name, one = wanted[source]
-        self.node._hand_on(name, received(data, one))
+        self.node._hear(name, received(data, one))
 
     def limit(self, source):
         """How many messages of a source may wait."""

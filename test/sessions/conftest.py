@@ -44,8 +44,8 @@ class StubTracker:
     ):  # fmt: skip
         self.body, self.camera, self.seed = body, camera, seed
         self.settings = settings or TrackerSettings()
-        self.background = background
         self.silhouettes = SimpleNamespace(
+            background=background,
             doubted=False,
             share=0.9,
             known='known',
@@ -56,9 +56,11 @@ class StubTracker:
         self.foreseen, self.nobody_shown, self.reason = False, True, ''
         self.track_id, self.started_from = 0, None
         self.existence_probability = 0.875
-        self.log_likelihoods = np.array([-1.5, -2.5])
-        self.likelihood_errors = CueErrors(0.25, 0.125)
-        self.shape_covariance = np.zeros((body.dimension, body.dimension))
+        self.likelihood = SimpleNamespace(
+            values=np.array([-1.5, -2.5]),
+            errors=CueErrors(0.25, 0.125),
+            shape_covariance=np.zeros((body.dimension, body.dimension)),
+        )
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
@@ -85,6 +87,11 @@ class StubTracker:
 
     def set_camera(self, position, rotation):
         self.poses.append((position, rotation))
+
+    @property
+    def estimate(self):
+        """It is its own estimate."""
+        return self
 
     @property
     def modes(self):

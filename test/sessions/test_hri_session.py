@@ -138,8 +138,9 @@ def test_people_who_are_gone_are_forgotten(session, outputs, people, monkeypatch
     assert one.identities == {'p1_1'}
 
 
-def test_who_is_silent_is_not_tracked(session, outputs, people, small_camera):
-    one = session(longest_silence=0.5)
+def test_who_is_silent_is_not_tracked(session, outputs, people, small_camera, monkeypatch):
+    monkeypatch.setattr(hri_session, 'LONGEST_SILENCE', 0.5)
+    one = session()
     one.take(CAMERA_INFO, small_camera.info(0))
     one.take(P1, people(0))
     one.take(CAMERA_INFO, small_camera.info(5))

@@ -143,7 +143,7 @@ def test_two_people_have_topics_of_their_own(session, outputs, small_camera):
     # One image, decoded once, and one background.
     first, second = StubTracker.made
     assert first.image is second.image
-    assert first.background is second.background
+    assert first.silhouettes.background is second.silhouettes.background
 
 
 def test_identities_stay_through_a_crossing(session, outputs, small_camera):
@@ -267,7 +267,7 @@ def test_an_empty_scene_is_learned_until_somebody_comes(session, small_camera):
         show(one, small_camera, i)
     show(one, small_camera, 6, somebody_at(15))
     show(one, small_camera, 7, somebody_at(15))
-    assert StubTracker.made[0].background.frames == 6
+    assert StubTracker.made[0].silhouettes.background.frames == 6
 
 
 def test_a_jump_back_and_a_reset_begin_anew(session, outputs, small_camera):

@@ -42,20 +42,19 @@ def track(body):
     covariances = root @ root.transpose(0, 2, 1) / body.dimension + 0.1 * np.eye(body.dimension)
     covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
     posterior = GaussianMixture(np.array([0.5, 0.3, 0.2]), poses, covariances)
-    tracker = SimpleNamespace(
+    estimate = SimpleNamespace(
         body=body,
-        camera=CAMERA,
-        settings=SimpleNamespace(max_hypotheses=8),
         status=Status.TRACKING,
-        track_id=1,
         existence_probability=0.75,
         reason='',
         published=SimpleNamespace(
             log_likelihoods=np.array([-3.0, -2.0, -1.0]), identities=np.arange(1, 4)
         ),
-        log_likelihoods=np.array([-2.5, -1.5]),
-        likelihood_errors=CueErrors(0.25, 0.125),
-        shape_covariance=0.01 * np.eye(body.dimension),
+        likelihood=SimpleNamespace(
+            values=np.array([-2.5, -1.5]),
+            errors=CueErrors(0.25, 0.125),
+            shape_covariance=0.01 * np.eye(body.dimension),
+        ),
         point_estimate=poses[1],
         ground=Ground(np.array([0.0, -0.8, -0.6]), 0.05, 1.5, 0.1),
         contacts={'left_foot': 0.75, 'right_foot': 0.25},
@@ -63,6 +62,12 @@ def track(body):
         vertical=None,
         # As rounding may leave them.
         validity=SimpleNamespace(shown={'depth': 0.25, 'track': 1.0 + 1e-15}),
+    )
+    tracker = SimpleNamespace(
+        camera=CAMERA,
+        settings=SimpleNamespace(max_hypotheses=8),
+        track_id=1,
+        estimate=estimate,
     )
     return TrackedImage(
         WaitingImage(np.full((240, 320, 3), 200, np.uint8), STAMP, 'lens'),
@@ -76,9 +81,11 @@ def track(body):
     )
 
 
-def changed(track, **of_tracker):
-    """The image with another tracker."""
-    return replace(track, tracker=SimpleNamespace(**{**vars(track.tracker), **of_tracker}))
+def changed(track, **of_estimate):
+    """The image with another estimate."""
+    estimate = SimpleNamespace(**{**vars(track.tracker.estimate), **of_estimate})
+    tracker = SimpleNamespace(**{**vars(track.tracker), 'estimate': estimate})
+    return replace(track, tracker=tracker)
 
 
 def draw(body, poses, weights, count, image):
@@ -117,7 +124,7 @@ def test_mixtures(track, body):
     assert (likelihood.error_share, likelihood.error_time) == (0.25, 0.125)
     assert np.isnan([posterior.error_share, posterior.error_time]).all()
     # So is what all images err by alike.
-    shape = track.tracker.shape_covariance.reshape(-1)
+    shape = track.tracker.estimate.likelihood.shape_covariance.reshape(-1)
     assert np.array_equal(likelihood.shape_covariance, shape)
     assert len(posterior.shape_covariance) == 0
     # The posterior tells what the cues are believed.
@@ -131,11 +138,11 @@ def test_mixtures(track, body):
 def test_joint_states_are_those_of_the_point_estimate(track, body):
     state = made(track)['human_joint_states']
     assert tuple(state.name) == body.dof_names
-    assert np.array_equal(state.position, track.tracker.point_estimate)
+    assert np.array_equal(state.position, track.tracker.estimate.point_estimate)
 
 
 def test_transforms_lead_from_the_camera_to_the_segments(track, body):
-    frames = forward(body.skeleton, track.tracker.point_estimate[None])
+    frames = forward(body.skeleton, track.tracker.estimate.point_estimate[None])
     transforms = {t.child_frame_id: t for t in made(track)['/tf'].transforms}
     for index, name in enumerate(body.skeleton.segment_names):
         transform = transforms[f'anna/{name}']
@@ -200,8 +207,11 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
         track,
         body=body,
         published=SimpleNamespace(log_likelihoods=np.zeros(2), identities=np.arange(2)),
-        log_likelihoods=np.zeros(2),
-        shape_covariance=np.zeros((body.dimension, body.dimension)),
+        likelihood=SimpleNamespace(
+            values=np.zeros(2),
+            errors=CueErrors(0.25, 0.125),
+            shape_covariance=np.zeros((body.dimension, body.dimension)),
+        ),
         point_estimate=poses[1],
     )
     found = made(replace(other, posterior=mixture, likelihood=mixture))
@@ -244,13 +254,13 @@ def test_ground(track, body):
     assert (content.stamp_ns, content.frame_id) == (STAMP, 'lens')
     np.testing.assert_allclose(content.plane, [0.0, -0.8, -0.6, 1.5])
     assert (content.up_sigma, content.height_sigma) == (0.05, 0.1)
-    assert content.contacts == track.tracker.contacts
+    assert content.contacts == track.tracker.estimate.contacts
     # The feet are those of the point estimate.
     feet = found['markers'].markers[-1]
     joints = dict(
         zip(
             body.joint_names,
-            body.joint_positions(track.tracker.point_estimate[None])[0],
+            body.joint_positions(track.tracker.estimate.point_estimate[None])[0],
             strict=True,
         )
     )
@@ -261,7 +271,7 @@ def test_ground(track, body):
 
 
 def test_ground_whose_height_is_unknown(track):
-    ground = Ground(track.tracker.ground.up, 0.3, None, np.inf)
+    ground = Ground(track.tracker.estimate.ground.up, 0.3, None, np.inf)
     unknown = changed(track, ground=ground, contacts={})
     found = made(unknown)
     content = ground_of(found['ground'])

@@ -112,7 +112,7 @@ def test_a_lost_track_is_told(session, outputs, small_camera, stub_tracker, monk
 
     def step(tracker, *inputs, **more):
         found = usual(tracker, *inputs, **more)
-        tracker.status = Status.LOST
+        tracker.estimate.status = Status.LOST
         return found
 
     usual = stub_tracker.step
@@ -676,7 +676,7 @@ def test_settings_reach_the_tracker(session, small_camera, stub_tracker, backgro
     assert tracker.settings.max_hypotheses == 3
     assert tracker.settings.evaluation_budget == 200
     assert tracker.seed == 5
-    assert tracker.background.frames > 0
+    assert tracker.silhouettes.background.frames > 0
 
 
 def test_changed_parameters_take_effect_with_the_next_track(session, small_camera, stub_tracker):
@@ -791,16 +791,16 @@ def test_an_image_that_shows_nothing_frees_nothing(session, outputs, small_camer
     one.take(IMAGE, small_camera.image(0))
     (tracker,) = stub_tracker.made
     # The posterior is a prediction, while the track has not been given up.
-    tracker.foreseen = True
+    tracker.estimate.foreseen = True
     one.take(IMAGE, small_camera.image(1))
     # It can not be tracked at all.
     stub_tracker.fault = ValueError('a hypothesis is not finite')
     one.take(IMAGE, small_camera.image(2))
-    stub_tracker.fault, tracker.foreseen = None, False
+    stub_tracker.fault, tracker.estimate.foreseen = None, False
     # Nobody, by an earlier image: the lens is covered now.
     stub_tracker.empty |= {small_camera.stamp(3), small_camera.stamp(4)}
     one.take(IMAGE, small_camera.image(3))
-    tracker.nobody_shown = False
+    tracker.estimate.nobody_shown = False
     one.take(IMAGE, small_camera.image(4))
     found = kept_out(outputs)
     assert [content.state.name for content in found] == [
@@ -818,8 +818,11 @@ def test_a_track_of_nobody_leaves_nothing_behind(session, outputs, small_camera,
     (tracker,) = stub_tracker.made
 
     def step(*_, **__):
-        tracker.status, tracker.reason = Status.WAITING, 'the scene was not seen empty'
-        tracker.existence_probability = np.nan
+        tracker.estimate.status, tracker.estimate.reason = (
+            Status.WAITING,
+            'the scene was not seen empty',
+        )
+        tracker.estimate.existence_probability = np.nan
         return None, None
 
     tracker.step = step

@@ -58,7 +58,7 @@ def test_a_tracker_is_the_same_after_it():
             for mixture in tracker.step(image, 10**9 + 10**8 * t, shown.keypoints(t)):
                 if mixture is not None:
                     found += [mixture.means.tobytes(), mixture.weights.tobytes()]
-        assert tracker.status is Status.TRACKING
+        assert tracker.estimate.status is Status.TRACKING
         return found
 
     before = tracked()

@@ -47,9 +47,13 @@ def tracked(film, human32, camera):
             stamp = i * FRAME if stamps is None else round(1e9 * stamps[i])
             posterior, likelihood = tracker.step(image, stamp, **inputs(i))
             assert (posterior is None) == (likelihood is None)
-            assert 0.0 <= tracker.existence_probability <= 1.0
+            assert 0.0 <= tracker.estimate.existence_probability <= 1.0
             found.append(
-                (tracker.status, tracker.track_id, 0 if posterior is None else len(posterior))
+                (
+                    tracker.estimate.status,
+                    tracker.track_id,
+                    0 if posterior is None else len(posterior),
+                )
             )
         return *(list(x) for x in zip(*found, strict=True)), tracker
 
@@ -87,9 +91,9 @@ def test_a_person_leaves_and_returns(film, tracked, human32):
     assert tracks == [1] * 18 + [2] * 7
     assert [count > 0 for count in components] == [x is not NOBODY for x in statuses]
     # Of the old track the lengths are kept.
-    assert tracker.body.segment_lengths == human32.segment_lengths
+    assert tracker.estimate.body.segment_lengths == human32.segment_lengths
     # A silhouette alone does not tell the pose at once, but the place.
-    assert np.abs(tracker.posterior.means[0, :3] - poses[9][:3]).max() < 0.3
+    assert np.abs(tracker.estimate.posterior.means[0, :3] - poses[9][:3]).max() < 0.3
 
 
 @pytest.mark.parametrize('evidence', ['silhouettes', 'keypoints'])
@@ -111,7 +115,9 @@ def test_after_hours_somebody_else_comes(film, tracked, human32, keypoints_of, e
         assert tracks == [1] * 3 + [wanted] * 4
         assert statuses[-1] is TRACKING
         assert min(components) > 0
-        kept = tracker.body.segment_lengths['thigh'] > human32.segment_lengths['thigh'] + 0.04
+        kept = (
+            tracker.estimate.body.segment_lengths['thigh'] > human32.segment_lengths['thigh'] + 0.04
+        )
         assert kept == (wanted == 1)
 
 
@@ -124,7 +130,9 @@ def test_lengths_of_somebody_who_left_hours_ago(film, tracked, human32, keypoint
         statuses, tracks, _, tracker = tracked(images, start=subject, stamps=stamps)
         assert statuses[10] is NOBODY
         assert (statuses[-1], tracks[-1]) == (TRACKING, 2)
-        kept = tracker.body.segment_lengths['thigh'] > human32.segment_lengths['thigh'] + 0.04
+        kept = (
+            tracker.estimate.body.segment_lengths['thigh'] > human32.segment_lengths['thigh'] + 0.04
+        )
         assert kept == (hours == 0.0)
 
 
@@ -140,7 +148,7 @@ def test_images_of_nothing_are_no_empty_scene(film, tracked, kind):
     assert statuses[26:] == [TRACKING] * 4
     assert set(tracks) == {1}
     assert min(components) > 0
-    assert np.abs(tracker.posterior.means[0, :3] - film[0][9][:3]).max() < 0.3
+    assert np.abs(tracker.estimate.posterior.means[0, :3] - film[0][9][:3]).max() < 0.3
 
 
 def test_nobody_from_the_start(film, tracked):
@@ -149,36 +157,35 @@ def test_nobody_from_the_start(film, tracked):
     assert statuses == [LOST] * 2 + [NOBODY] * 5
     assert tracks == [1] * 7
     assert components[2:] == [0] * 5
-    with pytest.raises(ValueError, match='no track yet'):
-        _ = tracker.posterior
+    assert len(tracker.estimate.posterior) == 0
     # A reset starts as it did the first time.
     tracker.reset()
-    assert tracker.status is Status.WAITING
+    assert tracker.estimate.status is Status.WAITING
     assert tracker.step(film[1][0], 0)[0] is not None
-    assert (tracker.status, tracker.track_id) == (Status.TRACKING, 2)
+    assert (tracker.estimate.status, tracker.track_id) == (Status.TRACKING, 2)
 
 
 def test_what_is_not_seen_moves_on_and_gets_wider(film, tracked):
     _, _, _, tracker = tracked(film[1][:4])
-    before, point = tracker.posterior, tracker.point_estimate
+    before, point = tracker.estimate.posterior, tracker.estimate.point_estimate
     empty = nothing(film, 'empty', 2)
     first, likelihood = tracker.step(empty[0], 4 * FRAME)
     second, _ = tracker.step(empty[1], 5 * FRAME)
-    assert tracker.evaluations == 0
+    assert tracker.estimate.evaluations == 0
     volumes = [np.linalg.slogdet(x.covariances)[1] for x in (before, first, second)]
     assert (np.diff(volumes, axis=0) > 0).all()
     assert np.array_equal(first.weights, before.weights)
     # Each component is the same mode. Poses of this body walk randomly: the best guess stays.
-    assert np.array_equal(tracker.origins, np.eye(len(second)))
-    assert np.array_equal(tracker.point_estimate, point)
+    assert np.array_equal(tracker.estimate.origins, np.eye(len(second)))
+    assert np.array_equal(tracker.estimate.point_estimate, point)
     # Such an image says nothing of where the person is.
     depth = likelihood.covariances[:, 2, 2]
     assert (depth > 1.0).all()
     # What follows is the same person.
     again, _ = tracker.step(film[1][5], 6 * FRAME)
-    assert (tracker.status, tracker.track_id) == (LOST, 1)
+    assert (tracker.estimate.status, tracker.track_id) == (LOST, 1)
     again, _ = tracker.step(film[1][6], 7 * FRAME)
-    assert (tracker.status, tracker.track_id) == (TRACKING, 1)
+    assert (tracker.estimate.status, tracker.track_id) == (TRACKING, 1)
     assert np.abs(again.means[0, :3] - film[0][6][:3]).max() < 0.2
 
 
@@ -214,7 +221,7 @@ def test_a_person_who_is_elsewhere_after_a_gap_is_found(film, tracked, gap):
     assert set(tracks) == {1}
     assert min(components) > 0
     assert statuses[-1] is TRACKING
-    place = tracker.posterior.means[0]
+    place = tracker.estimate.posterior.means[0]
     assert place[0] - film[0][3][0] == pytest.approx(90 / 330 * film[0][3][2], abs=0.3)
 
 
@@ -226,7 +233,7 @@ def test_a_gap_is_no_absence_until_an_image_says_so(film, tracked):
     )
     assert statuses == [TRACKING] * 2 + [LOST] * 2 + [NOBODY]
     assert components[3] > 0
-    assert tracker.existence_probability < 0.01
+    assert tracker.estimate.existence_probability < 0.01
 
 
 @pytest.mark.parametrize('closer', [0.5, -0.7])
@@ -248,7 +255,7 @@ def test_two_persons_cross(tracked, human32, camera, closer):
     assert set(tracks) == {1}
     assert min(components) > 0
     if closer < 0:
-        assert np.abs(tracker.posterior.means[0, :3] - poses[-1][:3]).max() < 0.5
+        assert np.abs(tracker.estimate.posterior.means[0, :3] - poses[-1][:3]).max() < 0.5
 
 
 def keypoint_inputs(film, human32, keypoints_of, seen):
@@ -273,7 +280,7 @@ def test_a_detector_sees_nobody(film, tracked, human32, keypoints_of):
     assert statuses[12:] == [NOBODY] * 4 + [TRACKING] * 4
     assert tracks == [1] * 16 + [2] * 4
     assert [count > 0 for count in components] == [x is not NOBODY for x in statuses]
-    joints = tracker.body.joint_positions(tracker.posterior.means)
+    joints = tracker.estimate.body.joint_positions(tracker.estimate.posterior.means)
     truth = human32.joint_positions(film[0][9][None])
     gaps = joints - joints[:, :1] - (truth - truth[:, :1])
     assert np.linalg.norm(gaps, axis=2).mean(1).min() < 0.08

@@ -72,8 +72,8 @@ def run(film, human32, camera, keypoints_of):
             change(i, inputs)
             pair = tracker.step(**inputs)
             check(tracker, pair)
-            errors.append(errors_of(tracker.body, pair[0], human32, poses[frame]))
-            shown.append(tracker.validity.shown)
+            errors.append(errors_of(tracker.estimate.body, pair[0], human32, poses[frame]))
+            shown.append(tracker.estimate.validity.shown)
         follow.shown = shown
         return Errors(*np.array(errors).T)
 
@@ -98,9 +98,9 @@ def check(tracker, pair):
         for numbers in (mixture.weights, mixture.means, mixture.covariances):
             assert np.isfinite(numbers).all()
         assert np.linalg.eigvalsh(mixture.covariances).min() > 0
-    assert np.isfinite(tracker.existence_probability)
-    assert np.isfinite(tracker.point_estimate).all()
-    assert tracker.status in (Status.TRACKING, Status.LOST)
+    assert np.isfinite(tracker.estimate.existence_probability)
+    assert np.isfinite(tracker.estimate.point_estimate).all()
+    assert tracker.estimate.status in (Status.TRACKING, Status.LOST)
 
 
 def errors_of(body, mixture, true_body, pose):

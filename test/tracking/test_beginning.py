@@ -21,7 +21,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import Status, Tracker, TrackerSettings
 from hmt_ros.tracking.beginning import STARTS, Source, with_reversals
-from hmt_ros.tracking.proposals import PosePrediction
+from hmt_ros.tracking.pose_prediction import PosePrediction
 from test.clips import read_clip
 
 FRAME = 100_000_000  # ns
@@ -92,13 +92,13 @@ def test_keypoints_start_a_track_once_they_last(human37, camera, black, keypoint
     # A person in one image may be a mistake.
     for i, keypoints in enumerate((seen[0], nothing, seen[1])):
         assert tracker.step(black, i * FRAME, keypoints) == (None, None)
-        assert tracker.status is Status.WAITING
+        assert tracker.estimate.status is Status.WAITING
     posterior, _ = tracker.step(black, 3 * FRAME, seen[2])
-    assert tracker.status is Status.TRACKING
-    assert tracker.started_from is Source.KEYPOINTS
-    assert error(tracker.body, posterior.means[0], human37, walk[2]) < 0.08
+    assert tracker.estimate.status is Status.TRACKING
+    assert tracker.estimate.started_from is Source.KEYPOINTS
+    assert error(tracker.estimate.body, posterior.means[0], human37, walk[2]) < 0.08
     # The background is not learned with the person in it.
-    assert tracker.background.frames == 1
+    assert tracker.silhouettes.background.frames == 1
 
 
 @pytest.mark.parametrize('stature', [1.55, 1.85])
@@ -106,24 +106,24 @@ def test_depth_is_as_uncertain_as_the_stature(start, human37, walk, stature):
     """One view tells no size; the covariance of the first mixture says so."""
     person = human37.with_stature(stature)
     tracker = start(person, 2)
-    mixture = tracker.posterior
+    mixture = tracker.estimate.posterior
     sigma = np.sqrt(mixture.covariances[0, 2, 2])
     wrong = mixture.means[0, 2] - walk[1, 2]
     assert 0.04 * walk[1, 2] < sigma < 0.12 * walk[1, 2]
     assert abs(wrong) < 2.5 * sigma
     # In proportion to the size the depth is right.
-    assert mixture.means[0, 2] / tracker.body.stature == pytest.approx(
+    assert mixture.means[0, 2] / tracker.estimate.body.stature == pytest.approx(
         walk[1, 2] / stature, rel=0.06
     )
 
 
 def test_without_legs_it_takes_longer(start, human37, walk):
     names = tuple(x for x in NAMES if not x.endswith(('hip', 'knee', 'ankle')))
-    assert start(images=4, names=names).status is Status.WAITING
+    assert start(images=4, names=names).estimate.status is Status.WAITING
     tracker = start(images=8, names=names)
-    assert tracker.status is Status.TRACKING
+    assert tracker.estimate.status is Status.TRACKING
     rows = [human37.joint_names.index(x) for x in names]
-    joints = tracker.body.joint_positions(tracker.posterior.means)[:, rows]
+    joints = tracker.estimate.body.joint_positions(tracker.estimate.posterior.means)[:, rows]
     truth = human37.joint_positions(walk[7:8])[:, rows]
     wrong = (joints - joints.mean(1, keepdims=True)) - (truth - truth.mean(1, keepdims=True))
     # From the side arms and shoulders alone hardly tell which way the person faces.
@@ -152,7 +152,7 @@ def test_a_detector_that_begins_with_sides_exchanged(human37, camera, black, key
         keypoints = detected(keypoints_of, human37, walk[i], seed=i, exchanged=i < 3)
         posterior, _ = tracker.step(black, i * FRAME, keypoints)
         if posterior is not None:
-            left = left_directions(tracker.body, posterior.means[:1])[0]
+            left = left_directions(tracker.estimate.body, posterior.means[:1])[0]
             back.append(left @ left_directions(human37, walk[i : i + 1])[0] < 0)
     assert not any(back[8:])
 
@@ -166,24 +166,24 @@ def test_reversals_explain_exchanged_sides(human37, camera, walk):
 
 
 def test_the_same_keypoints_give_the_same_track(start):
-    first, second = (start(images=3).posterior for _ in range(2))
+    first, second = (start(images=3).estimate.posterior for _ in range(2))
     assert first.means.tobytes() == second.means.tobytes()
     assert first.covariances.tobytes() == second.covariances.tobytes()
 
 
 def near(tracker, truth):
     """Whether the place of the heaviest mode is that of a pose, in a fifth of the distance."""
-    return np.abs(tracker.posterior.means[0, :3] - truth[:3]).max() < 0.2 * truth[2]
+    return np.abs(tracker.estimate.posterior.means[0, :3] - truth[:3]).max() < 0.2 * truth[2]
 
 
 def test_a_mask_starts_a_track(human37, camera, black, walk):
     masks = render_silhouettes(human37, walk, camera)
     tracker = Tracker(human37, camera, replace(FAST, likelihood=LikelihoodSettings()))
     for i in range(2):
-        assert tracker.status is Status.WAITING
+        assert tracker.estimate.status is Status.WAITING
         tracker.step(black, i * FRAME, mask=masks[i])
-    assert tracker.status is Status.TRACKING
-    assert tracker.started_from is Source.MASK
+    assert tracker.estimate.status is Status.TRACKING
+    assert tracker.estimate.started_from is Source.MASK
     assert near(tracker, walk[1])
 
 
@@ -194,7 +194,7 @@ def test_a_box_starts_a_track(human37, camera, black, walk):
     tracker = Tracker(human37, camera, replace(FAST, likelihood=LikelihoodSettings()))
     tracker.reset(box=box)
     posterior, _ = tracker.step(black, 0)
-    assert tracker.started_from is Source.BOX
+    assert tracker.estimate.started_from is Source.BOX
     assert near(tracker, walk[0])
     assert np.sqrt(posterior.covariances[0, 2, 2]) > 0.05 * walk[0, 2]
     # It is known for one image only.
@@ -228,12 +228,12 @@ def test_keypoints_of_a_detector_start_a_track(human37, name):
     names = clip.truth.joint_names
     rows = [names.index(x) for x in NAMES]
     true = clip.truth.joints[stamp][rows]
-    found = tracker.body.joint_positions(tracker.posterior.means[:1])[0]
+    found = tracker.estimate.body.joint_positions(tracker.estimate.posterior.means[:1])[0]
     found = found[[human37.joint_names.index(x) for x in NAMES]]
     hips = [NAMES.index('left_hip'), NAMES.index('right_hip')]
     wrong = (found - found[hips].mean(0)) - (true - true[hips].mean(0))
     assert np.linalg.norm(wrong, axis=1).mean() < 0.12
-    sigma = np.sqrt(tracker.posterior.covariances[0, 2, 2])
+    sigma = np.sqrt(tracker.estimate.posterior.covariances[0, 2, 2])
     depth = found[hips].mean(0)[2] - true[hips].mean(0)[2]
     assert abs(depth) < 2.5 * sigma
 
@@ -248,9 +248,9 @@ def test_why_no_track_starts_is_said(camera, human37, filmed):
     tracker = Tracker(human37, camera, FAST)
     for i in range(60):
         assert tracker.step(images[i % len(images)], i * FRAME) == (None, None)
-    assert tracker.status is Status.WAITING
-    assert tracker.reason == UNSEEN
-    assert np.isnan(tracker.existence_probability)
+    assert tracker.estimate.status is Status.WAITING
+    assert tracker.estimate.reason == UNSEEN
+    assert np.isnan(tracker.estimate.existence_probability)
     assert not tracker.silhouettes.scene.known
 
 
@@ -268,10 +268,10 @@ def test_a_track_that_a_ghost_began_ends(camera, human37, filmed):
     statuses = []
     for i, image in enumerate(images[4:]):
         tracker.step(image, (21 + i) * FRAME, prediction=prediction if i == 0 else None)
-        statuses.append(tracker.status)
+        statuses.append(tracker.estimate.status)
     assert statuses[0] is Status.TRACKING
     ended = statuses.index(Status.WAITING)
     assert ended <= 4
     assert set(statuses[ended:]) == {Status.WAITING}
-    assert tracker.reason == UNSEEN
-    assert np.isnan(tracker.existence_probability)
+    assert tracker.estimate.reason == UNSEEN
+    assert np.isnan(tracker.estimate.existence_probability)

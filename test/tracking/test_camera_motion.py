@@ -12,14 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_ros.body import Body, load_body
+from hmt_ros.body.camera_pose import CameraPose
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings, read_subject
-from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath, CameraPose
-from hmt_ros.tracking.contact import FootContacts
+from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath
+from hmt_ros.tracking.contact import by_foot, contacts_of
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.point_estimate import PointEstimate
@@ -64,11 +65,14 @@ def modes_of(body: Body, poses: np.ndarray, seed: int = 0) -> Modes:
     states = root @ root.transpose(0, 2, 1) + 1e-5 * np.eye(2 * d)
     velocities = rng.normal(size=(k, d))
     own = np.ascontiguousarray(states[:, :d, :d])
-    return Modes(
-        **vars(new_hypotheses(poses, np.zeros(k))), velocities=velocities, covariances=own,
-        filtered=own, log_likelihoods=np.zeros(k), state_covariances=states,
-        identities=np.arange(1, k + 1), origins=np.eye(k),
-    )  # fmt: skip
+    return replace(
+        Modes.blank(*poses.shape),
+        **vars(new_hypotheses(poses, np.zeros(k))),
+        velocities=velocities,
+        covariances=own,
+        filtered=own,
+        state_covariances=states,
+    )
 
 
 # What is carried.
@@ -161,7 +165,7 @@ def test_feet_rest_before_a_moving_camera(body):
     )  # fmt: skip
     found = []
     for carried in (True, False):
-        contacts, estimator = FootContacts(), GroundEstimator(KnownGround(UP, 1.0))
+        rested, estimator = None, GroundEstimator(KnownGround(UP, 1.0))
         before = drive(0.0)
         for t, pose in enumerate(standing):
             now = drive(0.1 * t)
@@ -170,15 +174,12 @@ def test_feet_rest_before_a_moving_camera(body):
             modes = replace(modes, velocities=np.zeros_like(modes.velocities))
             step = CameraMotion.between(before, now)
             if step is not None and carried:
-                contacts.carry(step)
+                rested = step.modes(body, rested)
                 estimator.carry(step)
-            if t == 0:
-                contacts.begin(body, estimator.plane, modes)
-            else:
-                contacts.update(body, estimator.plane, modes, 0.1, still=True)
+            rested = contacts_of(body, estimator.plane, modes, rested, 0.1, still=True)
             estimator.update(body, modes, 1.0, 0.1)
             before = now
-        found.append(max(contacts.by_foot().values()))
+        found.append(max(by_foot(rested).values()))
     assert found[0] > 0.8
     assert found[1] < 0.3
 
@@ -280,7 +281,9 @@ def track(body, camera, walking):
             if told:
                 tracker.set_camera(pose.position, pose.rotation)
             posterior, likelihood = tracker.step(black, t * FRAME)
-            found.append((posterior, likelihood, tracker.modes, tracker.point_estimate))
+            found.append(
+                (posterior, likelihood, tracker.estimate.modes, tracker.estimate.point_estimate)
+            )
         return tracker, found
 
     return run
@@ -310,7 +313,7 @@ def test_a_told_camera_that_stands_still_changes_no_bit(track, camera):
         for told in (False, True)
     )
     assert in_bytes(silent[1]) == in_bytes(told[1])
-    assert silent[0].contacts == told[0].contacts
+    assert silent[0].estimate.contacts == told[0].estimate.contacts
 
 
 def test_what_a_moving_camera_sees_is_what_a_still_one_sees(body, track):
@@ -356,9 +359,9 @@ def test_an_image_without_a_pose_is_tracked(body, track):
 def test_a_background_of_another_view_is_forgotten(body, camera, track):
     grey = np.full((camera.height, camera.width, 3), 40, np.uint8)
     tracker, _ = track(still, told=True, background=BackgroundModel.from_image(grey), frames=3)
-    assert tracker.background.frames > 0
+    assert tracker.silhouettes.background.frames > 0
     tracker, _ = track(drive, told=True, background=BackgroundModel.from_image(grey), frames=3)
-    assert tracker.background.frames == 0
+    assert tracker.silhouettes.background.frames == 0
     assert tracker.silhouettes.known == 'unknown'
 
 
@@ -383,7 +386,7 @@ def test_root_path_of_a_clip_with_a_moving_camera(human37):
         rotation, position = clip.views[stamp]
         tracker.set_camera(position, rotation)
         tracker.step(image, stamp, clip.keypoints[stamp])
-        root = tracker.body.joint_positions(tracker.point_estimate[None])[0]
+        root = tracker.estimate.body.joint_positions(tracker.estimate.point_estimate[None])[0]
         seen = (root[human37.joint_names.index('pelvis')], clip.truth.joints[stamp][pelvis])
         for path, point in zip((own, true), seen, strict=True):
             path.append(rotation @ point + position)

@@ -13,7 +13,9 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import KEYPOINTS
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking import Tracker, TrackerSettings
-from hmt_ros.tracking.posterior import Posterior, SideExchanges
+from hmt_ros.tracking.classes import known_exchanges, predicted_exchanges, seen_exchanges
+from hmt_ros.tracking.hypotheses import new_hypotheses
+from hmt_ros.tracking.posterior import Posterior
 from test.image.test_keypoints import BODY, CAMERA, exchanged, seen
 
 ARMS = ('shoulder', 'elbow', 'wrist', 'hand')
@@ -28,49 +30,44 @@ def standing():
     return pose
 
 
-def after(observation, count, dt=1.0 / 30.0):
-    """Exchanges after so many images of one pose."""
-    one, likelihood = SideExchanges(), ImageLikelihood(BODY, CAMERA)
+def after(observation, count, dt=1.0 / 30.0, exchanges=None):
+    """Log probabilities of exchanges (1, E) after so many images of one pose."""
+    if exchanges is None:
+        exchanges = np.full((1, usual_exchanges().shape[1]), np.nan)
+    likelihood = ImageLikelihood(BODY, CAMERA)
     for _ in range(count):
-        one.predict(dt)
-        prior = one.of(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.bool_))
-        one.update(likelihood, observation, standing()[None], prior)
-    return one
+        exchanges = predicted_exchanges(exchanges, dt)
+        exchanges = seen_exchanges(likelihood, observation, standing()[None], exchanges)
+    return exchanges
 
 
 def test_nothing_is_known_at_first():
-    one = SideExchanges()
-    one.predict(0.1)
-    np.testing.assert_array_equal(
-        one.of(np.array([0, 3]), np.zeros(2, dtype=np.bool_)), np.repeat(usual_exchanges(), 2, 0)
-    )
-    assert one.probabilities is None
+    nothing = after(Observation(), 2)
+    assert np.isnan(nothing).all()
+    np.testing.assert_array_equal(known_exchanges(nothing), usual_exchanges())
 
 
 def test_an_exchange_is_expected_to_stay_and_is_forgotten():
     turned = Observation(keypoints=exchanged(seen(standing()), LIMBS))
-    one = after(turned, 3)
-    assert one.probabilities[0, 1] > 0.9
-    one.predict(1.0 / 30.0)
-    assert np.exp(one.prior[0, 1]) > 0.6
-    one.predict(60.0)
-    assert np.exp(one.prior[0, 1]) < 0.1
+    known = after(turned, 3)
+    assert np.exp(known[0, 1]) > 0.9
+    assert np.exp(predicted_exchanges(known, 1.0 / 30.0)[0, 1]) > 0.6
+    assert np.exp(predicted_exchanges(known, 60.0)[0, 1]) < 0.1
 
 
 def test_images_without_keypoints_only_let_time_pass():
-    turned = Observation(keypoints=exchanged(seen(standing()), LIMBS))
-    one, likelihood = after(turned, 3), ImageLikelihood(BODY, CAMERA)
-    before = one.probabilities[0, 1]
-    one.predict(1.0 / 30.0)
-    prior = one.of(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.bool_))
-    one.update(likelihood, Observation(), standing()[None], prior)
-    assert one.probabilities[0, 1] < before
+    known = after(Observation(keypoints=exchanged(seen(standing()), LIMBS)), 3)
+    later = after(Observation(), 1, exchanges=known)
+    np.testing.assert_array_equal(later, predicted_exchanges(known, 1.0 / 30.0))
+    assert later[0, 1] < known[0, 1]
 
 
 def test_who_contradicts_the_track_knows_nothing_of_the_detector():
-    one = after(Observation(keypoints=exchanged(seen(standing()), LIMBS)), 3)
-    one.predict(1.0 / 30.0)
-    own = one.of(np.zeros(2, dtype=np.intp), np.array([False, True]))
+    known = after(Observation(keypoints=exchanged(seen(standing()), LIMBS)), 3)
+    expected = new_hypotheses(standing()[None], np.zeros(1), predicted_exchanges(known, 1.0 / 30.0))
+    poses = np.repeat(standing()[None], 2, axis=0)
+    jumped = np.repeat([[False], [True]], BODY.dimension, axis=1)
+    own = known_exchanges(expected.proposed(np.zeros(2, dtype=np.intp), poses, jumped).exchanges)
     np.testing.assert_array_equal(own[1], usual_exchanges()[0])
     assert own[0, 1] > own[0, 0]
     np.testing.assert_allclose(np.exp(own).sum(1), 1.0, rtol=1e-3)

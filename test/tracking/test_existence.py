@@ -14,13 +14,12 @@ from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.inference.markov_chain import update
 from hmt_ros.tracking.appearance import Motion
 from hmt_ros.tracking.existence import (
-    ABSENT,
     CHAIN,
     CLEAR,
     GIVEN,
-    PRESENT,
     Existence,
 )
+from hmt_ros.tracking.settings import ABSENT_PROBABILITY, PRESENT_PROBABILITY
 from hmt_ros.tracking.view import View
 
 SECOND = 1_000_000_000
@@ -33,7 +32,7 @@ NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 def test_without_an_image_nobody_is_not_said():
     """However long it lasts: r stays far above the limit."""
     for dt in (1.0, 1e3, 1e9):
-        assert CHAIN.predict([1 - GIVEN, GIVEN], dt)[1] > 5 * ABSENT
+        assert CHAIN.predict([1 - GIVEN, GIVEN], dt)[1] > 5 * ABSENT_PROBABILITY
 
 
 def test_against_the_bernoulli_filter_of_stone_soup():
@@ -94,22 +93,24 @@ def watched(film, human32, camera):
     def watch(views, rate=10.0, pose_of=lambda pose, _: pose, watching=None, first=0):
         if watching is None:
             watching = Existence(GIVEN)
-            watching.learn(views[0], round(first * SECOND / rate), human32, camera, film[0][first])
+            stamp = round(first * SECOND / rate)
+            watching.appearance.learn(views[0], stamp, human32, camera, film[0][first])
         found = []
         for i, view in enumerate(views, first):
             stamp = round(i * SECOND / rate)
-            watching.look(view, stamp, human32)
-            if watching.seen:
+            watching.look(view._replace(stamp=stamp), human32)
+            if watching.last.seen:
                 pose = pose_of(film[0][i % len(film[0])], i)
-                watching.learn(view, stamp, human32, camera, pose)
-            found.append((watching.probability, watching.seen))
+                watching.appearance.learn(view, stamp, human32, camera, pose)
+            found.append((watching.probability, watching.last.seen))
         return np.array([x for x, _ in found]), [x for _, x in found], watching
 
     return watch
 
 
 def view_of(image, mask, **fields):
-    return View(image, mask, mask, fields.pop('changed', mask.mean()), **fields)
+    changed = fields.pop('changed', mask.mean())
+    return View(image, silhouette=mask, anywhere=mask, changed=changed, **fields)
 
 
 def full_views(film, count=6, **fields):
@@ -131,19 +132,19 @@ def test_an_empty_scene_ends_it_within_half_a_second(film, watched, rate):
     assert not any(seen)
     assert watching.nobody
     # After the last image of the person, which is one before the first.
-    assert 0.3 <= (1 + np.argmax(found < ABSENT)) / rate <= 0.5
+    assert 0.3 <= (1 + np.argmax(found < ABSENT_PROBABILITY)) / rate <= 0.5
     # Who comes is there within 0.3 s.
     found, seen, _ = watched(full_views(film, 10), rate, watching=watching, first=26)
-    assert 0.1 <= np.argmax(found > PRESENT) / rate <= 0.34
+    assert 0.1 <= np.argmax(found > PRESENT_PROBABILITY) / rate <= 0.34
 
 
 @pytest.mark.parametrize('rate', [2.7, 1.0])
 def test_at_low_rates_one_image_or_two_suffice(film, watched, rate):
     _, _, watching = watched(full_views(film), rate)
     found, *_ = watched(empty_views(film, 2), rate, watching=watching, first=6)
-    assert found[-1] < ABSENT
+    assert found[-1] < ABSENT_PROBABILITY
     found, *_ = watched(full_views(film, 2), rate, watching=watching, first=8)
-    assert found[-1] > PRESENT
+    assert found[-1] > PRESENT_PROBABILITY
 
 
 @pytest.mark.parametrize('share', [0.36, 0.2])
@@ -156,7 +157,7 @@ def test_clothes_in_the_colours_of_the_room(film, watched, share):
     ]
     found, seen, watching = watched(views)
     assert all(seen)
-    assert found.min() > PRESENT
+    assert found.min() > PRESENT_PROBABILITY
     _, seen, _ = watched(empty_views(film, 3), watching=watching, first=10)
     assert not any(seen)
 
@@ -168,17 +169,17 @@ def test_a_wrong_pose_is_not_an_absent_person(film, watched):
         return pose if i < 6 else pose + 0.9 * (np.arange(len(pose)) == 0)
 
     found, seen, watching = watched(full_views(film, 7), pose_of=aside)
-    assert not watching.elsewhere
+    assert not watching.last.elsewhere
     found, seen, watching = watched(full_views(film, 4), pose_of=aside, watching=watching, first=7)
     assert all(seen)
-    assert found.min() > PRESENT
-    assert watching.elsewhere
+    assert found.min() > PRESENT_PROBABILITY
+    assert watching.last.elsewhere
     remnant = [
         view_of(view.image, view.silhouette & (np.arange(240) > 205)[:, None])
         for view in full_views(film, 3)
     ]
     found, *_ = watched(remnant, watching=watching, first=11)
-    assert watching.llr < 0
+    assert watching.last.llr < 0
 
 
 def test_a_part_of_the_person_is_a_person(film, watched):
@@ -210,7 +211,7 @@ def test_images_that_show_nothing_say_nothing(film, watched, kind, background):
     _, _, watching = watched(before)
     r = watching.probability
     found, *_ = watched([view] * 3, watching=watching, first=6)
-    assert watching.llr == 0.0
+    assert watching.last.llr == 0.0
     assert found[-1] == pytest.approx(CHAIN.predict([1 - r, r], 0.3)[1], abs=1e-9)
 
 
@@ -224,18 +225,18 @@ def test_colours_are_asked_where_the_background_is_of_no_use(film, watched):
     assert seen == [True] * 2
     # There they say nothing against the person.
     watched([view_of(empty, everything, changed=1.0)] * 3, watching=watching, first=8)
-    assert watching.llr == 0.0
+    assert watching.last.llr == 0.0
 
 
 def test_colours_decide_where_there_is_no_background(film, watched):
     _, images, _, empty = film
     found, seen, watching = watched([View(image) for image in images[:8]])
     assert seen == [True] * 8
-    assert found.min() > PRESENT
+    assert found.min() > PRESENT_PROBABILITY
     found, seen, _ = watched([View(empty)] * 20, watching=watching, first=8)
     assert not any(seen)
     assert watching.nobody
-    assert 0.4 < 0.1 * (1 + np.argmax(found < ABSENT)) < 2.0
+    assert 0.4 < 0.1 * (1 + np.argmax(found < ABSENT_PROBABILITY)) < 2.0
 
 
 def test_colours_say_nothing_against_somebody_in_another_scene(film, watched):
@@ -247,11 +248,11 @@ def test_colours_say_nothing_against_somebody_in_another_scene(film, watched):
         aside, watching=watching, first=60,
         pose_of=lambda pose, _: pose + 90 / 330 * pose[2] * (np.arange(len(pose)) == 0),
     )  # fmt: skip
-    assert found[-1] > PRESENT
+    assert found[-1] > PRESENT_PROBABILITY
     found, seen, _ = watched([View(empty)] * 50, watching=watching, first=65)
     assert not any(seen)
-    assert watching.llr == 0.0
-    assert found.min() > 5 * ABSENT
+    assert watching.last.llr == 0.0
+    assert found.min() > 5 * ABSENT_PROBABILITY
 
 
 @pytest.mark.parametrize('rate', [10.0, 5.0, 2.7])
@@ -275,7 +276,7 @@ def test_a_thing_that_was_taken_for_somebody_leaves_the_image(film, watched, rat
     found, seen, _ = watched(turned * 3, rate, watching=watching, first=2 * len(before))
     assert not any(seen)  # it is not what was learned
     assert not watching.somebody
-    assert found.min() > 5 * ABSENT
+    assert found.min() > 5 * ABSENT_PROBABILITY
 
 
 def test_who_turns_about_may_have_other_colours(film, watched):
@@ -286,14 +287,14 @@ def test_who_turns_about_may_have_other_colours(film, watched):
     back[masks[7]] = 255, 40, 10
     found, *_ = watched([View(back)] * 30, watching=watching, first=8)
     assert not watching.nobody
-    assert found.min() > 5 * ABSENT
+    assert found.min() > 5 * ABSENT_PROBABILITY
 
 
 def test_colours_that_are_the_same_everywhere_say_nothing(film, watched):
     grey = np.full(film[3].shape, 90, np.uint8)
     _, seen, watching = watched([View(grey)] * 20)
     assert all(seen)
-    assert watching.llr == 0.0
+    assert watching.last.llr == 0.0
 
 
 def keypoints(count, confidence, at=(100.0, 100.0)):
@@ -310,7 +311,7 @@ def test_a_failed_detector_does_not_end_a_track_with_a_silhouette(film, watched)
         views = full_views(film, 10, keypoints=NO_KEYPOINTS)
         found, seen, _ = watched(views, rate)
         assert all(seen)
-        assert found.min() > PRESENT
+        assert found.min() > PRESENT_PROBABILITY
 
 
 @pytest.mark.parametrize('fields', [{'keypoints': NO_KEYPOINTS}, {'predicted': False}])
@@ -321,26 +322,26 @@ def test_a_detector_alone_can_end_a_track(film, watched, fields):
         views = [View(grey, **fields)] * 40
         found, seen, _ = watched(views, rate, watching=watching, first=2)
         assert not any(seen)
-        assert 0.5 <= (1 + np.argmax(found < ABSENT)) / rate <= 1.1
+        assert 0.5 <= (1 + np.argmax(found < ABSENT_PROBABILITY)) / rate <= 1.1
 
 
 def test_a_detector_that_does_not_answer_says_nothing(film, watched):
     grey = np.full(film[3].shape, 90, np.uint8)
     _, _, watching = watched([View(grey), *[View(grey)] * 20])
-    assert watching.llr == 0.0
+    assert watching.last.llr == 0.0
 
 
 def test_keypoints_far_from_the_model_are_somebody_elsewhere(film, watched):
     grey = np.full(film[3].shape, 90, np.uint8)
     _, _, watching = watched([View(grey)] * 2)
     watched([View(grey, keypoints=keypoints(12, 0.9, (160.0, 120.0)))], watching=watching, first=2)
-    assert not watching.elsewhere
+    assert not watching.last.elsewhere
     # In 0.1 s nobody walks 1.2 m.
     far = [View(grey, keypoints=keypoints(12, 0.9, (10.0, 120.0)))]
     watched(far, watching=watching, first=3)
-    assert not watching.elsewhere
+    assert not watching.last.elsewhere
     watched(far, watching=watching, first=13)
-    assert watching.elsewhere
+    assert watching.last.elsewhere
 
 
 @pytest.mark.parametrize('hidden', [0.6, 1.0])
@@ -352,8 +353,8 @@ def test_who_is_hidden_has_not_left(film, watched, hidden):
     others[: round(rows[0] + hidden * (rows[-1] - rows[0])) + 1] = True
     views = empty_views(film, 50, keypoints=NO_KEYPOINTS, others=others)
     found, *_ = watched(views, watching=watching, first=6)
-    assert watching.hidden
-    assert watching.llr == 0.0
+    assert watching.last.hidden
+    assert watching.last.llr == 0.0
     assert not watching.nobody
     assert np.all(np.diff(found) < 0)
     assert found[-1] > 0.3
@@ -366,7 +367,7 @@ def test_a_part_that_others_hide_is_not_missed(film, watched):
     part = [view_of(view.image, view.silhouette & ~others, others=others) for view in views]
     found, seen, watching = watched(part)
     assert all(seen)
-    assert not watching.hidden
+    assert not watching.last.hidden
     assert found.min() > 0.99
 
 
@@ -374,7 +375,7 @@ def test_the_first_image_of_somebody_leaves_it_open(film, watched):
     """A second one shortly after does not."""
     found, *_ = watched(full_views(film, 3), watching=Existence())
     assert found[0] == pytest.approx(0.5)
-    assert found[1] > PRESENT
+    assert found[1] > PRESENT_PROBABILITY
 
 
 def test_a_silhouette_at_the_side_of_the_image_takes_longer(film, watched):
@@ -390,7 +391,7 @@ def test_a_silhouette_at_the_side_of_the_image_takes_longer(film, watched):
         stamps = range(5, 17)
         found = []
         for i, view in zip(stamps, views, strict=True):
-            watching.look(view, i * SECOND // 10, None)
+            watching.look(view._replace(stamp=i * SECOND // 10), None)
             found.append(watching.somebody)
         times.append(0.1 * np.argmax(found))
     assert times[0] == pytest.approx(0.3)
@@ -399,7 +400,7 @@ def test_a_silhouette_at_the_side_of_the_image_takes_longer(film, watched):
 
 def test_llr_has_the_share_of_the_time(film, watched):
     _, _, watching = watched(full_views(film, 3), 10.0)
-    assert watching.llr == pytest.approx(CLEAR.nats * share_of_time(0.1, CLEAR.tau))
+    assert watching.last.llr == pytest.approx(CLEAR.nats * share_of_time(0.1, CLEAR.tau))
 
 
 # What stands still.
@@ -418,15 +419,16 @@ def test_a_detector_says_the_same_of_the_same_picture(waiting, human37, camera, 
         existence = Existence()
         for i, image in enumerate(images):
             noisy = np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).astype(np.uint8)
-            existence.look(View(noisy, keypoints=seen), i * SECOND // 10, human37, waiting=waiting)
+            view = View(noisy, keypoints=seen, stamp=i * SECOND // 10)
+            existence.look(view, human37, waiting=waiting)
         return existence.probability
 
     still = probability(20 * [thing])
     moving = probability([np.roll(thing, 3 * i, axis=1) for i in range(20)])
     blank = probability(20 * [np.zeros_like(thing)])
-    assert moving > PRESENT
-    assert blank > PRESENT
-    assert (still > PRESENT) != waiting
+    assert moving > PRESENT_PROBABILITY
+    assert blank > PRESENT_PROBABILITY
+    assert (still > PRESENT_PROBABILITY) != waiting
 
 
 # Without any other cue.
@@ -441,14 +443,14 @@ def test_a_person_who_moves_is_there(film, watched):
     found, seen, watching = watched(bare_views(film, range(10)), 5.0)
     assert all(seen)
     assert found.min() > 0.95
-    assert 'motion' in watching.said
+    assert 'motion' in watching.last.said
 
 
 def test_where_nothing_moves_nobody_leaves(film, watched):
     found, _, watching = watched(bare_views(film, [0] * 10), 0.5)
     assert found.min() >= GIVEN
-    assert 'motion' not in watching.said
-    appearance = watching._appearance
+    assert 'motion' not in watching.last.said
+    appearance = watching.appearance
     assert appearance.motion(View(film[1][0])) == Motion(moved=False, still=True)
     # What moves elsewhere may be who has left; what moves everywhere is the camera.
     other = film[1][0].copy()
@@ -461,14 +463,15 @@ def test_where_nothing_moves_nobody_leaves(film, watched):
 def test_a_black_image_is_no_still_one(film, watched):
     black = View(np.zeros_like(film[1][0]))
     found, *_ = watched([View(film[1][0]), *[black] * 5], 1.0)
-    assert found[-1] < PRESENT
+    assert found[-1] < PRESENT_PROBABILITY
 
 
 def test_before_anything_has_spoken_nothing_is_told(film, human32):
     existence = Existence()
-    existence.look(View(film[1][0]), 0, human32, waiting=True)
+    existence.look(View(film[1][0]), human32, waiting=True)
     assert not existence.told
-    existence.look(View(film[1][0], keypoints=NO_KEYPOINTS), SECOND, human32, waiting=True)
+    empty = View(film[1][0], keypoints=NO_KEYPOINTS, stamp=SECOND)
+    existence.look(empty, human32, waiting=True)
     assert existence.told
     assert existence.log_odds == pytest.approx(
         math.log(existence.probability / (1 - existence.probability))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,7 +19,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.camera_motion import CameraMotion
-from hmt_ros.tracking.contact import FootContacts
+from hmt_ros.tracking.contact import by_foot, contacts_of
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
@@ -55,11 +56,14 @@ def single(pose: np.ndarray, velocity: np.ndarray | None = None) -> Modes:
     start, d = new_hypotheses(pose[None], np.zeros(1)), len(pose)
     velocities = np.zeros((1, d)) if velocity is None else velocity[None]
     one = np.eye(d)[None]
-    return Modes(
-        **vars(start), velocities=velocities, covariances=one, filtered=one,
-        log_likelihoods=np.zeros(1), state_covariances=one,
-        identities=np.ones(1, dtype=np.intp), origins=np.ones((1, 1)),
-    )  # fmt: skip
+    return replace(
+        Modes.blank(1, pose.size),
+        **vars(start),
+        velocities=velocities,
+        covariances=one,
+        filtered=one,
+        state_covariances=one,
+    )
 
 
 def after(estimator: GroundEstimator, body, poses: np.ndarray) -> GroundEstimator:
@@ -68,15 +72,12 @@ def after(estimator: GroundEstimator, body, poses: np.ndarray) -> GroundEstimato
     return estimator
 
 
-def contacts_of(body, plane, poses, rate: float, *, still: bool = True) -> list[list[float]]:
+def resting(body, plane, poses, rate: float, *, still: bool = True) -> list[list[float]]:
     """Probabilities that the left and the right foot rest, image by image."""
-    contacts, found = FootContacts(), []
-    for t, pose in enumerate(poses):
-        if t == 0:
-            contacts.begin(body, plane, single(pose))
-        else:
-            contacts.update(body, plane, single(pose), 1.0 / rate, still=still)
-        found.append(list(contacts.by_foot().values()))
+    modes, found = None, []
+    for pose in poses:
+        modes = contacts_of(body, plane, single(pose), modes, 1.0 / rate, still=still)
+        found.append(list(by_foot(modes).values()))
     return found
 
 
@@ -329,7 +330,7 @@ def test_contacts_are_those_of_a_walker(body, rate):
     """Points of the soles that rest in the motion rest, and those that swing do not."""
     poses = procedural_motion('walk', body, 3.0, rate, 1, viewpoint=PITCHED)
     plane = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)).plane
-    found = contacts_of(body, plane, poses, rate)
+    found = resting(body, plane, poses, rate)
     # Each foot moves as its slowest point does.
     points = sole_points(body, poses).reshape(len(poses), 2, 2, 3)
     speed = rate * np.linalg.norm(np.diff(points, axis=0), axis=3).min(2)
@@ -352,7 +353,7 @@ def test_feet_rest_at_any_rate(body, rate):
         pose[:3] += error
         error = kept * error + 0.008 * np.sqrt(1.0 - kept**2) * rng.normal(size=3)
     plane = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)).plane
-    found = np.array(contacts_of(body, plane, poses, rate))
+    found = np.array(resting(body, plane, poses, rate))
     assert (found[len(found) // 4 :] > 0.5).mean() > 0.9
 
 
@@ -362,7 +363,7 @@ def test_before_a_camera_that_moves_only_heights_tell_of_contact(body, reaching)
     slid[:3] += 0.3 * np.cross(up_of(PITCHED), [0.0, 0.0, 1.0])
     aloft[:3] += 0.3 * up_of(PITCHED)
     rests = {
-        (name, still): min(contacts_of(body, plane, [pose, other], RATE, still=still)[1])
+        (name, still): min(resting(body, plane, [pose, other], RATE, still=still)[1])
         for name, other in (('stays', pose), ('slides', slid), ('rises', aloft))
         for still in (True, False)
     }
@@ -429,18 +430,18 @@ def test_a_tracker_knows_its_ground(ground, human32, camera, motion, keypoints_o
         tracker.reset(subject)
         for t in range(4):
             tracker.step(black, t * 100_000_000, keypoints_of(human32, motion[t], 1.0, t))
-        assert tracker.contacts == {}  # no background: the camera may move
-        found = human32.joint_positions(tracker.point_estimate[None])[0]
+        assert tracker.estimate.contacts == {}  # no background: the camera may move
+        found = human32.joint_positions(tracker.estimate.point_estimate[None])[0]
         errors.append(
             np.linalg.norm(found - human32.joint_positions(motion[3:4])[0], axis=1).mean()
         )
-        assert tracker.ground.up == pytest.approx(up, abs=0.15)
+        assert tracker.estimate.ground.up == pytest.approx(up, abs=0.15)
         if known is not None:
-            assert tracker.ground.plane == pytest.approx([*up, 1.2])
+            assert tracker.estimate.ground.plane == pytest.approx([*up, 1.2])
         elif ground.on:
-            assert tracker.ground.height == pytest.approx(1.2, abs=0.2)
+            assert tracker.estimate.ground.height == pytest.approx(1.2, abs=0.2)
     assert max(errors) < 0.12
     tracker.set_gravity(up_of(PITCHED), 1.3)
     tracker.step(black, 400_000_000, keypoints_of(human32, motion[4], 1.0, 4))
-    assert tracker.ground.up == pytest.approx(up_of(PITCHED))
-    assert tracker.ground.height == pytest.approx(1.3)
+    assert tracker.estimate.ground.up == pytest.approx(up_of(PITCHED))
+    assert tracker.estimate.ground.height == pytest.approx(1.3)

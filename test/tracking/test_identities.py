@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import Tracker, TrackerSettings
-from hmt_ros.tracking.hypotheses import Identities
+from hmt_ros.tracking.hypotheses import Hypotheses, Identities, Modes, new_hypotheses
 
 FRAME = 100_000_000  # ns
 
@@ -16,6 +18,12 @@ FRAME = 100_000_000  # ns
 def jumps(*rows: str) -> np.ndarray:
     """Degrees of freedom (N, 2) that jumped, 'x'."""
     return np.array([[c == 'x' for c in row] for row in rows])
+
+
+def descendants(ancestors: list[int], jumped: np.ndarray) -> Hypotheses:
+    """Hypotheses that come from some modes, heaviest first."""
+    new = new_hypotheses(np.zeros(jumped.shape), np.zeros(len(jumped)))
+    return replace(new, ancestors=np.array(ancestors), jumped=jumped)
 
 
 @pytest.mark.parametrize(
@@ -35,12 +43,14 @@ def jumps(*rows: str) -> np.ndarray:
 )
 def test_the_heaviest_descendant_keeps_the_number(ancestors, jumped, expected):
     identities = Identities()
-    before = identities.new(3)
+    before = identities.of(descendants([0, 1, 2], jumps('..', '..', '..')), None)
     assert before.tolist() == [1, 2, 3]
-    found = identities.inherited(before, np.array(ancestors), jumped)
+    modes = replace(Modes.blank(3, 2), identities=before)
+    found = identities.of(descendants(ancestors, jumped), modes)
     assert found.tolist() == expected
     # A number is given once, even where a mode has ended.
-    after = identities.inherited(found, np.zeros(2, dtype=int), jumps('..', '..'))
+    modes = replace(modes, identities=found)
+    after = identities.of(descendants([0, 0], jumps('..', '..')), modes)
     assert after.tolist() == [expected[0], max(3, *expected) + 1]
 
 
@@ -57,14 +67,14 @@ def test_numbers_of_a_track(human32, camera, filmed):
         found = []
         for i, image in enumerate(images):
             tracker.step(image, i * FRAME)
-            found.append(tracker.modes.identities.tolist())
+            found.append(tracker.estimate.modes.identities.tolist())
         runs.append(found)
         assert found[0][0] == 1
         # A new track begins with 1 again.
         tracker.reset(start)
         tracker.step(images[0], 0)
-        assert tracker.modes.identities[0] == 1
-        assert tracker.velocities is None
+        assert tracker.estimate.modes.identities[0] == 1
+        assert tracker.estimate.velocities is None
     assert runs[0] == runs[1]
     seen: set[int] = set()
     for before, now in zip(runs[0], runs[0][1:], strict=False):

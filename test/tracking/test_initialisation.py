@@ -82,7 +82,7 @@ def test_poses_explain_the_joints_in_different_ways(camera, known):
     assert apart.max() > 0.15
 
 
-def test_energies_are_those_of_joints_and_prior(camera, known):
+def test_starts_have_the_least_energies_of_joints_and_prior_first(camera, known):
     keypoints, start = known
     body, poses = start.body, start.poses
     pixels = camera.project(body.joint_positions(poses))
@@ -91,9 +91,7 @@ def test_energies_are_those_of_joints_and_prior(camera, known):
     value += self_intersection_energy(
         body, forward(body.skeleton, poses), sigma=LikelihoodSettings().self_intersection_sigma
     )[0]
-    assert np.allclose(start.energies, value, rtol=1e-9)
-    assert (np.diff(start.energies) >= 0).all()
-    assert np.linalg.eigvalsh(start.hessians).min() > 0
+    assert (np.diff(value) > -1e-9 * value[1:]).all()
     assert (poses >= body.lower).all()
     assert (poses <= body.upper).all()
 
@@ -159,7 +157,6 @@ def test_the_same_joints_give_the_same_start(human32, camera, keypoints_of, walk
     subject = Subject(0, exact(keypoints_of, human32, walk[2]), {}, 1.7)
     first, second = (start_from_keypoints(human32, camera, subject) for _ in range(2))
     assert first.poses.tobytes() == second.poses.tobytes()
-    assert first.energies.tobytes() == second.energies.tobytes()
 
 
 def test_joints_on_one_point_are_refused(human32, camera):

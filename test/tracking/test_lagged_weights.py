@@ -134,11 +134,14 @@ def test_the_weights_of_a_tracker(filmed, camera, human32, keypoints_of):
     for i, image in enumerate(images):
         seen = keypoints_of(human32, poses[i], 2.0, i)
         posterior, _ = tracker.step(image, i * 100_000_000, keypoints=seen)
-        assert tracker.origins.shape == (len(posterior), len(published[-1]) if published else 0)
-        assert not published or tracker.origins.sum(1) == pytest.approx(1.0, abs=1e-12)
-        found += lagged.update(i, posterior, tracker.origins)
+        assert tracker.estimate.origins.shape == (
+            len(posterior),
+            len(published[-1]) if published else 0,
+        )
+        assert not published or tracker.estimate.origins.sum(1) == pytest.approx(1.0, abs=1e-12)
+        found += lagged.update(i, posterior, tracker.estimate.origins)
         published.append(posterior)
-        origins.append(tracker.origins)
+        origins.append(tracker.estimate.origins)
     assert [one.stamp for one in found] == list(range(len(images) - 3))
     changed = 0.0
     for one in found:

@@ -13,6 +13,7 @@ from hmt_ros.body.camera import roll
 from hmt_ros.image.likelihood import OFF
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.tracking import KnownGround, Tracker, TrackerSettings
+from hmt_ros.tracking.track_state import Estimate
 
 UP = np.array([0.0, -1.0, 0.0])
 IMAGES, STEP = 4, 100_000_000
@@ -34,7 +35,7 @@ def by_keypoints() -> TrackerSettings:
     return replace(settings, likelihood=replace(settings.likelihood, **off))
 
 
-def tracked(body, camera, keypoints_of, poses, up: np.ndarray, level: np.ndarray) -> Tracker:
+def tracked(body, camera, keypoints_of, poses, up: np.ndarray, level: np.ndarray) -> Estimate:
     """A tracker after images of a camera turned by a level, with this vertical given."""
     image = np.full((camera.height, camera.width, 3), 90, np.uint8)
     tracker = Tracker(body, camera, by_keypoints(), known_ground=KnownGround(up))
@@ -43,7 +44,7 @@ def tracked(body, camera, keypoints_of, poses, up: np.ndarray, level: np.ndarray
         seen = keypoints_of(body, pose, 2.0)
         seen = replace(seen, pixels=(seen.pixels - middle) @ level[:2, :2].T + middle)
         tracker.step(image, index * STEP, seen)
-    return tracker
+    return tracker.estimate
 
 
 @pytest.mark.parametrize('degrees', [90.0, 180.0])

@@ -43,9 +43,9 @@ def observed(tracker, monkeypatch):
     seen, observer = [], tracker._observer
     view = observer.view
 
-    def spy(image, stamp, keypoints, *arguments, **named):
-        seen.append(keypoints)
-        return view(image, stamp, keypoints, *arguments, **named)
+    def spy(given, *arguments):
+        seen.append(given.keypoints)
+        return view(given, *arguments)
 
     monkeypatch.setattr(observer, 'view', spy)
     return seen
@@ -116,7 +116,7 @@ def test_a_true_guess_tells_towards_from_away(walk):
         for t in range(6):
             told = replace(seen[t], positions=guesses[t] if name == 'with' else None)
             tracker.step(BLANK, t * STEP, told)
-        found = tracker.body.joint_positions(tracker.modes.poses[:1])[0]
+        found = tracker.estimate.body.joint_positions(tracker.estimate.modes.poses[:1])[0]
         off = (found - found[hips].mean(0)) - guesses[5]
         errors[name] = float(np.linalg.norm(off, axis=1).mean())
     assert errors['with'] < 0.06
@@ -132,6 +132,6 @@ def test_a_mixture_that_is_wrong_costs_little(walk):
     far[hips] = 0.01
     for t in range(4):
         tracker.step(BLANK, t * STEP, replace(seen[t], positions=far))
-    found = tracker.body.joint_positions(tracker.modes.poses[:1])[0]
+    found = tracker.estimate.body.joint_positions(tracker.estimate.modes.poses[:1])[0]
     off = np.linalg.norm(CAMERA.project(found) - seen[3].pixels, axis=1)
     assert np.median(off) < 6.0

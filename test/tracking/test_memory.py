@@ -41,5 +41,5 @@ def test_a_track_does_not_grow(filmed):
                 taken[i + 1], _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert tracker.status is Status.TRACKING
+    assert tracker.estimate.status is Status.TRACKING
     assert taken[LAST] - taken[FIRST] < BOUND, taken

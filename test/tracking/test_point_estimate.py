@@ -9,8 +9,8 @@ from hmt_ros.body.mirror import left_directions, reverse_depth
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.tracking.classes import VALID
 from hmt_ros.tracking.point_estimate import PointEstimate
+from hmt_ros.tracking.settings import FACING_VALID
 
 DT = 1.0 / 30.0
 
@@ -97,7 +97,11 @@ def test_it_keeps_its_way_until_no_image_may_be_wrong_by_so_much(human37, pose, 
     both = np.concatenate([pose[None], reverse_depth(human37, pose[None])])
     way = left_directions(human37, both)
     estimate.update(human37, dynamics, mixture(both[:1]), None)
-    for share, wanted in ((VALID - 0.01, 0), (VALID + 0.01, 1), (1.0 - VALID + 0.01, 1)):
+    for share, wanted in (
+        (FACING_VALID - 0.01, 0),
+        (FACING_VALID + 0.01, 1),
+        (1.0 - FACING_VALID + 0.01, 1),
+    ):
         estimate.update(human37, dynamics, mixture(both, (1.0 - share, share)), DT)
         assert left_directions(human37, estimate.pose[None])[0] @ way[wanted] > 0.99
         # No pose between the two ways.

@@ -23,7 +23,8 @@ def modes_of(body: Body) -> Modes:
     states = root @ root.transpose(0, 2, 1)
     poses = body.prior_mean + 0.01 * rng.normal(size=(K, d))
     poses[:, 2] += 3.0
-    return Modes(
+    return replace(
+        Modes.blank(K, d),
         poses=poses,
         log_weights=np.log([0.5, 0.3, 0.2]),
         ancestors=np.zeros(K, dtype=np.intp),
@@ -34,8 +35,6 @@ def modes_of(body: Body) -> Modes:
         filtered=states[:, :d, :d],
         log_likelihoods=np.zeros(K),
         state_covariances=states,
-        identities=np.arange(1, K + 1),
-        origins=np.eye(K),
     )
 
 

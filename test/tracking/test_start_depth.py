@@ -15,12 +15,12 @@ from hmt_ros.image.joint_depths import depths_of, joint_depths, moved_to_depth
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking import Subject, Tracker, TrackerSettings
+from hmt_ros.tracking import Subject, Tracker
 from hmt_ros.tracking.beginning import Shown, first_start
 from hmt_ros.tracking.existence import Existence
-from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.initialisation import start_from_keypoints
-from hmt_ros.tracking.validity import DEPTH
+from hmt_ros.tracking.misfit import of_depth_at_best
+from hmt_ros.tracking.validity import DEPTH, Validity
 from hmt_ros.tracking.view import View
 
 STATURE, AWAY = 1.9, 3.5
@@ -123,7 +123,8 @@ def test_poses_move_along_their_rays(tall, camera):
 
 def shown(view, stamp, model, camera, given=None, box=None):
     """An image without any other input."""
-    return Shown(view, stamp, model, model, camera, None, given, box, None, False, lambda: None)
+    view = view._replace(stamp=stamp)
+    return Shown(view, model, model, camera, None, given, box, lambda: None)
 
 
 def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
@@ -169,9 +170,9 @@ def tracked(tall, camera, keypoints_of):
             given = {'depth': depth, 'no depth': None, 'holes': np.zeros_like(depth)}
             given['shifted'] = np.roll(depth, 20, axis=1)
             posterior, _ = tracker.step(image, 100 * t * MS, depth=given[name])
-            joints = tracker.body.joint_positions(posterior.means[:1])[0]
+            joints = tracker.estimate.body.joint_positions(posterior.means[:1])[0]
             errors.append(np.linalg.norm(joints - true[t], axis=1).mean())
-        assert tracker.validity.believes(DEPTH) == (name != 'shifted')
+        assert tracker.estimate.validity.believes(DEPTH) == (name != 'shifted')
         found[name] = np.array(errors), posterior
     return found
 
@@ -205,7 +206,12 @@ def test_depth_that_is_not_registered_does_no_harm(tracked):
 def test_the_belief_comes_back(tall, camera):
     body, poses, _, depths, _ = tall
     shifted = np.roll(depths[0], 20, axis=1)
-    track = MixtureFilter(body, camera, TrackerSettings(), 0)
+    validity = Validity()
+
+    def see(pose, depth, dt):
+        if (shown := depths_of(depth)) is not None:
+            validity.update_depths(of_depth_at_best(body, camera, pose, shown), dt)
+
     wrong = poses[0] * np.where(np.arange(body.dimension) < 3, 1.1, 1.0)
     for depth, pose, believed in (
         (None, wrong, True),
@@ -215,9 +221,9 @@ def test_the_belief_comes_back(tall, camera):
         *[(depths[0], wrong, None)] * 10,
         (depths[0], wrong, True),
     ):
-        track.validity.predict(0.1)
-        track.check_depths(body, pose, depths_of(depth), 0.1)
-        assert believed is None or track.validity.believes(DEPTH) == believed
+        validity.predict(0.1)
+        see(pose, depth, 0.1)
+        assert believed is None or validity.believes(DEPTH) == believed
     # One image does not change that.
-    track.check_depths(body, wrong, depths_of(shifted), 1.0 / 30.0)
-    assert track.validity.believes(DEPTH)
+    see(wrong, shifted, 1.0 / 30.0)
+    assert validity.believes(DEPTH)

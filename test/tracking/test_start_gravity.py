@@ -74,8 +74,6 @@ def test_a_start_is_upright_against_gravity(body, camera, keypoints_of, standing
     error = lean(body, known.poses[0], standing)
     assert error < 6.0
     assert error < lean(body, camera_axes.poses[0], standing)
-    assert (np.diff(known.energies) >= 0).all()
-    assert np.linalg.eigvalsh(known.hessians).min() > 0
 
 
 def test_a_tracker_passes_gravity_to_a_start_only_where_it_is_known(body, camera, monkeypatch):

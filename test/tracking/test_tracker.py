@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +28,8 @@ from hmt_ros.tracking import (
     TrackerSettings,
 )
 from hmt_ros.tracking.misfit import KEYPOINTS
-from hmt_ros.tracking.posterior import WIDEST, free_covariances
+from hmt_ros.tracking.posterior import free_covariances
+from hmt_ros.tracking.settings import MAX_SIGMA
 from hmt_ros.tracking.validity import UNDECIDED
 
 ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
@@ -74,7 +76,7 @@ def begun(human32, camera, black, motion, keypoints_of, subject) -> tuple[Body, 
     tracker = Tracker(human32, camera, keypoint_settings())
     tracker.reset(subject)
     posterior, _ = tracker.step(black, 0, keypoints_of(human32, motion[0], 1.0, 0))
-    return tracker.body, posterior
+    return tracker.estimate.body, posterior
 
 
 @pytest.fixture(scope='module')
@@ -101,7 +103,7 @@ def follow(human32, black, motion, keypoints_of, started):
         for i in range(frames):
             seen = keypoints_of(body, motion[i], 1.0, i)
             mixtures.append(tracker.step(black, i * FRAME, seen))
-            errors.append(best_error(tracker.body, mixtures[-1][0], body, motion[i]))
+            errors.append(best_error(tracker.estimate.body, mixtures[-1][0], body, motion[i]))
         return tracker, mixtures, np.array(errors)
 
     return run
@@ -126,7 +128,7 @@ def in_bytes(mixtures):
 @pytest.mark.parametrize('proposals', ['kjs', 'css', 'ss'])
 def test_the_truth_is_among_the_modes(follow, proposals):
     tracker, mixtures, errors = follow(proposals=proposals, samples=64)
-    assert tracker.status is Status.TRACKING
+    assert tracker.estimate.status is Status.TRACKING
     assert errors.mean() < 0.045
     assert errors.max() < 0.07
     assert all(len(posterior) > 1 for posterior, _ in mixtures)
@@ -157,23 +159,25 @@ def test_modes_nearer_than_the_merge_distance_are_one(follow):
 def test_heaviest_modes_explain_the_joints(follow, camera, human32, motion, keypoints_of):
     tracker, mixtures, _ = follow()
     for i, (posterior, _) in enumerate(mixtures):
-        pixels = camera.project(tracker.body.joint_positions(posterior.means[:1]))[0]
+        pixels = camera.project(tracker.estimate.body.joint_positions(posterior.means[:1]))[0]
         error = pixels - keypoints_of(human32, motion[i], 1.0, i).pixels
         assert np.sqrt((error**2).sum(1).mean()) < 3.0
 
 
 def test_weights_of_the_likelihood_are_those_of_the_image_alone(
-    follow, camera, human32, motion, keypoints_of
+    follow, black, camera, human32, motion, keypoints_of
 ):
     """exp(-energy) at the modes of the posterior, times their volumes, with the ground off.
 
     And the whole curvature: nothing is discounted, so that the mixture is exp(-energy) itself.
     """
-    tracker, mixtures, _ = follow(frames=4, ground=OFF)
-    posterior, likelihood = mixtures[-1]
-    (_, used) = tracker._track._observed
-    seen = Observation(keypoints=keypoints_of(human32, motion[3], 1.0, 3), beliefs=used.beliefs)
-    likelihood_of = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).given(seen)
+    tracker, *_ = follow(frames=3, ground=OFF)
+    validity = deepcopy(tracker.estimate.validity)
+    validity.predict(1e-9 * FRAME)
+    keypoints = keypoints_of(human32, motion[3], 1.0, 3)
+    posterior, likelihood = tracker.step(black, 3 * FRAME, keypoints)
+    seen = Observation(keypoints=keypoints, beliefs=validity.beliefs)
+    likelihood_of = ImageLikelihood(tracker.estimate.body, camera, ONLY_KEYPOINTS).given(seen)
     energy = likelihood_of.energy(posterior.means)
     gradient, hessian = energy.derivatives()
     free = ~resting(posterior.means, gradient, human32.lower, human32.upper)
@@ -184,23 +188,23 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     lower, upper = human32.lower + 1e-6, human32.upper - 1e-6
     for k, precision in zip(order, np.linalg.inv(likelihood.covariances), strict=True):
         inside = (posterior.means[k] > lower) & (posterior.means[k] < upper)
-        wanted = energy.hessian[k] + WIDEST**-2.0 * np.eye(len(inside))
+        wanted = energy.hessian[k] + MAX_SIGMA**-2.0 * np.eye(len(inside))
         both = np.ix_(inside, inside)
         assert inside.sum() > len(inside) / 2
         assert np.allclose(precision[both], wanted[both], rtol=1e-6, atol=1e-3)
     # All cues have one error model today; the mean over those that speak is among theirs.
     shares = [errors.independent for errors in ERRORS.values()]
-    assert min(shares) <= tracker.likelihood_errors.independent <= max(shares)
+    assert min(shares) <= tracker.estimate.likelihood.errors.independent <= max(shares)
     # What is not known of the lengths is beside it: of the place the distance, above all.
-    unknown = tracker.shape_covariance
+    unknown = tracker.estimate.likelihood.shape_covariance
     assert np.linalg.eigvalsh(unknown).min() > -1e-9
     assert np.diagonal(unknown)[:3].argmax() == 2
     # Its log at the means is that of the image, without the prior of the body.
-    frames = forward(tracker.body.skeleton, likelihood.means)
-    term = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).keypoint_term(seen, None)
+    frames = forward(tracker.estimate.body.skeleton, likelihood.means)
+    term = ImageLikelihood(tracker.estimate.body, camera, ONLY_KEYPOINTS).keypoint_term(seen, None)
     values = term.energy(frames, np.arange(len(likelihood))).value
     assert len(likelihood) > 1
-    assert np.allclose(tracker.log_likelihoods, -values, rtol=1e-9)
+    assert np.allclose(tracker.estimate.likelihood.values, -values, rtol=1e-9)
 
 
 def test_the_same_seed_and_images_give_identical_bytes(follow):
@@ -226,7 +230,7 @@ def test_other_body_sizes(follow, human32, camera, motion, keypoints_of):
     tracker.reset(subject)
     _, first, errors = follow(4, body=child, tracker=tracker)
     assert tracker.model is human32
-    found = tracker.body.segment_lengths
+    found = tracker.estimate.body.segment_lengths
     assert max(abs(found[name] - lengths[name]) for name in lengths) < 0.02
     assert errors.max() < 0.06
     again = Tracker(human32, camera, keypoint_settings(), seed=1)
@@ -238,9 +242,8 @@ def test_other_body_sizes(follow, human32, camera, motion, keypoints_of):
 def test_reset_starts_over(follow):
     tracker, first, _ = follow(4, proposals='css', seed=7)
     tracker.reset()
-    assert tracker.status is Status.WAITING
-    with pytest.raises(ValueError, match='no track yet'):
-        _ = tracker.posterior
+    assert tracker.estimate.status is Status.WAITING
+    assert len(tracker.estimate.posterior) == 0
     _, second, _ = follow(4, tracker=tracker)
     assert in_bytes(first) == in_bytes(second)
 
@@ -251,11 +254,11 @@ def test_waits_for_the_image_of_the_subject(human32, camera, black, subject, mot
     tracker.reset(replace(subject, stamp_ns=3 * FRAME))
     for i in range(3):
         assert tracker.step(black, i * FRAME + 7) == (None, None)
-        assert tracker.status is Status.WAITING
-    assert tracker.background.frames == 4
+        assert tracker.estimate.status is Status.WAITING
+    assert tracker.silhouettes.background.frames == 4
     seen = keypoints_of(human32, motion[0])
     posterior, likelihood = tracker.step(black, 3 * FRAME + 7, seen)
-    assert tracker.status is Status.TRACKING
+    assert tracker.estimate.status is Status.TRACKING
     assert posterior.dimension == likelihood.dimension == human32.dimension
     # Nobody can be told from a background of black.
     assert tracker.silhouettes.doubted
@@ -273,9 +276,9 @@ def test_start_from_a_mixture(human32, camera, black, motion, keypoints_of, mixt
     """The image tells the components apart; the body stays as it is."""
     tracker = Tracker(human32, camera, keypoint_settings())
     tracker.reset(mixture)
-    assert tracker.status is Status.WAITING
+    assert tracker.estimate.status is Status.WAITING
     posterior, _ = tracker.step(black, 0, keypoints_of(human32, motion[0]))
-    assert tracker.body is human32
+    assert tracker.estimate.body is human32
     assert np.abs(posterior.means[0] - motion[0]).max() < 0.3
     assert np.abs(posterior.means[0, :3] - motion[0, :3]).max() < 0.05
     assert posterior.weights[0] > 0.5
@@ -307,7 +310,7 @@ def test_modes_move_on_where_nothing_is_seen(human37, camera, black, motion, key
     for i in range(8):
         pose[0] = first + speed * i * 0.1
         tracker.step(black, i * FRAME, keypoints_of(human37, pose, 0.5, i))
-    before = tracker.modes
+    before = tracker.estimate.modes
     assert before.velocities[0, 0] == pytest.approx(speed, abs=0.1)
     seen = keypoints_of(human37, pose, 0.0)
     covariances = np.tile(1e10 * np.eye(2), (len(seen.names), 1, 1))
@@ -337,8 +340,8 @@ def test_without_keypoints_and_background_it_still_runs(human32, camera, motion,
         for mixture in pair:
             assert mixture.weights.sum() == pytest.approx(1.0)
             assert np.linalg.eigvalsh(mixture.covariances).min() > 0
-    assert tracker.background.frames == 0
-    assert best_error(tracker.body, pair[0], human32, motion[3]) < 0.3
+    assert tracker.silhouettes.background.frames == 0
+    assert best_error(tracker.estimate.body, pair[0], human32, motion[3]) < 0.3
 
 
 # Images, three good ones among them, after which a track is lost whose keypoints jumped: 0.4 s.
@@ -360,11 +363,11 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     for i in range(18):
         pose = motion[i] if i < 3 else other
         posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, pose, 1.0, i))
-        seen.append(tracker.status)
-        begins.append(tracker.origins.shape[1] == 0)
-        places.append(tracker.point_estimate[:3])
-        misfits.append(tracker.misfit)
-        errors.append(best_error(tracker.body, posterior, human32, pose))
+        seen.append(tracker.estimate.status)
+        begins.append(tracker.estimate.origins.shape[1] == 0)
+        places.append(tracker.estimate.point_estimate[:3])
+        misfits.append(tracker.estimate.misfit)
+        errors.append(best_error(tracker.estimate.body, posterior, human32, pose))
     tracking, lost = Status.TRACKING, Status.LOST
     found = seen.index(lost) + 1
     assert 5 <= found <= LOST_WITHIN
@@ -416,15 +419,15 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
             rows = [seen.names.index(name) for name in few]
             # Too few to start from.
             seen = Keypoints(few, seen.pixels[rows], seen.covariances[rows], np.ones(len(few)))
-            lost = tracker.status is Status.LOST
+            lost = tracker.estimate.status is Status.LOST
             prediction = predicted(human32, other) if given and lost else None
             posterior, _ = tracker.step(black, i * FRAME, seen, prediction)
-            statuses.append(tracker.status)
+            statuses.append(tracker.estimate.status)
             if lost:
                 break
         assert statuses[-2] is Status.LOST
         assert (statuses[-1] is Status.TRACKING) == given
-        errors[given] = best_error(tracker.body, posterior, human32, other)
+        errors[given] = best_error(tracker.estimate.body, posterior, human32, other)
     # Five keypoints hold little: the prior of the angles draws the pose away from the prediction.
     assert errors[True] < 0.97 * errors[False]
 
@@ -436,12 +439,16 @@ def test_nothing_becomes_certain_while_a_lost_track_is_sought(
     for i in range(LOST_WITHIN + 20):
         seen = keypoints_of(human32, motion[i] if i < 3 else other, 1.0, i)
         # Starts anew in each image, at a place where nobody is.
-        prediction = predicted(human32, motion[0]) if tracker.status is Status.LOST else None
+        prediction = (
+            predicted(human32, motion[0]) if tracker.estimate.status is Status.LOST else None
+        )
         joints = seen.names if prediction is None else ('left_hip', 'right_knee')
         rows = [seen.names.index(name) for name in joints]
         seen = Keypoints(joints, seen.pixels[rows], seen.covariances[rows], np.ones(len(rows)))
         tracker.step(black, i * FRAME, seen, prediction)
-    chances = np.concatenate([[tracker.validity.track], *tracker.validity.cues.values()])
+    chances = np.concatenate(
+        [[tracker.estimate.validity.track], *tracker.estimate.validity.cues.values()]
+    )
     assert chances.min() > 1e-4
     assert chances.max() < 0.9999
 
@@ -456,7 +463,7 @@ def test_predictions_are_among_the_hypotheses(human32, started, black, motion, k
             prediction = predicted(human32, pose) if given else None
             seen = keypoints_of(human32, pose, 1.0, i)
             posterior, _ = tracker.step(black, i * FRAME, seen, prediction)
-        errors[given] = best_error(tracker.body, posterior, human32, pose)
+        errors[given] = best_error(tracker.estimate.body, posterior, human32, pose)
     assert errors[False] > 0.15
     assert errors[True] < 0.06
 
@@ -491,7 +498,7 @@ def test_predictions_are_as_far_away_as_the_person_is_large(human32, motion):
 def test_keypoints_alone_leave_more_open_than_their_sum_says(follow):
     """Their errors last from image to image: images are no independent witnesses."""
     tracker, mixtures, _ = follow(6)
-    modes = tracker.modes
+    modes = tracker.estimate.modes
     published, independent = (
         np.trace(x, axis1=1, axis2=2) for x in (mixtures[-1][0].covariances, modes.filtered)
     )
@@ -504,8 +511,8 @@ def test_who_jumps_is_found_where_the_keypoints_are(human32, started, black, mot
     for i in range(LOST_WITHIN + 3):
         pose = motion[i] if i < 3 else jumped(motion)
         posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, pose, 1.0, i))
-        errors.append(best_error(tracker.body, posterior, human32, pose))
-        lost.append(tracker.status is Status.LOST)
+        errors.append(best_error(tracker.estimate.body, posterior, human32, pose))
+        lost.append(tracker.estimate.status is Status.LOST)
     found = lost.index(True) + 1
     assert min(errors[3:found]) > 0.1
     assert max(errors[found:]) < 0.065
@@ -520,9 +527,9 @@ def test_one_bad_image_is_forgiven(human32, started, black, motion, keypoints_of
             anywhere = rng.uniform(0, 240, seen.pixels.shape)
             seen = Keypoints(seen.names, anywhere, seen.covariances, seen.confidences)
         posterior, _ = tracker.step(black, i * FRAME, seen)
-        assert tracker.status is Status.TRACKING
-        assert (tracker.misfit > UNDECIDED[KEYPOINTS]) == (i == 3)
-    assert best_error(tracker.body, posterior, human32, motion[5]) < 0.07
+        assert tracker.estimate.status is Status.TRACKING
+        assert (tracker.estimate.misfit > UNDECIDED[KEYPOINTS]) == (i == 3)
+    assert best_error(tracker.estimate.body, posterior, human32, motion[5]) < 0.07
 
 
 def test_joints_that_were_not_seen_do_not_count(follow, human32, motion, keypoints_of, black):
@@ -532,8 +539,8 @@ def test_joints_that_were_not_seen_do_not_count(follow, human32, motion, keypoin
     pixels[[seen.names.index(x) for x in ('left_hand', 'right_hand', 'head')]] = np.nan
     hidden = Keypoints(seen.names, pixels, seen.covariances, seen.confidences)
     posterior, _ = tracker.step(black, 4 * FRAME, hidden)
-    assert tracker.misfit == 0.0
-    assert best_error(tracker.body, posterior, human32, motion[4]) < 0.07
+    assert tracker.estimate.misfit == 0.0
+    assert best_error(tracker.estimate.body, posterior, human32, motion[4]) < 0.07
 
 
 def test_bad_images_are_refused_and_change_nothing(follow, human32, black, motion, keypoints_of):
@@ -586,10 +593,10 @@ def test_images_alone(film, human32, camera, keypoints_of):
         tracker = Tracker(human32, camera, settings, BackgroundModel.from_image(empty), seed=seed)
         tracker.reset(Subject(0, keypoints_of(human32, poses[0]), dict(human32.segment_lengths)))
         runs.append([tracker.step(image, i * FRAME) for i, image in enumerate(images)])
-        assert tracker.status is Status.TRACKING
-        assert tracker.misfit < 0.2
+        assert tracker.estimate.status is Status.TRACKING
+        assert tracker.estimate.misfit < 0.2
     errors = [
-        best_error(tracker.body, posterior, human32, pose)
+        best_error(tracker.estimate.body, posterior, human32, pose)
         for (posterior, _), pose in zip(runs[0], poses)
     ]
     assert max(errors) < 0.1

@@ -35,7 +35,13 @@ def steps(human32, camera, motion, keypoints_of):
         posterior, _ = tracker.step(black, i * STEP, seen)
         assert posterior is not None
         result.append(
-            (tracker.body, posterior, tracker.origins, tracker.published.identities, tracker.modes)
+            (
+                tracker.estimate.body,
+                posterior,
+                tracker.estimate.origins,
+                tracker.estimate.published.identities,
+                tracker.estimate.modes,
+            )
         )
     return result
 

@@ -54,8 +54,10 @@ def followed(body, camera, keypoints_of, poses, *, shown=None, ground=None):
         assert posterior is not None
         assert np.isfinite(posterior.means).all()
         assert np.isfinite(posterior.covariances).all()
-        assert tracker.status is Status.TRACKING
-        found, true = (body.joint_positions(x[None])[0] for x in (tracker.point_estimate, pose))
+        assert tracker.estimate.status is Status.TRACKING
+        found, true = (
+            body.joint_positions(x[None])[0] for x in (tracker.estimate.point_estimate, pose)
+        )
         relative = [x - x[hips].mean(0) for x in (found, true)]
         errors.append(np.linalg.norm(relative[0] - relative[1], axis=1).mean())
     return tracker, np.array(errors)
@@ -80,7 +82,9 @@ def test_who_jumps_is_followed(human37, camera, keypoints_of):
 def test_only_the_upper_body_is_in_view(human37, camera, keypoints_of):
     poses = np.tile(pose_of(human37, {'left_shoulder_x': 60.0}), (4, 1))
     tracker, _ = followed(human37, camera, keypoints_of, poses, shown=UPPER)
-    found, true = (human37.joint_positions(x[None])[0] for x in (tracker.point_estimate, poses[-1]))
+    found, true = (
+        human37.joint_positions(x[None])[0] for x in (tracker.estimate.point_estimate, poses[-1])
+    )
     arms = [i for i, name in enumerate(human37.joint_names) if 'wrist' in name or 'neck' in name]
     assert np.linalg.norm(found[arms] - true[arms], axis=1).mean() < 0.25
 
@@ -108,7 +112,7 @@ def test_a_camera_that_rolls_and_a_bump(human37, camera, keypoints_of):
         assert posterior is not None
         assert np.isfinite(posterior.means).all()
         found, true = (
-            human37.joint_positions(x[None])[0] for x in (tracker.point_estimate, poses[0])
+            human37.joint_positions(x[None])[0] for x in (tracker.estimate.point_estimate, poses[0])
         )
         relative = [x - x[0] for x in (found, true)]
         assert np.linalg.norm(relative[0] - relative[1], axis=1).mean() < 0.2
@@ -122,4 +126,4 @@ def test_what_is_no_direction_is_refused_and_the_track_goes_on(
     tracker, _ = followed(human37, camera, keypoints_of, poses)
     with pytest.raises(ValueError, match='up must be a unit vector'):
         tracker.set_gravity(gravity)
-    assert np.array_equal(tracker.ground.up, UP)
+    assert np.array_equal(tracker.estimate.ground.up, UP)

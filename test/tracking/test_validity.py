@@ -12,30 +12,31 @@ from scipy.linalg import expm
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SILHOUETTE, Misfit, of_points
+from hmt_ros.tracking.settings import (
+    MAX_CUE_NATS,
+    MISFIT_TIME,
+    PLACED_PROBABILITY,
+    RATES,
+    VALIDITY_COUNT,
+    VALIDITY_NATS,
+)
 from hmt_ros.tracking.validity import (
     CHAIN,
     DEPTH,
     DETECTOR,
-    DETECTOR_CHAIN,
-    ENOUGH,
-    FAILS,
-    MOST,
-    NATS,
-    PLACED,
-    RECOVERS,
-    TAU,
     UNDECIDED,
     ByKeypoints,
     Validity,
     evidence_of,
 )
 
+RECOVERS, FAILS = RATES['track and cues']
 RATE, USUAL = 30.0, CHAIN.usual[1]
 
 
 def whole(share, groups=1):
     """A cue of which so much is not explained."""
-    return Misfit(np.full(groups, share), np.full(groups, ENOUGH))
+    return Misfit(np.full(groups, share), np.full(groups, VALIDITY_COUNT))
 
 
 def seconds(validity, misfits, until, rate=RATE, longest=5.0):
@@ -52,7 +53,7 @@ def test_images_are_those_of_a_hidden_markov_model():
     """The joint states of track, detector, silhouette and groups of keypoints, written out."""
     rng = np.random.default_rng(0)
     fails = np.full(6, FAILS)
-    fails[DETECTOR] = DETECTOR_CHAIN.rates[1, 0]
+    fails[DETECTOR] = RATES['detector'][1]
     rates = [np.array([[-RECOVERS, RECOVERS], [x, -x]]) for x in fails]
     states = np.array(list(itertools.product((0, 1), repeat=6)))
     usual = RECOVERS / (fails + RECOVERS)
@@ -61,14 +62,16 @@ def test_images_are_those_of_a_hidden_markov_model():
     for dt in (0.03, 0.1, 0.4, 0.03, 2.0):
         p = p @ functools.reduce(np.kron, [expm(x * dt) for x in rates])
         shares = rng.uniform(0.1, 0.6, 5)
-        counts = np.full(3, ENOUGH)
+        counts = np.full(3, VALIDITY_COUNT)
         misfits = {
             OUTLINE: whole(shares[0]),
             SILHOUETTE: whole(shares[1]),
             KEYPOINTS: Misfit(shares[2:], counts),
         }
         each = [evidence_of(name, misfit) for name, misfit in misfits.items()]
-        says = np.clip(share_of_time(dt, TAU) * np.concatenate(each), -MOST, MOST)
+        says = np.clip(
+            share_of_time(dt, MISFIT_TIME) * np.concatenate(each), -MAX_CUE_NATS, MAX_CUE_NATS
+        )
         track, detector, cues = states[:, 0], states[:, 1], states[:, 2:].copy()
         cues[:, 1:] *= detector[:, None]
         p *= np.exp(track * (says[0] + cues @ says[1:]))
@@ -94,12 +97,12 @@ def test_a_search_leaves_what_is_known_of_the_cues():
 def test_what_measurements_say():
     few = Misfit(np.array([0.0, 1.0, 1.0]), np.array([0, 1, 100]))
     undecided = UNDECIDED[KEYPOINTS]
-    wanted = NATS * np.array([0.0, (undecided - 1) / ENOUGH, undecided - 1])
+    wanted = VALIDITY_NATS * np.array([0.0, (undecided - 1) / VALIDITY_COUNT, undecided - 1])
     assert evidence_of(KEYPOINTS, few, begun=False) == pytest.approx(wanted)
     # A part may be misplaced in a mode that is right.
-    most = np.log(PLACED / (1 - PLACED))
+    most = np.log(PLACED_PROBABILITY / (1 - PLACED_PROBABILITY))
     for e in (1e3, -1e3):
-        counts, share = np.array([ENOUGH]), undecided - e / NATS
+        counts, share = np.array([VALIDITY_COUNT]), undecided - e / VALIDITY_NATS
         found = evidence_of(KEYPOINTS, Misfit(np.array([share]), counts))
         assert found == pytest.approx(np.sign(e) * most)
 
@@ -107,7 +110,7 @@ def test_what_measurements_say():
 def test_depths_follow_given_the_track():
     validity = Validity()
     p, q, dt = USUAL, USUAL, 0.1
-    e = share_of_time(dt, TAU) * NATS * (UNDECIDED[DEPTH] - 0.3)
+    e = share_of_time(dt, MISFIT_TIME) * VALIDITY_NATS * (UNDECIDED[DEPTH] - 0.3)
     validity.update({DEPTH: whole(0.3)}, dt)
     valid = p * (q * np.exp(e) + 1 - q)
     assert validity.cues[DEPTH] == pytest.approx(valid / (valid + 1 - p))
@@ -118,7 +121,7 @@ def test_one_image_says_no_more_than_it_can():
     validity = Validity()
     validity.update({OUTLINE: whole(0.0)}, np.inf)
     odds = validity.track / (1 - validity.track)
-    assert np.log(odds) == pytest.approx(np.log(RECOVERS / FAILS) + MOST)
+    assert np.log(odds) == pytest.approx(np.log(RECOVERS / FAILS) + MAX_CUE_NATS)
 
 
 @pytest.mark.parametrize('rate', [60.0, 15.0, 5.0])
@@ -231,7 +234,7 @@ def test_keypoints_that_leave_the_person_are_doubted():
 def test_the_pose_by_keypoints_stands_for_the_states_without_the_silhouette(gain):
     """Enumerated: silhouette and one group of keypoints, at the modes and by keypoints alone."""
     validity, dt = Validity(), 0.1
-    before, share = validity.joint.copy(), share_of_time(dt, TAU)
+    before, share = validity.joint.copy(), share_of_time(dt, MISFIT_TIME)
     none = Misfit(np.zeros(3), np.array([0, 4, 0]))
     groups = Misfit(np.array([0.0, 0.9, 0.0]), np.array([0, 4, 0]))
     at_modes = share * evidence_of(KEYPOINTS, groups)[1]

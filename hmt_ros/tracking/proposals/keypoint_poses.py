@@ -20,6 +20,7 @@ from hmt_ros.inference.energy import Quadratic
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.misfit import KEYPOINTS, Misfit, of_keypoints
 from hmt_ros.tracking.optimisation import Search
+from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.validity import UNDECIDED, ByKeypoints
 
 
@@ -64,22 +65,27 @@ class KeypointHistory:
         return ByKeypoints(of_keypoints(term, pose), gain)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KeypointPoses:
-    """Proposes the pose to which keypoints alone would move the heaviest mode."""
+    """Proposes the pose to which keypoints alone would move the heaviest mode.
+
+    It does so where the modes missed more than a quarter of the keypoints of the image before.
+
+    Attributes:
+        posterior: of the body before the camera.
+    """
+
+    posterior: Posterior
 
     def propose(
         self, search: Search, _base: Minimum, sources: Hypotheses, _rng: np.random.Generator
     ) -> Hypotheses:
         """See `Proposal`."""
+        if not search.contradicted or self.posterior.placing(search.observation) is None:
+            return sources[:0]
         pose = _by_keypoints(search, None)
-        return Hypotheses(
-            pose,
-            sources.log_weights[:1],
-            sources.ancestors[:1],
-            pose,
-            np.zeros(pose.shape, dtype=np.bool_),
-        )
+        first = np.zeros(1, dtype=np.intp)
+        return sources.proposed(first, pose, np.zeros(pose.shape, dtype=np.bool_), expected=pose)
 
 
 def _by_keypoints(search: Search, before: Array | None) -> Array:

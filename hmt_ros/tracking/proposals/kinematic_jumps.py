@@ -31,11 +31,12 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Derivatives, Student
 from hmt_ros.inference.error_model import ERRORS
-from hmt_ros.tracking.hypotheses import LIKELY, Hypotheses
+from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.selection import choose_hypotheses
 from hmt_ros.tracking.settings import (
+    LIKELY_NATS,
     LIMB_TAILS,
     PRIOR_STRETCH,
     SAME_LIMB_DISTANCE,
@@ -56,20 +57,20 @@ class LimbSearch:
     posterior: Posterior
     chain: str
 
-    def __post_init__(self) -> None:
-        p = self.posterior
-        segments = set(p.body.skeleton.chains[self.chain])
-        parts = range(len(p.body.flesh.parts))
-        own = tuple(i for i in parts if p.body.flesh.parts[i].segment in segments)
-        rest = tuple(i for i in parts if i not in own)
-        for name, traced, occluders in (('_own', own, None), ('_rest', rest, rest)):
-            likelihood = replace(p.likelihood, parts=traced, occluders=occluders)
-            object.__setattr__(self, name, likelihood)
-        object.__setattr__(self, 'dofs', p.body.skeleton.chain_dofs[self.chain])
+    @cached_property
+    def dofs(self) -> Index:
+        """Degrees of freedom of the limb."""
+        return np.asarray(self.posterior.body.skeleton.chain_dofs[self.chain])
 
-    _own: ImageLikelihood = None  # type: ignore[assignment]
-    _rest: ImageLikelihood = None  # type: ignore[assignment]
-    dofs: Index = None  # type: ignore[assignment]
+    @cached_property
+    def _likelihoods(self) -> tuple[ImageLikelihood, ImageLikelihood]:
+        """Those of the limb, and of the rest of the body without the limb."""
+        body, whole = self.posterior.body, self.posterior.likelihood
+        segments = set(body.skeleton.chains[self.chain])
+        of_limb = [part.segment in segments for part in body.flesh.parts]
+        own = tuple(i for i, ours in enumerate(of_limb) if ours)
+        rest = tuple(i for i, ours in enumerate(of_limb) if not ours)
+        return replace(whole, parts=own), replace(whole, parts=rest, occluders=rest)
 
     def find(
         self,
@@ -92,19 +93,18 @@ class LimbSearch:
         s = self.posterior.settings.search
         block = covariance[np.ix_(own, own)]
         samples = self._draw(pose[own], block, plan.samples, rng)
-        others = self._rest.energies(
+        of_limb, of_rest = self._likelihoods
+        others = of_rest.energies(
             forward(body.skeleton, pose[None]), observation, derivatives=False
         )
-        seen = self._own.seen(observation, explained=others.costs)
+        seen = of_limb.seen(observation, explained=others.costs)
         seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
         motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
-        term = PoseEnergy(self._own, seen, motion, pose, own)
+        term = PoseEnergy(of_limb, seen, motion, pose, own)
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: plan.refined]]
-        self.posterior.evaluations += len(samples) + plan.refined * s.iterations
-        return term.minimise(
-            best, step_scale=0.4, damping=1.0, max_iterations=s.iterations, tolerance=0.05
-        ).x
+        self.posterior.spent.append(len(samples) + plan.refined * s.iterations)
+        return term.minimise(best, max_iterations=s.iterations, tolerance=0.05).x
 
     def _draw(self, angles: Array, block: Array, n: int, rng: np.random.Generator) -> Array:
         """N samples from the mode, from it stretched, and from the body's prior: a third each."""
@@ -142,7 +142,7 @@ class KinematicJumps:
         prior = search.rated(base.x, base.value)
         groups = self._groups(base)
         for group in groups[: plan.groups]:
-            likely = prior[group].max() > prior.max() - LIKELY
+            likely = prior[group].max() > prior.max() - LIKELY_NATS
             products = LimbProducts.of(
                 body,
                 base.x[group],
@@ -180,14 +180,8 @@ class KinematicJumps:
         ).chosen
         poses, members = poses[kept], members[kept]
         # A chain that jumped is expected where it landed, the rest where it was predicted.
-        changed = np.abs(poses - base.x[members]) > 1e-9
-        return Hypotheses(
-            poses,
-            sources.log_weights[members],
-            sources.ancestors[members],
-            np.where(changed, poses, sources.expected[members]),
-            changed | sources.jumped[members],
-        )
+        jumped = np.abs(poses - base.x[members]) > np.sqrt(np.finfo(np.float64).eps)
+        return sources.proposed(members, poses, jumped)
 
     @cached_property
     def _searches(self) -> dict[str, LimbSearch]:

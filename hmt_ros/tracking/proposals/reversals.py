@@ -3,7 +3,8 @@
     x' = reversal of x (`body.mirror`)
 
 A silhouette hardly tells a pose from its reversal, so a turn can be taken the wrong way round, and
-no jump of a limb leads back.
+no jump of a limb leads back. Where no mode of comparable weight faces one of the two ways, the best
+mode is reversed.
 """
 
 from __future__ import annotations
@@ -14,37 +15,32 @@ import numpy as np
 
 from hmt_ros.body.mirror import reverse_depth
 from hmt_ros.inference.bounded_newton import Minimum
+from hmt_ros.tracking.classes import lost_a_facing
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
+from hmt_ros.tracking.posterior import Posterior
+from hmt_ros.tracking.settings import REVERSAL_ITERATIONS
 
-# Newton steps from the reversal of a mode to its optimum, before candidates are compared.
-ITERATIONS = 8
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reversals:
-    """Proposes the reversals of the best modes.
+    """Proposes the reversal of the best mode where a way to face is lost.
 
     Attributes:
-        count: number of modes that are reversed.
+        posterior: of the body before the camera.
     """
 
-    count: int = 1
+    posterior: Posterior
 
     def propose(
         self, search: Search, base: Minimum, sources: Hypotheses, _rng: np.random.Generator
     ) -> Hypotheses:
         """See `Proposal`."""
-        best = np.argsort(-search.rated(base.x, base.value), kind='stable')[: self.count]
-        posterior = search.posterior
-        reversed_poses = reverse_depth(posterior.body, base.x[best])
-        moved = posterior.minimise(
-            posterior.of_image(search.observation), reversed_poses, ITERATIONS
-        ).x
-        return Hypotheses(
-            moved,
-            sources.log_weights[best],
-            sources.ancestors[best],
-            moved,
-            np.ones(moved.shape, dtype=np.bool_),
-        )
+        log_weights = search.rated(base.x, base.value)
+        if not lost_a_facing(search.modes.back, log_weights):
+            return sources[:0]
+        best = np.argsort(-log_weights, kind='stable')[:1]
+        turned = reverse_depth(self.posterior.body, base.x[best])
+        term = self.posterior.of_image(search.observation)
+        moved = self.posterior.minimise(term, turned, REVERSAL_ITERATIONS).x
+        return sources.proposed(best, moved, np.ones(moved.shape, dtype=np.bool_))

@@ -91,14 +91,8 @@ class CovarianceScaledSamples:
             search.plan.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen
-        rows = rows[kept]
-        return Hypotheses(
-            poses[kept],
-            sources.log_weights[rows],
-            sources.ancestors[rows],
-            sources.expected[rows],
-            np.zeros((len(rows), body.dimension), dtype=np.bool_),
-        )
+        still = np.zeros((len(kept), body.dimension), dtype=np.bool_)
+        return sources.proposed(rows[kept], poses[kept], still)
 
 
 @dataclass(frozen=True, eq=False)

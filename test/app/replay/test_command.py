@@ -85,8 +85,11 @@ class StandingStill:
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.existence_probability, self.reason = 1.0, ''
-        self.likelihood_errors = CueErrors(0.25, 0.125)
-        self.shape_covariance = np.zeros((body.dimension, body.dimension))
+        self.likelihood = SimpleNamespace(
+            values=np.zeros(1),
+            errors=CueErrors(0.25, 0.125),
+            shape_covariance=np.zeros((body.dimension, body.dimension)),
+        )
         self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.depths = []
@@ -103,12 +106,11 @@ class StandingStill:
         self.start = start
 
     @property
-    def modes(self):
+    def estimate(self):
+        """It is its own estimate, and its own modes."""
         return self
 
-    @property
-    def published(self):
-        return self.modes
+    published = modes = estimate
 
     log_likelihoods, identities, velocities = np.zeros(1), np.ones(1, dtype=int), None
     forecaster, foreseen, nobody_shown = None, False, False
@@ -313,7 +315,7 @@ def test_options_reach_the_tracker(still, short, tmp_path):
     settings = tracker.settings
     assert (settings.max_hypotheses, settings.evaluation_budget) == (5, 120)
     assert settings.threads == 1
-    assert (tracker.seed, tracker.body.name) == (7, 'human34')
+    assert (tracker.seed, tracker.estimate.body.name) == (7, 'human34')
 
 
 def test_config_of_the_node_changes_nothing(still, short, tmp_path):

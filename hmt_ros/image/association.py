@@ -18,22 +18,25 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from hmt_ros.image.person_shape import fill_hull
+from hmt_ros.image.person_shape import fill_hull, resized
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.error_model import seconds
-from hmt_ros.tracking.settings import (
-    ASSOCIATION_GATE,
-    EXPECTED_TIME,
-    LIMB_MARGIN,
-    VELOCITY_TIME,
-)
 
-GATE = ASSOCIATION_GATE
+# Cost below which a pair is possible from one image to the next, in sizes of the person; it doubles
+# within `EXPECTED_TIME`.
+GATE = 0.4
+# Time for which a person is taken to go on as before, and to keep the size though less is seen now,
+# s.
+EXPECTED_TIME = 1.0
+# Time constant of the velocity of a person in the images, s.
+VELOCITY_TIME = 0.25
+# Margin around the area of a person, or around the hull of keypoints, that is masked for others, as
+# a fraction of the height: the radius of a limb.
+LIMB_MARGIN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +118,7 @@ class ImageTrack:
 
     def gate(self, stamp: int) -> float:
         """Cost from which a sighting is of somebody else."""
-        return ASSOCIATION_GATE * (1.0 + min(seconds(stamp - self.stamp) / EXPECTED_TIME, 1.0))
+        return GATE * (1.0 + min(seconds(stamp - self.stamp) / EXPECTED_TIME, 1.0))
 
 
 def assigned(
@@ -163,10 +166,7 @@ def hull(sighting: Sighting, shape: tuple[int, ...]) -> Mask:
 
 def grown(area: Mask) -> Mask:
     """An area (H, W) with a margin."""
-    pixels = area.view(np.uint8)
-    size = max(round(LIMB_MARGIN * cv2.boundingRect(pixels)[3]), 1)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
-    return np.asarray(cv2.dilate(pixels, kernel), dtype=np.uint8) > 0
+    return resized(area, LIMB_MARGIN)
 
 
 def moved(area: Mask, shift: Array) -> Mask:

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.tracking.association import (
+from hmt_ros.image.association import (
     GATE,
     ImageTrack,
     Sighting,
     assigned,
     unknown_area,
 )
+from hmt_ros.image.terms.keypoints import Keypoints
 
 NAMES = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
 SHAPE = np.array([[-10.0, 20.0], [10.0, 20.0], [-15.0, -30.0], [15.0, -30.0]])

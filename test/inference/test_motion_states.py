@@ -6,7 +6,7 @@ import numpy as np
 
 from hmt_ros.inference.damped_velocity import DampedVelocity
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.tracking.motion_states import PredictedStates, fused
+from hmt_ros.inference.motion_states import PredictedStates, fused
 
 D = 3
 DYNAMICS = DampedVelocity.of(

@@ -18,7 +18,9 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.tracking.settings import UNKNOWN_VARIANCE
+
+# Variance of a variable that may be anywhere, as it jumped, rad^2 or m^2: as good as infinite.
+UNKNOWN_VARIANCE = 1e6
 
 
 @dataclass(frozen=True, eq=False)

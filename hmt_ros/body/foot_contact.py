@@ -1,0 +1,88 @@
+"""Contact of the feet: a hidden Markov chain for every point of the soles of a pose.
+
+    prior      P = s + (c_(t-1) - s) exp(-(enter + leave) dt),    s = enter / (enter + leave)
+    height     log N(h; 0, s_h) - log(1 / LIFT)
+    motion     log(1 - q + q N(m; 0, S_rest) / N(m; 0, S_free)),  q = c_(t-1) exp(-leave dt) / P
+    posterior  logit c_t = logit P + a(dt) (height + motion)
+
+c is the probability that the point rests, m how far it moved since the image before and h its
+height over the floor. A point that rests has stayed with the probability q, and else has come to
+rest since that image. Along the line of sight an image shows little of m, so there both deviations
+are wider and nearer to each other. Errors of a pose last, so an image counts with its share a(dt)
+in time (`hmt_ros.inference.error_model`), and the errors of images that are close differ little.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import expit, logit
+
+from hmt_ros.body.ground_terms import FloorPlane
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import ERRORS, share_of_time
+from hmt_ros.inference.markov_chain import MarkovChain
+
+# Rates at which a resting foot leaves the floor, and another comes to rest: those of walking, 1/s.
+LEAVES, ENTERS = 1.5, 2.5
+CONTACT = MarkovChain.of_two(ENTERS, LEAVES)
+# How far errors of poses that are long apart move a point that rests, across and along the line of
+# sight, m.
+REST_ACROSS, REST_ALONG = 0.013, 0.033
+# Speed of a foot that does not rest, m/s: deviation of each component.
+FREE_SPEED = 1.0
+# Deviation of the height of a resting point from that of the floor, besides that of the floor
+# itself; height up to which a free foot is lifted, m.
+REST_HIGH, LIFT = 0.04, 0.25
+
+
+def first_contacts(plane: FloorPlane, points: Array) -> Array:
+    """Probabilities (K, P) that points (K, P, 3) of soles rest, of which nothing was known."""
+    return np.asarray(expit(logit(CONTACT.usual[1]) + _height_evidence(plane, points)))
+
+
+def contacts(
+    plane: FloorPlane, points: Array, rested: Array, before: Array, dt: float, *, still: bool
+) -> Array:
+    """Probabilities (K, P) that points of soles rest, after an image.
+
+    Args:
+        plane: gravity and floor.
+        points: (K, P, 3) m.
+        rested: (K, P) probabilities in the image before.
+        before: (K, P, 3) the points there, in the same camera frame, m.
+        dt: time since then, s.
+        still: whether the motion of the camera is known; if not, that of a foot is no evidence.
+    """
+    prior = CONTACT.closed(rested, dt)
+    evidence = _height_evidence(plane, points)
+    if still:
+        stayed = rested * np.exp(-LEAVES * dt) / prior
+        moved = _motion_evidence(before, points, dt)
+        evidence += np.log1p(stayed * np.expm1(moved))
+    share = share_of_time(dt, ERRORS['image'].time)
+    return np.asarray(expit(logit(prior) + share * evidence))
+
+
+def _height_evidence(plane: FloorPlane, points: Array) -> Array:
+    """Log odds (K, P) of rest by the heights of points (K, P, 3)."""
+    if plane.height is None:
+        return np.zeros(points.shape[:2])
+    sigma = np.hypot(REST_HIGH, plane.height_sigma)
+    z = (points @ plane.up + plane.height) / sigma
+    result: Array = -0.5 * z * z - np.log(np.sqrt(2.0 * np.pi) * sigma / LIFT)
+    return result
+
+
+def _motion_evidence(before: Array, points: Array, dt: float) -> Array:
+    """Log odds (K, P) of rest by how far points (K, P, 3) moved in a time dt, s."""
+    ray = points / np.linalg.norm(points, axis=2, keepdims=True)
+    moved = points - before
+    along = (moved * ray).sum(2)
+    across = (moved * moved).sum(2) - along**2
+    differs = np.sqrt(-np.expm1(-dt / ERRORS['image'].time))
+    result = np.zeros(points.shape[:2])
+    for square, axes, error in ((across, 2, REST_ACROSS), (along**2, 1, REST_ALONG)):
+        rest = error * differs
+        free = np.hypot(rest, FREE_SPEED * dt)
+        result += axes * np.log(free / rest) - 0.5 * square * (rest**-2 - free**-2)
+    return result

@@ -1,0 +1,218 @@
+"""The state of a track beside its modes: one object, and what is published of it.
+
+    existence   whether somebody is in view                                    `existence`
+    validity    whether modes are where the person is, and cues show the person `validity`
+    identity    whether who is in view now is who was seen last                 `SAME_PERSON`
+
+        WAITING or NOBODY  -> (a start)                         ->  TRACKING
+        TRACKING           -> (no image says where)             ->  LOST
+        LOST               -> (found again)                     ->  TRACKING
+        TRACKING or LOST   -> (an image says: nobody is there)  ->  NOBODY
+        TRACKING or LOST   -> (not seen for an hour)            ->  WAITING, for anybody
+
+The classes of the modes, which are chains, too, are with the modes (`hypotheses.Modes`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import ERRORS, seconds
+from hmt_ros.inference.markov_chain import MarkovChain
+from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.beginning import Source
+from hmt_ros.tracking.existence import Existence, Status
+from hmt_ros.tracking.ground import Ground
+from hmt_ros.tracking.hypotheses import Modes
+from hmt_ros.tracking.laplace_approximation import Likelihood
+from hmt_ros.tracking.prediction import Forecaster
+from hmt_ros.tracking.settings import RATES
+from hmt_ros.tracking.validity import Validity
+
+# Whether who comes is who was seen last.
+SAME_PERSON = MarkovChain.of_two(*RATES['same person'])
+
+
+@dataclass
+class TrackState:
+    """The state of a track, or of the wait for one.
+
+    Attributes:
+        existence: whether somebody is in view.
+        validity: of the modes and of the cues.
+        ended: whether a track has ended: who comes now starts another one.
+        met: stamp of the last image that showed the person, ns; None: nobody is known.
+        stamp: of the last image, ns; None: there was none.
+        followed: stamp of the last image that the modes were fitted to, ns; None: no track.
+    """
+
+    existence: Existence = field(default_factory=Existence)
+    validity: Validity = field(default_factory=Validity)
+    ended: bool = False
+    met: int | None = None
+    stamp: int | None = None
+    followed: int | None = None
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is a track."""
+        return self.followed is not None
+
+    @property
+    def status(self) -> Status:
+        """State of the tracker."""
+        if not self.begun:
+            known = self.existence.nobody or self.met is not None
+            return Status.NOBODY if self.ended and known else Status.WAITING
+        found = self.existence.somebody and not self.validity.lost
+        return Status.TRACKING if found else Status.LOST
+
+    @property
+    def probability(self) -> float:
+        """Probability that somebody is in view; NaN: nothing has said anything of that."""
+        known = self.begun or self.existence.told
+        return self.existence.probability if known else math.nan
+
+    @property
+    def nobody_shown(self) -> bool:
+        """Whether the last image itself has said that nobody is there; a covered lens does not."""
+        return self.ended and self.existence.nobody
+
+    def age(self, stamp: int) -> float:
+        """Time since the last image that the modes were fitted to, s; 0 without a track."""
+        return 0.0 if self.followed is None else seconds(stamp - self.followed)
+
+    def is_somebody_else(self, stamp: int) -> bool:
+        """Whether who is in view at a stamp, ns, more likely is not who was seen last."""
+        if self.met is None:
+            return False
+        return bool(SAME_PERSON.transition(seconds(stamp - self.met))[1, 1] < 0.5)
+
+    def reason(self, scene: str, misfit: float) -> str:
+        """What is missing where the state is neither tracking nor nobody; '' where nothing is.
+
+        Args:
+            scene: what is missing for silhouettes.
+            misfit: share of the last image that no mode explains.
+        """
+        status, existence = self.status, self.existence
+        if status is Status.WAITING:
+            return 'nobody has been seen so far' if existence.told else scene
+        if status is Status.NOBODY and not self.nobody_shown:
+            return 'the image shows neither somebody nor that nobody is there'
+        if status is not Status.LOST:
+            return ''
+        if not existence.somebody:
+            return (
+                'no image says where the person is, who is in view with a probability of '
+                f'{existence.probability:.0%}'
+            )
+        return f'no mode explains {misfit:.0%} of what is seen'
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What a tracker knows after an image.
+
+    Attributes:
+        status: state of the tracker.
+        reason: what is missing where it is neither tracking nor nobody; '' where nothing is.
+        existence_probability: that somebody is in view, given all images so far; NaN: nothing has
+            said anything of that.
+        nobody_shown: whether the last image itself has said that nobody is there; a covered lens
+            does not.
+        started_from: the input that this track began from; None before the first.
+        body: the person, with the present estimate of lengths and flesh.
+        modes: of the track, heaviest first, as they are carried on; none without a track.
+        published: the modes of the posterior: limbs that no image shows are as people hold them.
+        point_estimate: (d,) the pose of the likeliest motion; empty without a track.
+        likelihood: of the last image that was tracked.
+        foreseen: whether the last image showed nothing of the person: a prediction is published.
+        misfit: share of the last image that no mode explains.
+        evaluations: number of evaluations of the likelihood in the last image.
+        validity: how far each cue of the images is believed to show the person, and the track.
+        contacts: probability by foot, 'left_foot' and 'right_foot', that the heaviest mode rests on
+            it. Empty while it is unknown: there is no track, the body has no feet, the terms of the
+            ground are off, or the motion of the camera is unknown. The camera stands still where
+            there is a background image, and moves as `Tracker.set_camera` says.
+        ground: gravity and floor, as far as they are known or estimated.
+        vertical: (3,) unit vector against gravity, camera frame, as given or as the scene shows it;
+            None: it is unknown, at most guessed from the track.
+        gravity_contradicted: whether scene or person contradict the gravity that is given; it is
+            used all the same.
+        gravity_reversed: whether the gravity that is given is the opposite, as an accelerometer
+            measures it.
+        motion: the setting.
+        stamp_ns: of the last image that the modes were fitted to; None: there is no track.
+    """
+
+    status: Status
+    reason: str
+    existence_probability: float
+    nobody_shown: bool
+    started_from: Source | None
+    body: Body
+    modes: Modes
+    published: Modes
+    point_estimate: Array
+    likelihood: Likelihood
+    foreseen: bool
+    misfit: float
+    evaluations: int
+    validity: Validity
+    contacts: Mapping[str, float]
+    ground: Ground
+    vertical: Array | None
+    gravity_contradicted: bool
+    gravity_reversed: bool
+    motion: str
+    stamp_ns: int | None
+
+    @property
+    def posterior(self) -> GaussianMixture:
+        """The posterior over poses; without a track it has no components."""
+        return self.published.mixture
+
+    @property
+    def velocities(self) -> Array | None:
+        """Velocities (K, d) of the published modes, per second; None: unknown.
+
+        They are unknown in the first image of a track, and where poses walk randomly.
+        """
+        velocities = self.published.velocities
+        return velocities if velocities.any() else None
+
+    @property
+    def origins(self) -> Array:
+        """Probabilities (K, M) that component k of the posterior continues component m before.
+
+        M is the number of components of the image before, 0 where a track begins or is found again;
+        see `LaggedWeights`.
+        """
+        return np.eye(len(self.published)) if self.foreseen else self.published.origins
+
+    @property
+    def forecaster(self) -> Forecaster:
+        """Predicts the track from the last image that it followed.
+
+        Raises:
+            ValueError: there is no track.
+        """
+        if self.stamp_ns is None:
+            raise ValueError('there is no track to predict')
+        return Forecaster(
+            self.published, self.posterior.weights, self.body, self.motion, self.stamp_ns
+        )
+
+
+def no_likelihood(dimension: int) -> Likelihood:
+    """The likelihood over poses of d variables before the first image: it says nothing."""
+    square = np.zeros((dimension, dimension))
+    nothing = GaussianMixture(np.empty(0), np.empty((0, dimension)), square[None][:0])
+    return Likelihood(nothing, np.empty(0), ERRORS['image'], square)
