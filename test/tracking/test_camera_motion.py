@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
-from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings, read_subject
+from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings
 from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath
 from hmt_ros.tracking.contact import by_foot, contacts_of
 from hmt_ros.tracking.ground import GroundEstimator
@@ -26,11 +24,9 @@ from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.prediction import dynamics_of, predicted_states
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
-from test.clips import read_clip
 
 FRAME = 100_000_000  # ns
 UP = np.array([0.0, -1.0, 0.0])
-SHARED = Path(os.environ.get('HMT_SHARED', Path(__file__).parents[2] / '..' / 'shared'))
 NO_IMAGE = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
 
 
@@ -140,22 +136,6 @@ def test_the_point_estimate_is_carried_with_its_velocity(body, walking):
     wanted = motion.poses(body, other.pose[None])[0]
     np.testing.assert_allclose(one.pose, wanted, atol=1e-6)
     assert np.abs(other.pose - before).max() > 0.01
-
-
-@pytest.mark.parametrize('known', [KnownGround(UP, 1.2), KnownGround(UP), KnownGround()])
-def test_heights_over_the_carried_ground_are_as_before(body, walking, known):
-    estimator, motion = GroundEstimator(known), motion_of(0.5, 12.0)
-    for pose in walking[:8]:
-        estimator.update(body, modes_of(body, pose[None]), 1.0, 0.1)
-    before = estimator.plane
-    points = np.random.default_rng(0).normal((0.0, 0.0, 4.0), size=(20, 3))
-    heights = points @ before.up + before.height
-    estimator.carry(motion)
-    after = estimator.plane
-    np.testing.assert_allclose(motion.points(points) @ after.up + after.height, heights, atol=1e-9)
-    assert (after.up_sigma, after.height_sigma) == pytest.approx(
-        (before.up_sigma, before.height_sigma)
-    )
 
 
 def test_feet_rest_before_a_moving_camera(body):
@@ -339,58 +319,8 @@ def test_what_a_moving_camera_sees_is_what_a_still_one_sees(body, track):
     assert np.mean(slips[4:]) > 0.5
 
 
-def test_an_image_without_a_pose_is_tracked(body, track):
-    tracker, found = track(drive, told=True, frames=6)
-    pose = drive(0.6)
-    # The seventh image has no pose: the camera is taken to go on, and the person stands.
-    black = np.zeros((tracker.camera.height, tracker.camera.width, 3), np.uint8)
-    (term,) = tracker._extra
-    placed = term.targets @ drive(0.5).rotation.T + drive(0.5).position
-    term.targets = (placed - pose.position) @ pose.rotation
-    posterior, _ = tracker.step(black, 6 * FRAME)
-    assert posterior is not None
-    before = found[-1][3]
-    motion = CameraMotion.between(drive(0.5), pose)
-    assert motion is not None
-    place = body.joint_positions(posterior.means[:1])[0, 0]
-    assert np.linalg.norm(place - motion.points(body.joint_positions(before[None])[0, 0])) < 0.1
-
-
-def test_a_background_of_another_view_is_forgotten(body, camera, track):
-    grey = np.full((camera.height, camera.width, 3), 40, np.uint8)
-    tracker, _ = track(still, told=True, background=BackgroundModel.from_image(grey), frames=3)
-    assert tracker.silhouettes.background.frames > 0
-    tracker, _ = track(drive, told=True, background=BackgroundModel.from_image(grey), frames=3)
-    assert tracker.silhouettes.background.frames == 0
-    assert tracker.silhouettes.known == 'unknown'
-
-
 def test_frames_of_a_pose_are_the_carried_ones(body, walking):
     motion = motion_of(0.4, 10.0)
     one = forward(body.skeleton, walking[:2])
     other = forward(body.skeleton, motion.poses(body, walking[:2]))
     np.testing.assert_allclose(other.rotations(), motion.rotation @ one.rotations(), atol=1e-9)
-
-
-@pytest.mark.skipif(
-    not (SHARED / 'video' / 'follow').is_dir(), reason='the development clips are absent'
-)
-def test_root_path_of_a_clip_with_a_moving_camera(human37):
-    folder = SHARED / 'video' / 'follow'
-    clip = read_clip(folder, 30)
-    tracker = Tracker(human37, clip.camera)
-    tracker.reset(read_subject(folder / 'subject.yaml', human37))
-    pelvis = clip.truth.joint_names.index('pelvis')
-    own, true = [], []
-    for stamp, image in clip.images.items():
-        rotation, position = clip.views[stamp]
-        tracker.set_camera(position, rotation)
-        tracker.step(image, stamp, clip.keypoints[stamp])
-        root = tracker.estimate.body.joint_positions(tracker.estimate.point_estimate[None])[0]
-        seen = (root[human37.joint_names.index('pelvis')], clip.truth.joints[stamp][pelvis])
-        for path, point in zip((own, true), seen, strict=True):
-            path.append(rotation @ point + position)
-    own, true = np.array(own), np.array(true)
-    length = np.linalg.norm(np.diff(true[::10], axis=0), axis=1).sum()
-    assert np.linalg.norm(own - true, axis=1).mean() < 0.08
-    assert np.linalg.norm((own[-1] - own[0]) - (true[-1] - true[0])) < 0.1 * length

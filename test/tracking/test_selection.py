@@ -108,15 +108,6 @@ def test_an_unlikely_hypothesis_far_away_beats_a_likely_one_nearby():
     assert np.allclose(np.exp(kept.log_weights), [0.9, 0.1])
 
 
-def test_what_is_chosen_first_is_kept_after_the_heaviest():
-    joints, log_weights = hypotheses(12, 6)
-    heaviest, *_, lightest = np.argsort(-log_weights)
-    kept = choose_hypotheses(joints, log_weights, 4, same=0.02, first=[lightest])
-    assert list(kept.chosen[:2]) == [heaviest, lightest]
-    alone = choose_hypotheses(joints, log_weights, 1, same=0.02, first=[lightest])
-    assert list(alone.chosen) == [heaviest]
-
-
 @pytest.mark.parametrize('seed', range(4))
 def test_distinct_hypotheses_are_the_heaviest_of_their_neighbours(seed):
     joints, log_weights = hypotheses(30, seed, spread=0.1)
