@@ -1,13 +1,10 @@
 """The documentation tells the truth: its code runs, its commands parse, its names exist."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 import re
 import runpy
 import shlex
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -76,13 +73,13 @@ FOREIGN = {
 }
 
 
-def blocks(page: Path, language: str) -> list[tuple[str, bool]]:
+def blocks(page, language):
     """Code of a page in a language, and whether it is marked to be run."""
     found = BLOCK.findall(page.read_text('utf-8'))
     return [(code, bool(mark)) for mark, kind, code in found if kind == language]
 
 
-def commands(page: Path) -> Iterator[tuple[list[str], bool]]:
+def commands(page):
     """Commands in the bash blocks of a page."""
     for code, run in blocks(page, 'bash'):
         for line in code.replace('\\\n', ' ').splitlines():
@@ -150,7 +147,7 @@ def test_commands_are_understood(page):
             assert given <= {p.name for every in known for p in every}
 
 
-def parse(package: str, words: list[str]) -> None:
+def parse(package, words):
     """Fails where a command of a package does not know the arguments."""
     if words == ['--help']:
         return
@@ -172,7 +169,7 @@ def test_marked_commands_run(workplace, capsys):
     assert (workplace / 'reach_report' / 'report.html').is_file()
 
 
-def page_of(node: str) -> str:
+def page_of(node):
     """The page of a node."""
     return (ROOT / 'docs' / f'{node}.md').read_text('utf-8')
 
@@ -188,7 +185,7 @@ def test_generated_parts_are_up_to_date():
         generate['with_part'](page, 'weather', '')
 
 
-def rows(page: str, heading: str) -> list[list[str]]:
+def rows(page, heading):
     """Cells of the tables under a heading, without their heads."""
     text = page.partition(f'{heading}\n')[2]
     text = re.split(r'^#', text, maxsplit=1, flags=re.MULTILINE)[0]

@@ -4,8 +4,6 @@
 what they are given take their place; what is given is then started as launch_ros would.
 """
 
-from __future__ import annotations
-
 import re
 import runpy
 import subprocess
@@ -16,12 +14,10 @@ import types
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
-from hmt_ros.detectors.detector import DetectorKind
 from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.sessions import bme_session, keypoints_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
@@ -57,12 +53,12 @@ SETTINGS = {
 class Kept:
     """Any action or substitution: keeps its arguments."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
+    def __init__(self, *arguments, **options):
         self.arguments, self.options = arguments, options
 
 
 class Configuration(Kept):
-    def perform(self, context: Any) -> str:
+    def perform(self, context):
         return str(context[self.arguments[0]])
 
 
@@ -85,7 +81,7 @@ STAND_INS = {
 }
 
 
-def with_stand_ins(file: Path) -> dict[str, Any]:
+def with_stand_ins(file):
     """Everything in a launch file, with stand-ins."""
     with pytest.MonkeyPatch.context() as patch:
         for name, content in STAND_INS.items():
@@ -95,7 +91,7 @@ def with_stand_ins(file: Path) -> dict[str, Any]:
         return runpy.run_path(str(file))
 
 
-def detector(installed: bool) -> DetectorKind:
+def detector(installed):
     """The usual detector, as if it were installed here, or not."""
     return replace(DETECTORS[USUAL_DETECTOR], is_installed=lambda: installed)
 
@@ -122,7 +118,7 @@ def actions(description, tmp_path, monkeypatch):
     return make
 
 
-def parameters(options: dict[str, Any]) -> dict[str, Any]:
+def parameters(options):
     """What a node is given beside its file in config/."""
     file, values, *_ = options['parameters']
     assert file == str(ROOT / 'hmt_ros' / 'config' / f'{options["name"]}.yaml')
@@ -420,7 +416,7 @@ def test_page_lists_the_arguments(description):
 # The nodes, started with what the launch file gives launch_ros.
 
 
-def command(options: dict[str, Any]) -> list[str]:
+def command(options):
     """Arguments of a node as launch_ros makes them."""
     name, namespace = options['name'], options['namespace']
     words = ['--ros-args', '-r', f'__node:={name}', '-r', f'__ns:={namespace}']

@@ -1,7 +1,5 @@
 """The shape of the packages: layers, metadata, and what is installed."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re
@@ -46,7 +44,7 @@ LAYERS = [
 ]
 
 
-def modules() -> dict[str, Path]:
+def modules():
     """Every module of the Python packages, by name."""
     found = {}
     for package in ('hmt_ros', 'msg_tools', 'hmt_learning'):
@@ -59,13 +57,13 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
-def layer_of(module: str) -> str | None:
+def layer_of(module):
     fitting = [layer for layer in LAYERS if f'{module}.'.startswith(f'{layer}.')]
     return max(fitting, key=len, default=None)
 
 
 @cache
-def imported_names(module: str) -> frozenset[str]:
+def imported_names(module):
     """Full names of the modules that a module's text imports, at its top or anywhere in it."""
     path = MODULES[module]
     package = module if path.name == '__init__.py' else module.rpartition('.')[0]
@@ -83,7 +81,7 @@ def imported_names(module: str) -> frozenset[str]:
     return frozenset(names)
 
 
-def test_layers_import_downwards_only() -> None:
+def test_layers_import_downwards_only():
     place = {layer: i for i, layer in enumerate(LAYERS)}
     upwards = [
         (module, name)
@@ -95,7 +93,7 @@ def test_layers_import_downwards_only() -> None:
     assert upwards == []
 
 
-def names_learning(text: str) -> list[str]:
+def names_learning(text):
     """Imports of hmt_learning anywhere in a source, and strings that name its modules."""
     found = []
     for node in ast.walk(ast.parse(text)):
@@ -112,16 +110,16 @@ def names_learning(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize('module', [x for x in MODULES if not x.startswith('hmt_learning')])
-def test_nothing_that_a_robot_has_imports_learning(module: str) -> None:
+def test_nothing_that_a_robot_has_imports_learning(module):
     assert names_learning(MODULES[module].read_text('utf-8')) == []
 
 
-def test_every_module_belongs_to_a_layer() -> None:
+def test_every_module_belongs_to_a_layer():
     outside = {name for name in MODULES if layer_of(name) is None}
     assert outside <= {'hmt_ros', 'hmt_ros.__main__', 'hmt_ros.compiled_code'}
 
 
-def test_only_nodes_and_commands_name_rclpy() -> None:
+def test_only_nodes_and_commands_name_rclpy():
     users = {
         layer_of(name)
         for name in MODULES
@@ -130,7 +128,7 @@ def test_only_nodes_and_commands_name_rclpy() -> None:
     assert users <= {'hmt_ros.nodes', 'hmt_ros.app'}
 
 
-def test_all_but_the_nodes_imports_without_ros_and_nothing_slow_before_it_is_needed() -> None:
+def test_all_but_the_nodes_imports_without_ros_and_nothing_slow_before_it_is_needed():
     names = [
         name for name in MODULES if layer_of(name) != 'hmt_ros.nodes' and '__main__' not in name
     ]
@@ -160,7 +158,7 @@ def test_all_but_the_nodes_imports_without_ros_and_nothing_slow_before_it_is_nee
     assert result.stdout.splitlines() == ['[]', str(len(names))]
 
 
-def setup_arguments_of(command: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def setup_arguments_of(command, monkeypatch):
     """What setup.py hands to setuptools for a command."""
     arguments: dict[str, Any] = {}
     monkeypatch.setattr(setuptools, 'setup', lambda **given: arguments.update(given))
@@ -171,24 +169,24 @@ def setup_arguments_of(command: str, monkeypatch: pytest.MonkeyPatch) -> dict[st
 
 
 @pytest.fixture(scope='module')
-def setup_arguments() -> dict[str, Any]:
+def setup_arguments():
     """What setup.py hands to setuptools."""
     with pytest.MonkeyPatch.context() as patch:
         return setup_arguments_of('install', patch)
 
 
-def xml(path: Path) -> ET.Element:
+def xml(path):
     return ET.parse(path).getroot()
 
 
-def test_versions_agree(setup_arguments: dict[str, Any]) -> None:
+def test_versions_agree(setup_arguments):
     assert setup_arguments['version'] == hmt_ros.__version__
     assert xml(ROOT / 'package.xml').findtext('version') == hmt_ros.__version__
     for folder in (HMT_MSGS, ROOT / 'examples'):
         assert xml(folder / 'package.xml').findtext('version') == hmt_ros.__version__
 
 
-def test_dependencies_of_package_xml_cover_the_ros_packages_used() -> None:
+def test_dependencies_of_package_xml_cover_the_ros_packages_used():
     root = xml(ROOT / 'package.xml')
     declared = {element.text for element in root.iter() if element.tag.endswith('depend')}
     imported = {name.split('.')[0] for module in MODULES for name in imported_names(module)}
@@ -197,7 +195,7 @@ def test_dependencies_of_package_xml_cover_the_ros_packages_used() -> None:
     assert used - {'hmt_msgs'} <= declared
 
 
-def test_package_data_covers_every_data_file(setup_arguments: dict[str, Any]) -> None:
+def test_package_data_covers_every_data_file(setup_arguments):
     for package, patterns in setup_arguments['package_data'].items():
         for path in (ROOT / package).rglob('*'):
             name = str(path.relative_to(ROOT / package))
@@ -205,7 +203,7 @@ def test_package_data_covers_every_data_file(setup_arguments: dict[str, Any]) ->
                 assert any(fnmatch(name, pattern) for pattern in patterns), name
 
 
-def test_entry_points_are_all_nodes_and_commands(setup_arguments: dict[str, Any]) -> None:
+def test_entry_points_are_all_nodes_and_commands(setup_arguments):
     lines = setup_arguments['entry_points']['console_scripts']
     points = dict(line.split(' = ') for line in lines)
     nodes = {name for name in points if points[name].startswith('hmt_ros.nodes.')}
@@ -220,7 +218,7 @@ def test_entry_points_are_all_nodes_and_commands(setup_arguments: dict[str, Any]
 
 @pytest.mark.filterwarnings('ignore:.*traverse:DeprecationWarning')
 @pytest.mark.parametrize('folder', [ROOT, HMT_MSGS], ids=['hmt_ros', 'hmt_msgs'])
-def test_changelog_can_be_released(folder: Path, tmp_path: Path) -> None:
+def test_changelog_can_be_released(folder, tmp_path):
     changelog = pytest.importorskip('catkin_pkg.changelog')
     version = hmt_ros.__version__
     text = (folder / 'CHANGELOG.rst').read_text('utf-8')
@@ -236,7 +234,7 @@ def test_changelog_can_be_released(folder: Path, tmp_path: Path) -> None:
     assert len(parsed.get_content_of_version(version)) > 0
 
 
-def test_a_wheel_has_the_library_and_one_command(tmp_path: Path) -> None:
+def test_a_wheel_has_the_library_and_one_command(tmp_path):
     sources = tmp_path / 'sources'
     for name in (
         *('hmt_ros', 'msg_tools', 'hmt_learning', 'resource'),
@@ -283,5 +281,5 @@ def test_a_wheel_has_the_library_and_one_command(tmp_path: Path) -> None:
     assert dimension == '37'
 
 
-def test_tests_that_begin_first_exist() -> None:
+def test_tests_that_begin_first_exist():
     assert [name for name in LONGEST if not (ROOT / 'test' / name).is_file()] == []

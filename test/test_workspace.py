@@ -1,7 +1,5 @@
 """The clone as one package among others: in a workspace of colcon, for rosdep, for bloom."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -12,7 +10,6 @@ import sys
 import sysconfig
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import setuptools
@@ -28,13 +25,13 @@ PAGE = (ROOT / 'docs' / 'consumers.md').read_text('utf-8')
 RCLCPP = ROOT / 'test' / 'rclcpp_stand_in'
 
 
-def code(language: str) -> str:
+def code(language):
     """The only block of code in a language on the page on consumers."""
     (found,) = re.findall(rf'^```{language}\n(.*?)^```$', PAGE, re.M | re.S)
     return found
 
 
-def package_xml(name: str, build_type: str, depends: str) -> str:
+def package_xml(name, build_type, depends):
     return f"""<package format="3">
   <name>{name}</name><version>0.0.0</version><description>Uses hmt_msgs.</description>
   <maintainer email="somebody@example.com">somebody</maintainer><license>Apache-2.0</license>
@@ -70,7 +67,7 @@ install_scripts=$base/lib/listener
 }
 
 
-def ros_without_this_package() -> dict[str, str]:
+def ros_without_this_package():
     """The environment of the tests, without the workspace in which they were built."""
     environment = dict(os.environ)
     prefixes = [Path(x) for x in os.environ['AMENT_PREFIX_PATH'].split(os.pathsep) if x]
@@ -98,7 +95,7 @@ def ros_without_this_package() -> dict[str, str]:
     return environment
 
 
-def write_packages(folder: Path, replace: tuple[str, str] = ('', '')) -> None:
+def write_packages(folder, replace=('', '')):
     """Writes the packages that use the messages, with a text in place of another."""
     for name, text in CONSUMERS.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -106,7 +103,7 @@ def write_packages(folder: Path, replace: tuple[str, str] = ('', '')) -> None:
 
 
 @pytest.fixture(scope='module')
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(tmp_path_factory):
     """A workspace with the clone in src/, after "colcon build"."""
     if shutil.which('colcon') is None:
         pytest.skip('colcon is not installed: a workspace cannot be built')
@@ -138,7 +135,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def sourced(workspace: Path, command: str) -> subprocess.CompletedProcess[str]:
+def sourced(workspace, command):
     """A command in a shell that has sourced the workspace."""
     return subprocess.run(
         ['bash', '-c', f'source {workspace}/install/setup.bash && {command}'],
@@ -152,7 +149,7 @@ def sourced(workspace: Path, command: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.ros
-def test_colcon_build_in_a_workspace_builds_the_messages(workspace: Path) -> None:
+def test_colcon_build_in_a_workspace_builds_the_messages(workspace):
     program = (
         'import hmt_ros, json, sys; from hmt_msgs.msg import PoseComponent, PoseMixture; '
         'from rclpy.serialization import deserialize_message, serialize_message; '
@@ -171,7 +168,7 @@ def test_colcon_build_in_a_workspace_builds_the_messages(workspace: Path) -> Non
 
 
 @pytest.mark.ros
-def test_packages_that_use_the_messages_run(workspace: Path) -> None:
+def test_packages_that_use_the_messages_run(workspace):
     for package, name in (('consumer', 'consumer'), ('hmt_ros_examples', 'stop_near_hand')):
         ran = sourced(workspace, f'install/{package}/lib/{package}/{name}')
         # Stops before anything has come, for a hand that may be near, for a lost person, and for
@@ -188,7 +185,7 @@ def test_packages_that_use_the_messages_run(workspace: Path) -> None:
 
 
 @pytest.mark.ros
-def test_a_node_of_a_workspace_starts(workspace: Path) -> None:
+def test_a_node_of_a_workspace_starts(workspace):
     node = subprocess.Popen(
         ['bash', '-c', 'source install/setup.bash && exec install/hmt_ros/lib/hmt_ros/filter_node'],
         cwd=workspace,
@@ -209,12 +206,12 @@ def test_a_node_of_a_workspace_starts(workspace: Path) -> None:
 
 
 @pytest.fixture
-def install_messages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SimpleNamespace:
+def install_messages(monkeypatch, tmp_path):
     """setup.py's functions, its commands of CMake recorded instead of run."""
     calls: list[tuple[list[str], dict[str, str]]] = []
     codes: list[int] = []
 
-    def run(command: list[str], *, env: dict[str, str], check: bool) -> SimpleNamespace:
+    def run(command, *, env, check):
         calls.append((command, env))
         return SimpleNamespace(returncode=codes.pop() if codes else 0)
 
@@ -225,7 +222,7 @@ def install_messages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SimpleN
     return SimpleNamespace(calls=calls, codes=codes, **names)
 
 
-def install_definitions(prefix: Path) -> Path:
+def install_definitions(prefix):
     share = prefix / 'share' / 'hmt_msgs'
     for name in ('msg', 'srv'):
         shutil.copytree(HMT_MSGS / name, share / name)
@@ -233,7 +230,7 @@ def install_definitions(prefix: Path) -> Path:
     return share
 
 
-def test_messages_with_other_definitions_are_built(install_messages: Any, tmp_path: Path) -> None:
+def test_messages_with_other_definitions_are_built(install_messages, tmp_path):
     share = install_definitions(tmp_path / 'ros')
     (share / 'msg' / 'Body.msg').write_text('string name\n', 'utf-8')
     install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
@@ -244,7 +241,7 @@ def test_messages_with_other_definitions_are_built(install_messages: Any, tmp_pa
     assert environment['DESTDIR'] == ''
 
 
-def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_path: Path) -> None:
+def test_a_failed_build_of_messages_says_what_to_do(install_messages, tmp_path):
     install_messages.codes.append(1)
     with pytest.raises(SystemExit, match='rosdep install') as raised:
         install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
@@ -254,16 +251,11 @@ def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_p
 
 @pytest.mark.parametrize(('variable', 'code'), [('', 0), ('', 1), ('later', 0)])
 def test_kernels_are_compiled_where_the_package_is_installed(
-    install_messages: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    variable: str,
-    code: int,
-) -> None:
+    install_messages, tmp_path, monkeypatch, capsys, variable, code
+):
     runs: list[tuple[list[str], str]] = []
 
-    def run(command: list[str], *, env: dict[str, str], cwd: str, check: bool) -> SimpleNamespace:
+    def run(command, *, env, cwd, check):
         runs.append((command[1:], env['PYTHONPATH'].split(os.pathsep)[0]))
         return SimpleNamespace(returncode=code)
 
@@ -279,7 +271,7 @@ def test_kernels_are_compiled_where_the_package_is_installed(
 
 
 @pytest.fixture
-def clone(tmp_path: Path) -> Path:
+def clone(tmp_path):
     """What the stage of the detector reads of a clone that is set up, without the packages."""
     for name in (
         'tools/workspace.sh',
@@ -305,7 +297,7 @@ def clone(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run_detector_stage(clone: Path) -> tuple[int, list[str], int]:
+def run_detector_stage(clone):
     """Exit code, lines on stderr but for how long it takes, and calls of Python of one run."""
     (clone / 'calls').unlink(missing_ok=True)
     done = subprocess.run(
@@ -318,7 +310,7 @@ def run_detector_stage(clone: Path) -> tuple[int, list[str], int]:
     return done.returncode, lines, count
 
 
-def test_the_detector_is_installed_once(clone: Path) -> None:
+def test_the_detector_is_installed_once(clone):
     assert run_detector_stage(clone) == (0, ['hmt_ros: installing MediaPipe Pose'], 2)
     pip, networks = (
         ' -m pip -qq --disable-pip-version-check --no-input install --no-compile --retries 1 '
@@ -337,7 +329,7 @@ def test_the_detector_is_installed_once(clone: Path) -> None:
 
 
 @pytest.mark.parametrize(('what', 'calls'), [('pip', 1), ('install-detector', 2)])
-def test_without_network_the_rest_goes_on(clone: Path, what: str, calls: int) -> None:
+def test_without_network_the_rest_goes_on(clone, what, calls):
     (clone / 'offline').write_text(what, 'utf-8')
     code, (begun, told), count = run_detector_stage(clone)
     assert (code, begun, count) == (78, 'hmt_ros: installing MediaPipe Pose', calls)
@@ -355,7 +347,7 @@ def test_without_network_the_rest_goes_on(clone: Path, what: str, calls: int) ->
 # ---- What colcon, rosdep and bloom read ----
 
 
-def test_rosdep_can_resolve_what_it_finds() -> None:
+def test_rosdep_can_resolve_what_it_finds():
     """rosdep finds one package here, and knows no package of this repository."""
     packages = pytest.importorskip('catkin_pkg.packages')
     found = packages.find_packages(str(ROOT))
@@ -372,7 +364,7 @@ def test_rosdep_can_resolve_what_it_finds() -> None:
     assert needed <= names
 
 
-def order(folder: Path, *options: str) -> list[str]:
+def order(folder, *options):
     """Names of packages in the order in which colcon builds them."""
     if shutil.which('colcon') is None:
         pytest.skip('colcon is not installed')
@@ -381,7 +373,7 @@ def order(folder: Path, *options: str) -> list[str]:
     return done.stdout.split()
 
 
-def test_messages_alone_are_linked_into_a_workspace(tmp_path: Path) -> None:
+def test_messages_alone_are_linked_into_a_workspace(tmp_path):
     """The lines of docs/workspace.md, with the clone beside the workspace."""
     text = (ROOT / 'docs' / 'workspace.md').read_text('utf-8')
     (line,) = re.findall(r'^ln -s .*$', text, re.M)
@@ -397,7 +389,7 @@ def test_messages_alone_are_linked_into_a_workspace(tmp_path: Path) -> None:
 # ---- A file that is not run here: its one command is ----
 
 
-def test_workflow_runs_what_the_project_is_tested_with() -> None:
+def test_workflow_runs_what_the_project_is_tested_with():
     workflow = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text('utf-8'))
     (job,) = workflow['jobs'].values()
     assert job['strategy']['matrix']['python'] == ['3.10', '3.11', '3.12', '3.13']

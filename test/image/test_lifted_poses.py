@@ -1,7 +1,5 @@
 """Mixtures over whole poses: sizes, exchanged sides, and the energy of depths with keypoints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import logsumexp
@@ -28,14 +26,14 @@ CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
 STEP = 1e-6
 
 
-def pose(seed: int = 0) -> np.ndarray:
+def pose(seed=0):
     rng = np.random.default_rng(seed)
     found = BODY.prior_mean + 0.4 * rng.normal(size=BODY.dimension)
     found[:6] = 0.2, 0.1, 4.0, 0.5, 0.1, 0.1
     return np.clip(found, BODY.lower, BODY.upper)
 
 
-def lifted(seed: int = 1, components: int = 3) -> LiftedPoses:
+def lifted(seed=1, components=3):
     rng = np.random.default_rng(seed)
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     weights = rng.uniform(0.5, 1.0, components)
@@ -45,19 +43,19 @@ def lifted(seed: int = 1, components: int = 3) -> LiftedPoses:
     return LiftedPoses(JOINTS, np.log(weights / weights.sum()), means, spread, axes, lengths)
 
 
-def term(poses: LiftedPoses, exchanges: np.ndarray | None) -> KeypointTerm:
+def term(poses, exchanges):
     """Of one keypoint that hardly counts, and of the mixture."""
     pixels = CAMERA.project(BODY.joint_positions(pose()[None])[0][:1])
     one = Keypoints(BODY.joint_names[:1], pixels, 1e12 * np.eye(2)[None], np.ones(1), lifted=poses)
     return KeypointTerm(BODY.skeleton, CAMERA, one, exchanges=exchanges)
 
 
-def energy(poses: LiftedPoses, x: np.ndarray, exchanges: np.ndarray | None) -> float:
+def energy(poses, x, exchanges):
     frames = forward(BODY.skeleton, x[None])
     return float(term(poses, exchanges).energy(frames, np.zeros(1, np.intp)).value[0])
 
 
-def density(poses: LiftedPoses, x: np.ndarray) -> float:
+def density(poses, x):
     """Minus the log density of depths, as the formula of the page says it."""
     joints = BODY.joint_positions(x[None])[0]
     hips = joints[BODY.skeleton.joint_index(HIPS)].mean(0)
@@ -68,7 +66,7 @@ def density(poses: LiftedPoses, x: np.ndarray) -> float:
     return -float(logsumexp(poses.log_weights - (kernel + np.log(sigma)).sum(1)))
 
 
-def test_energy_is_the_log_density_of_depths() -> None:
+def test_energy_is_the_log_density_of_depths():
     poses = lifted()
     # What the term adds beside the mixture does not depend on the pose.
     found = [energy(poses, pose(i), NOT_EXCHANGED) for i in range(4)]
@@ -77,7 +75,7 @@ def test_energy_is_the_log_density_of_depths() -> None:
 
 
 @pytest.mark.parametrize('exchanges', [NOT_EXCHANGED, usual_exchanges()])
-def test_gradient(exchanges: np.ndarray) -> None:
+def test_gradient(exchanges):
     poses, x = lifted(), pose()
     found = term(poses, exchanges).energy(forward(BODY.skeleton, x[None]), np.zeros(1, np.intp))
     gradient, hessian = found.derivatives()
@@ -92,7 +90,7 @@ def test_gradient(exchanges: np.ndarray) -> None:
     assert np.abs(gradient[0, :3]).max() < 1e-6  # depths relative to the hips
 
 
-def test_hessian_of_one_component_is_that_of_squares() -> None:
+def test_hessian_of_one_component_is_that_of_squares():
     one = lifted(components=1)
     sure = LiftedPoses(
         one.joints, one.log_weights, one.means, 1e-2 * one.deviations, one.axes, one.lengths
@@ -120,7 +118,7 @@ def test_hessian_of_one_component_is_that_of_squares() -> None:
     assert np.allclose(hessian, numeric, atol=2e-3 * np.abs(hessian).max())
 
 
-def test_sizes_keep_directions() -> None:
+def test_sizes_keep_directions():
     poses = lifted()
     longer = BODY.with_segment_lengths({k: 1.2 * v for k, v in BODY.segment_lengths.items()})
     first, second = poses.sized(BODY.skeleton), poses.sized(longer.skeleton)

@@ -1,7 +1,5 @@
 """A camera that moves: what is carried from image to image, and tracks that do not notice it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,29 +29,29 @@ NO_IMAGE = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
 
 
 @pytest.fixture(scope='module')
-def body() -> Body:
+def body():
     return load_body('human37')
 
 
 @pytest.fixture(scope='module')
-def walking(body) -> np.ndarray:
+def walking(body):
     """Poses (20, d) before a still camera, 10 Hz."""
     return procedural_motion('walk', body, 2.0, 10.0, 1)
 
 
-def drive(t: float, pitch: float = 0.0) -> CameraPose:
+def drive(t, pitch=0.0):
     """A camera that passes sideways at 0.8 m/s, turning by 20 degrees a second."""
     turn = Rotation.from_euler('yx', [-20.0 * t, pitch], degrees=True).as_matrix()
     return CameraPose.of([0.8 * t, -0.1 * t, 0.05 * np.sin(t)], turn)
 
 
-def motion_of(t: float, pitch: float = 0.0) -> CameraMotion:
+def motion_of(t, pitch=0.0):
     found = CameraMotion.between(CameraPose.of(np.zeros(3), np.eye(3)), drive(t, pitch))
     assert found is not None
     return found
 
 
-def modes_of(body: Body, poses: np.ndarray, seed: int = 0) -> Modes:
+def modes_of(body, poses, seed=0):
     """Modes with velocities and full covariances of states."""
     k, d = poses.shape
     rng = np.random.default_rng(seed)
@@ -98,7 +96,7 @@ def test_carrying_and_predicting_commute(body, walking):
     modes, motion = modes_of(body, walking[:3]), motion_of(0.3)
     dynamics = dynamics_of(body, 'learned')
 
-    def predicted(x: Modes) -> Modes:
+    def predicted(x):
         states = predicted_states(x, x.state_covariances, body, dynamics, 0.1)
         d = body.dimension
         return replace(
@@ -122,7 +120,7 @@ def test_the_point_estimate_is_carried_with_its_velocity(body, walking):
     # No axis of the camera is better known than another: both see the same.
     dynamics, spread = dynamics_of(body, 'learned'), 1e-3 * np.eye(body.dimension)[None]
 
-    def seen(pose: np.ndarray) -> GaussianMixture:
+    def seen(pose):
         return GaussianMixture(np.ones(1), pose[None], spread)
 
     for t in range(5):
@@ -170,7 +168,7 @@ def test_feet_rest_before_a_moving_camera(body):
 def test_a_path_interpolates_and_goes_on():
     path, poses = CameraPath(), [drive(0.1 * i) for i in range(12)]
 
-    def check(found: CameraMotion | None, a: CameraPose, b: CameraPose, atol: float) -> None:
+    def check(found, a, b, atol):
         wanted = CameraMotion.between(a, b)
         assert found is not None
         assert wanted is not None
@@ -223,7 +221,7 @@ class Places:
     targets: np.ndarray
     sigma: float = 0.01
 
-    def energy(self, frames, rows, *, derivatives=Derivatives.POSITIVE) -> Energy:
+    def energy(self, frames, rows, *, derivatives=Derivatives.POSITIVE):
         skeleton, n = self.body.skeleton, frames.count
         targets = np.repeat(self.targets[:, :, None], n, axis=2)
         weights = np.full((len(self.targets), n), self.sigma**-2)
@@ -240,7 +238,7 @@ def track(body, camera, walking):
     The measurements are those of the fixed frame, so that the camera makes no difference to them.
     """
 
-    def run(path, *, told: bool, background=None, frames=10):
+    def run(path, *, told, background=None, frames=10):
         black = np.zeros((camera.height, camera.width, 3), np.uint8)
         settings = TrackerSettings(
             max_hypotheses=1, candidates=2, likelihood=NO_IMAGE, flow_weight=0.0,
@@ -269,11 +267,11 @@ def track(body, camera, walking):
     return run
 
 
-def still(t: float) -> CameraPose:
+def still(t):
     return drive(0.0)
 
 
-def in_bytes(found) -> list[bytes]:
+def in_bytes(found):
     return [
         array.tobytes()
         for posterior, likelihood, modes, point in found

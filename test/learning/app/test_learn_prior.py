@@ -1,10 +1,5 @@
 """The command on a handful of short motions of a stick figure."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,7 +11,7 @@ from hmt_ros.body.mirror import mirror
 from test.learning.stick_figure import figure, write_bvh
 
 
-def write_motion(path: Path, seed: int, frames: int = 24) -> Path:
+def write_motion(path, seed, frames=24):
     """A figure that swings its limbs."""
     rng, joints = np.random.default_rng(seed), figure(hang=True)
     rows = np.zeros((frames, 3 + 3 * len(joints)))
@@ -32,7 +27,7 @@ def write_motion(path: Path, seed: int, frames: int = 24) -> Path:
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     result = tmp_path_factory.mktemp('motions')
     for i in range(4):
         write_motion(result / f'lab_{i:02d}_walk.bvh', i)
@@ -40,12 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return result
 
 
-def test_the_command_learns_chooses_and_tells(
-    folder: Path,
-    tmp_path: Path,
-    read_here: Callable[[], None],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_learns_chooses_and_tells(folder, tmp_path, read_here, capsys):
     output = tmp_path / 'prior.npz'
     rest = [
         str(folder),
@@ -94,14 +84,7 @@ def test_the_command_learns_chooses_and_tells(
         (['FOLDER', '--people', 'none.csv'], 'none.csv'),
     ],
 )
-def test_bad_input_is_one_line(
-    folder: Path,
-    tmp_path: Path,
-    arguments: list[str],
-    message: str,
-    read_here: Callable[[], None],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_bad_input_is_one_line(folder, tmp_path, arguments, message, read_here, capsys):
     read_here()
     places = {'FOLDER': str(folder), 'ONE': str(folder / 'lab_00_walk.bvh')}
     given = [places.get(x, x) for x in arguments]

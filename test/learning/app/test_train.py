@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -28,19 +25,17 @@ Frame Time: 0.033
 
 
 @pytest.fixture(autouse=True)
-def short_motions(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_motions(monkeypatch):
     monkeypatch.setattr(train, 'PROCEDURAL_SECONDS', 2.5)
     monkeypatch.setattr(train, 'PROCEDURAL_SEEDS', 2)
 
 
 @pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_figures(monkeypatch):
     monkeypatch.setattr(train, 'write_report', lambda *_: [])
 
 
-def test_procedural_motions_give_a_model_and_figures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_procedural_motions_give_a_model_and_figures(tmp_path, capsys, monkeypatch):
     output = tmp_path / 'model.npz'
     arguments = ['--motions', 'reach', '--model', 'local', '--samples', '120', '--seed', '3']
     arguments += ['--dynamics', '--acknowledgement', 'Thanks.']
@@ -65,12 +60,8 @@ def test_procedural_motions_give_a_model_and_figures(
 
 @pytest.mark.usefixtures('no_figures')
 def test_broken_motions_are_skipped_and_counted(
-    mocap_walk: Path,
-    tmp_path: Path,
-    read_here: Callable[[], None],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    mocap_walk, tmp_path, read_here, capsys, monkeypatch
+):
     monkeypatch.setattr(train, 'TESTED', 100)
     folder = tmp_path / 'motions'
     (folder / 'deeper').mkdir(parents=True)
@@ -97,7 +88,7 @@ def test_broken_motions_are_skipped_and_counted(
 
 
 @pytest.fixture(scope='module')
-def mocap_walk() -> Path:
+def mocap_walk():
     import os
 
     root = Path(__file__).resolve().parents[3]
@@ -108,16 +99,14 @@ def mocap_walk() -> Path:
     return path
 
 
-def _fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+def _fails(arguments, capsys):
     assert train.main([*arguments, '--model', 'local']) == 1
     error = capsys.readouterr().err.strip().splitlines()
     assert error[-1].startswith('train: ')
     return error[-1]
 
 
-def test_bad_input_is_one_line(
-    tmp_path: Path, read_here: Callable[[], None], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_line(tmp_path, read_here, capsys):
     read_here()
     output = str(tmp_path / 'm.npz')
     empty = tmp_path / 'empty'

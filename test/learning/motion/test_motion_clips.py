@@ -1,21 +1,18 @@
 """Every development motion against a plain evaluation of its file, and against the index."""
 
-from __future__ import annotations
-
 import csv
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hmt_learning.motion.motion_file import Motion, read_motion
+from hmt_learning.motion.motion_file import read_motion
 
 FRAMES = 6  # of each clip are evaluated the plain way
 
 
 @pytest.fixture(scope='module')
-def clips(mocap) -> dict[str, tuple[dict[str, str], Motion]]:
+def clips(mocap):
     """Row of the index and motion of every clip."""
     with (mocap / 'index.csv').open() as file:
         rows = list(csv.DictReader(file))
@@ -26,7 +23,7 @@ def clips(mocap) -> dict[str, tuple[dict[str, str], Motion]]:
     }
 
 
-def turn(letter: str, degrees: float) -> np.ndarray:
+def turn(letter, degrees):
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     rows = {
         'X': [[1, 0, 0], [0, c, -s], [0, s, c]],
@@ -38,13 +35,13 @@ def turn(letter: str, degrees: float) -> np.ndarray:
     return result
 
 
-def shift(v) -> np.ndarray:
+def shift(v):
     result = np.eye(4)
     result[:3, 3] = v
     return result
 
 
-def plain_bvh(path: Path, frames: np.ndarray) -> dict[str, np.ndarray]:
+def plain_bvh(path, frames):
     """Joint positions by name, file units; nested 4 x 4 products down the hierarchy."""
     header, motion = path.read_text().split('MOTION')
     rows = motion.strip().splitlines()[2:]
@@ -53,7 +50,7 @@ def plain_bvh(path: Path, frames: np.ndarray) -> dict[str, np.ndarray]:
     tokens = iter(header.split())
     column = 0
 
-    def joint(name: str, above: list) -> None:
+    def joint(name, above):
         nonlocal column
         assert next(tokens) == '{'
         assert next(tokens) == 'OFFSET'
@@ -85,7 +82,7 @@ def plain_bvh(path: Path, frames: np.ndarray) -> dict[str, np.ndarray]:
     return {name: np.array(place) for name, place in places.items()}
 
 
-def plain_amc(path: Path, frames: np.ndarray) -> dict[str, np.ndarray]:
+def plain_amc(path, frames):
     """Joint positions by name of the bone that starts there, file units."""
     text = path.with_suffix('.asf').read_text()
     bones = {}
@@ -110,7 +107,7 @@ def plain_amc(path: Path, frames: np.ndarray) -> dict[str, np.ndarray]:
         x = values['root']
         root = shift(x[:3]) @ turn('Z', x[5]) @ turn('Y', x[4]) @ turn('X', x[3])
 
-        def bone(name: str, above: np.ndarray, values=values) -> None:
+        def bone(name, above, values=values):
             span, axis, dof = bones[name]
             places.setdefault(name, []).append(above[:3, 3])
             c = turn('Z', axis[2]) @ turn('Y', axis[1]) @ turn('X', axis[0])

@@ -1,7 +1,5 @@
 """BVH and ASF/AMC: what small files mean, and one line for files that are broken."""
 
-from __future__ import annotations
-
 import contextlib
 from itertools import pairwise
 
@@ -90,7 +88,7 @@ upper 30 90
 """
 
 
-def write(folder, name: str, text: str):
+def write(folder, name, text):
     path = folder / name
     path.write_text(text)
     return path
@@ -168,7 +166,7 @@ def test_asf_and_amc_by_hand(rod):
     np.testing.assert_allclose(joints[1], [[0, 0, 0], [0, 0, 0], knee, end], atol=1e-12)
 
 
-def sliding(frames: str) -> str:
+def sliding(frames):
     """A joint with position channels beside the root's."""
     return (
         BVH.replace(
@@ -374,13 +372,11 @@ def test_damaged_files_are_read_or_refused(data, rod):
 # ------------------------------------------------------------------------------ whose names
 
 
-def rig(
-    prefix: str, spine: list[str], arm: list[str], leg: list[str], sides: tuple[str, str]
-) -> tuple:
+def rig(prefix, spine, arm, leg, sides):
     """Names and parents of a rig; `*` in a name is its side."""
     names, parents = [], []
 
-    def chain(start: int, joints: list[str], side: str = '') -> None:
+    def chain(start, joints, side=''):
         for joint in joints:
             names.append(prefix + joint.replace('*', side))
             parents.append(start)
@@ -456,16 +452,16 @@ def test_joints_of_known_rigs_get_standard_names(maker):
     assert left.startswith('l') or left.endswith('l')
 
 
-def person_bvh(unit: float, up: int) -> str:
+def person_bvh(unit, up):
     """A person of about 1.75 m who stands along an axis, in the names of MotionBuilder."""
     axes = [(up + 1) % 3, (up + 2) % 3, up]
 
-    def offset(x: float, y: float, z: float) -> str:
+    def offset(x, y, z):
         v = np.zeros(3)
         v[axes] = np.array([x, y, z]) / unit
         return ' '.join(f'{c:.9g}' for c in v)
 
-    def joint(name: str, place: tuple, *children: str) -> str:
+    def joint(name, place, *children):
         inside = ''.join(children) or f'End Site\n{{\nOFFSET {offset(0, 0.05, 0)}\n}}\n'
         channels = 'CHANNELS 3 Zrotation Xrotation Yrotation'
         return f'JOINT {name}\n{{\nOFFSET {offset(*place)}\n{channels}\n{inside}}}\n'

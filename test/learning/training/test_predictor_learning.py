@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,7 @@ from hmt_ros.experts import CalibratedExperts
 from hmt_ros.experts.pose_encoding import PoseEncoding
 
 
-def test_models_by_name() -> None:
+def test_models_by_name():
     for name in KINDS:
         assert isinstance(new_model(name), CalibratedExperts)
     few = new_model('joint', samples=200)
@@ -25,7 +23,7 @@ def test_models_by_name() -> None:
         new_model('forest')
 
 
-def test_affinities() -> None:
+def test_affinities():
     vectors = np.random.default_rng(0).normal(size=(20, 3))
     found = affinities(vectors)
     np.testing.assert_allclose(found, found.T)
@@ -34,7 +32,7 @@ def test_affinities() -> None:
     assert np.median(off) == pytest.approx(np.exp(-0.5), rel=0.05)
 
 
-def test_the_metric_of_targets_is_that_of_joints() -> None:
+def test_the_metric_of_targets_is_that_of_joints():
     body = load_body('human37')
     encoding = PoseEncoding(body)
     poses = procedural_sequence('dance', body, 3.0, 1).poses

@@ -1,33 +1,30 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from hmt_learning.training.training_set import (
     SIDE,
-    PoseSequence,
     TrainingSettings,
     activity_of,
     procedural_sequence,
     seen_from,
     training_set,
 )
-from hmt_ros.body import Body, load_body
+from hmt_ros.body import load_body
 from hmt_ros.body.mirror import mirror, root_rotations
 from hmt_ros.experts.pose_encoding import PoseEncoding
 
 
 @pytest.fixture(scope='module')
-def body() -> Body:
+def body():
     return load_body('human37')
 
 
 @pytest.fixture(scope='module')
-def sequences(body: Body) -> list[PoseSequence]:
+def sequences(body):
     return [procedural_sequence(name, body, 3.0, 1) for name in ('walk', 'dance')]
 
 
-def test_the_mirror_image_of_a_pose(body: Body, sequences: list[PoseSequence]) -> None:
+def test_the_mirror_image_of_a_pose(body, sequences):
     poses = sequences[1].poses
     names = body.joint_names
     swapped = [
@@ -39,7 +36,7 @@ def test_the_mirror_image_of_a_pose(body: Body, sequences: list[PoseSequence]) -
     np.testing.assert_array_equal(mirror(body, mirror(body, poses)), poses)
 
 
-def test_pairs_are_seen_whole_from_all_around(body: Body, sequences: list[PoseSequence]) -> None:
+def test_pairs_are_seen_whole_from_all_around(body, sequences):
     pairs = training_set(body, sequences, TrainingSettings(samples=96, seed=2))
     assert len(pairs) == 96
     for mask in pairs.masks():
@@ -55,7 +52,7 @@ def test_pairs_are_seen_whole_from_all_around(body: Body, sequences: list[PoseSe
     assert set(pairs.activities) == {'walk', 'dance'}
 
 
-def test_the_same_seed_gives_the_same_set(body: Body, sequences: list[PoseSequence]) -> None:
+def test_the_same_seed_gives_the_same_set(body, sequences):
     first, second, other = (
         training_set(body, sequences, TrainingSettings(samples=32, seed=s)) for s in (3, 3, 4)
     )
@@ -67,9 +64,7 @@ def test_the_same_seed_gives_the_same_set(body: Body, sequences: list[PoseSequen
 @pytest.mark.parametrize(
     ('heading', 'wanted'), [(0.0, (0, -1)), (90.0, (1, 0)), (180.0, (0, 1)), (-90.0, (-1, 0))]
 )
-def test_a_motion_seen_from_a_heading(
-    body: Body, sequences: list[PoseSequence], heading: float, wanted: tuple[int, int]
-) -> None:
+def test_a_motion_seen_from_a_heading(body, sequences, heading, wanted):
     poses, masks = seen_from(body, sequences[1], heading, frames=slice(10, 30, 2))
     assert masks.shape == (10, SIDE, SIDE)
     front = root_rotations(body, poses)[:, :, 1].mean(0)
@@ -90,5 +85,5 @@ def test_a_motion_seen_from_a_heading(
         ('Jump-3', 'jump'),
     ],
 )
-def test_activities_from_names(stem: str, wanted: str) -> None:
+def test_activities_from_names(stem, wanted):
     assert activity_of(stem) == wanted

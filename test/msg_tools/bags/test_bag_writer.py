@@ -1,11 +1,7 @@
 """Writing bags: what other tools read, the same bytes every time, whole or not at all."""
 
-from __future__ import annotations
-
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 
-from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
+from msg_tools import BagError, BagReader, BagWriter
 from msg_tools.bags import bag_writer
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import typestore
@@ -24,7 +20,7 @@ from test.msg_tools.conftest import limited_file_size
 STRING = 'std_msgs/msg/String'
 
 
-def write_bag(path: Path, messages: RosbagsMessages, count: int = 20, **options: Any) -> None:
+def write_bag(path, messages, count=20, **options):
     rng = np.random.default_rng(1)
     with BagWriter(path, **options) as bag:
         bag.add_topic('/body', 'hmt_msgs/msg/Body', latched=True)
@@ -41,7 +37,7 @@ def write_bag(path: Path, messages: RosbagsMessages, count: int = 20, **options:
             bag.write('/image/compressed', stamp, image)
 
 
-def test_same_calls_write_the_same_bytes(tmp_path: Path, messages: RosbagsMessages) -> None:
+def test_same_calls_write_the_same_bytes(tmp_path, messages):
     for folder in ('a', 'b'):
         write_bag(tmp_path / folder / 'bag', messages)
     for name in ('bag.mcap', 'metadata.yaml'):
@@ -50,7 +46,7 @@ def test_same_calls_write_the_same_bytes(tmp_path: Path, messages: RosbagsMessag
     assert sorted(path.name for path in (tmp_path / 'a').iterdir()) == ['bag']
 
 
-def test_topics_have_absolute_names(tmp_path: Path, messages: RosbagsMessages) -> None:
+def test_topics_have_absolute_names(tmp_path, messages):
     """rosbag2 makes the names that a user gives absolute, and compares them with these."""
     text = messages.create(STRING, data='')
     with BagWriter(tmp_path / 'bag', namespace='/humans/bodies/p1') as bag:
@@ -68,7 +64,7 @@ def test_topics_have_absolute_names(tmp_path: Path, messages: RosbagsMessages) -
     assert {one['topic_metadata']['name']: one['message_count'] for one in topics} == wanted
 
 
-def test_metadata_is_that_of_rosbag2(tmp_path: Path, messages: RosbagsMessages) -> None:
+def test_metadata_is_that_of_rosbag2(tmp_path, messages):
     write_bag(tmp_path / 'bag', messages)
     text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
     assert '&' not in text
@@ -100,12 +96,12 @@ def test_metadata_is_that_of_rosbag2(tmp_path: Path, messages: RosbagsMessages) 
     assert offered['durability'] == 'volatile'
 
 
-def test_rosbags_reads_it(tmp_path: Path, messages: RosbagsMessages) -> None:
+def test_rosbags_reads_it(tmp_path, messages):
     write_bag(tmp_path / 'bag', messages)
     with Reader(tmp_path / 'bag') as reader:
         assert reader.message_count == 41
         by_topic = {connection.topic: connection for connection in reader.connections}
-        (offered,) = by_topic['/body'].ext.offered_qos_profiles  # type: ignore[union-attr]
+        (offered,) = by_topic['/body'].ext.offered_qos_profiles
         assert offered.durability == QosDurability.TRANSIENT_LOCAL
         assert offered.reliability == QosReliability.RELIABLE
         assert [time for _, time, _ in reader.messages([by_topic['/text']])] == [
@@ -120,9 +116,7 @@ def test_rosbags_reads_it(tmp_path: Path, messages: RosbagsMessages) -> None:
         assert reader.deserialize(data, connection.msgtype).name == 'human37'
 
 
-def test_every_type_of_the_project_has_its_definition_in_the_bag(
-    tmp_path: Path, messages: RosbagsMessages
-) -> None:
+def test_every_type_of_the_project_has_its_definition_in_the_bag(tmp_path, messages):
     types = sorted(name for name in typestore().fielddefs if name.startswith('hmt_msgs/'))
     assert len(types) == 11
     with BagWriter(tmp_path / 'bag') as bag:
@@ -137,7 +131,7 @@ def test_every_type_of_the_project_has_its_definition_in_the_bag(
             ]
 
 
-def test_a_bag_without_messages(tmp_path: Path) -> None:
+def test_a_bag_without_messages(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add_topic('/text', STRING)
     with BagReader(tmp_path / 'bag') as reader:
@@ -150,8 +144,8 @@ def test_a_bag_without_messages(tmp_path: Path) -> None:
 # Whole or not at all
 
 
-def test_an_error_leaves_nothing(tmp_path: Path, messages: RosbagsMessages) -> None:
-    def fail() -> None:
+def test_an_error_leaves_nothing(tmp_path, messages):
+    def fail():
         with BagWriter(tmp_path / 'bag') as bag:
             bag.write('/text', 1, messages.create(STRING, data='text'))
             assert not (tmp_path / 'bag').exists()
@@ -163,7 +157,7 @@ def test_an_error_leaves_nothing(tmp_path: Path, messages: RosbagsMessages) -> N
     assert list(tmp_path.iterdir()) == []
 
 
-def test_close_and_abort_are_final(tmp_path: Path, messages: RosbagsMessages) -> None:
+def test_close_and_abort_are_final(tmp_path, messages):
     bag = BagWriter(tmp_path / 'bag')
     bag.write('/text', 1, messages.create(STRING, data='text'))
     bag.close()
@@ -175,7 +169,7 @@ def test_close_and_abort_are_final(tmp_path: Path, messages: RosbagsMessages) ->
         assert reader.message_count() == 1
 
 
-def test_overwrite_replaces_at_the_end(tmp_path: Path, messages: RosbagsMessages) -> None:
+def test_overwrite_replaces_at_the_end(tmp_path, messages):
     write_bag(tmp_path / 'bag', messages, count=1)
     with BagWriter(tmp_path / 'bag', overwrite=True) as bag:
         bag.write('/text', 1, messages.create(STRING, data='new'))
@@ -185,7 +179,7 @@ def test_overwrite_replaces_at_the_end(tmp_path: Path, messages: RosbagsMessages
         assert reader.message_count() == 1
     assert [path.name for path in tmp_path.iterdir()] == ['bag']
 
-    def fail() -> None:
+    def fail():
         with BagWriter(tmp_path / 'bag', overwrite=True) as bag:
             raise RuntimeError(bag.path.name)
 
@@ -195,9 +189,7 @@ def test_overwrite_replaces_at_the_end(tmp_path: Path, messages: RosbagsMessages
         assert reader.message_count() == 1
 
 
-def test_overwrite_never_touches_anything_but_a_bag(
-    tmp_path: Path, messages: RosbagsMessages
-) -> None:
+def test_overwrite_never_touches_anything_but_a_bag(tmp_path, messages):
     (tmp_path / 'folder').mkdir()
     (tmp_path / 'folder' / 'thesis.tex').write_text('years of work')
     with pytest.raises(BagError, match=r'is not replaced: it has thesis\.tex'):
@@ -222,7 +214,7 @@ def test_overwrite_never_touches_anything_but_a_bag(
 
 
 @pytest.mark.parametrize('limit', [1_000, 1_500_000])
-def test_full_disk(tmp_path: Path, messages: RosbagsMessages, limit: int) -> None:
+def test_full_disk(tmp_path, messages, limit):
     with (
         pytest.raises(BagError, match=r'bag can not be written: File too large'),
         limited_file_size(limit),
@@ -232,15 +224,13 @@ def test_full_disk(tmp_path: Path, messages: RosbagsMessages, limit: int) -> Non
 
 
 @pytest.mark.parametrize('step', ['fsync', 'rename'])
-def test_failure_while_closing(
-    tmp_path: Path, messages: RosbagsMessages, monkeypatch: pytest.MonkeyPatch, step: str
-) -> None:
+def test_failure_while_closing(tmp_path, messages, monkeypatch, step):
     write_bag(tmp_path / 'bag', messages, count=1)
 
-    def refuse(*arguments: object) -> None:
+    def refuse(*arguments):
         raise OSError(28, 'No space left on device')
 
-    def refuse_the_new_folder(path: Path, target: Path, rename: Callable[..., Any]) -> Any:
+    def refuse_the_new_folder(path, target, rename):
         refused = path.parent.suffix == '.partial' and path.name == 'bag'
         return refuse() if refused else rename(path, target)
 
@@ -260,7 +250,7 @@ def test_failure_while_closing(
 # Wrong calls
 
 
-def test_wrong_calls(tmp_path: Path, messages: RosbagsMessages) -> None:
+def test_wrong_calls(tmp_path, messages):
     with BagWriter(tmp_path / 'bag') as bag:
         bag.write('/text', 1, messages.create(STRING, data='text'))
         with pytest.raises(BagError, match='/text is there already'):

@@ -1,7 +1,5 @@
 """Pictures in messages: every encoding against OpenCV, every defect as one line."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from types import SimpleNamespace
@@ -11,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from msg_tools import RosbagsMessages
 from msg_tools.messages.images import (
     ImageError,
     compressed_image_message,
@@ -26,22 +23,14 @@ HEIGHT, WIDTH = 30, 44
 RNG = np.random.default_rng(2)
 
 
-def scene() -> np.ndarray[Any, np.dtype[np.uint8]]:
+def scene():
     """A smooth picture with colours, BGR."""
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
     planes = [128 + 100 * np.sin(u / 7), 128 + 100 * np.cos(v / 9), 255 * u / WIDTH]
     return np.stack(planes, axis=-1).round().astype(np.uint8)
 
 
-def raw(
-    pixels: np.ndarray[Any, Any],
-    encoding: str,
-    /,
-    *,
-    padding: int = 0,
-    big: bool = False,
-    **changes: Any,
-) -> SimpleNamespace:
+def raw(pixels, encoding, /, *, padding=0, big=False, **changes):
     """An Image of rows of pixels."""
     kind = pixels.dtype.newbyteorder('>' if big else '<')
     rows = np.ascontiguousarray(pixels.astype(kind)).view(np.uint8).reshape(len(pixels), -1)
@@ -66,7 +55,7 @@ PLANES = RNG.integers(0, 256, (HEIGHT * 3 // 2, WIDTH), dtype=np.uint8)
 ALPHA = np.dstack([BGR, MOSAIC])
 
 
-def eight_bits(words: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def eight_bits(words):
     return np.rint(words.astype(np.float64) / 257.0).astype(np.uint8)
 
 
@@ -106,7 +95,7 @@ CASES: list[tuple[str, Any, Any]] = [
 
 @pytest.mark.parametrize('padding', [0, 1, 6])
 @pytest.mark.parametrize(('encoding', 'pixels', 'wanted'), CASES, ids=[case[0] for case in CASES])
-def test_every_encoding(encoding: str, pixels: Any, wanted: Any, padding: int) -> None:
+def test_every_encoding(encoding, pixels, wanted, padding):
     for big in (False, True) if pixels.dtype == np.uint16 else (False,):
         picture = decode_image(raw(pixels, encoding, padding=padding, big=big))
         np.testing.assert_array_equal(picture, wanted)
@@ -117,7 +106,7 @@ def test_every_encoding(encoding: str, pixels: Any, wanted: Any, padding: int) -
 
 @pytest.mark.parametrize('padding', [0, 2, 6])
 @pytest.mark.parametrize('encoding', ['yuv420', 'i420', 'yv12'])
-def test_three_planes(encoding: str, padding: int) -> None:
+def test_three_planes(encoding, padding):
     """Rows of chroma are half as long, with half the padding, as libcamera writes them."""
     wanted = cv2.cvtColor(PLANES, cv2.COLOR_YUV2BGR_I420)
     luma, chroma = PLANES[:HEIGHT], PLANES[HEIGHT:].reshape(2, HEIGHT // 2, WIDTH // 2)
@@ -155,7 +144,7 @@ def test_three_planes(encoding: str, padding: int) -> None:
         ({'encoding': 'nv12', 'height': 31}, r'image of 44x31 can not be nv12, wanted even sizes'),
     ],
 )
-def test_defects_of_raw_images(changes: dict[str, Any], error: str) -> None:
+def test_defects_of_raw_images(changes, error):
     with pytest.raises(ImageError, match=error):
         decode_image(raw(BGR, 'bgr8', **changes))
 
@@ -163,11 +152,11 @@ def test_defects_of_raw_images(changes: dict[str, Any], error: str) -> None:
 # Compressed
 
 
-def compressed(data: bytes, form: str = 'jpeg') -> SimpleNamespace:
+def compressed(data, form='jpeg'):
     return SimpleNamespace(format=form, data=data)
 
 
-def encoded(suffix: str, image: Any) -> bytes:
+def encoded(suffix, image):
     done, data = cv2.imencode(suffix, image)
     assert done
     return bytes(data)
@@ -185,7 +174,7 @@ def encoded(suffix: str, image: Any) -> bytes:
         ('rgb8; png compressed bgr8', '.png'),
     ],
 )
-def test_compressed_formats(form: str, suffix: str) -> None:
+def test_compressed_formats(form, suffix):
     data = encoded(suffix, BGR)
     wanted = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     picture = decode_image(compressed(data, form))
@@ -195,7 +184,7 @@ def test_compressed_formats(form: str, suffix: str) -> None:
         np.testing.assert_array_equal(picture, BGR)
 
 
-def test_compressed_grey_alpha_and_16_bits() -> None:
+def test_compressed_grey_alpha_and_16_bits():
     for image, wanted in (
         (GREY, np.dstack([GREY] * 3)),
         (ALPHA, BGR),
@@ -209,7 +198,7 @@ def test_compressed_grey_alpha_and_16_bits() -> None:
     assert np.abs(grey[..., 1].astype(int) - GREY).mean() < 3
 
 
-def test_jpeg_that_was_cut_anywhere_is_no_picture() -> None:
+def test_jpeg_that_was_cut_anywhere_is_no_picture():
     data = encoded('.jpg', BGR)
     for length in range(len(data) - 1):
         with pytest.raises(ImageError):
@@ -218,7 +207,7 @@ def test_jpeg_that_was_cut_anywhere_is_no_picture() -> None:
     assert decode_image(compressed(data + bytes(7))).shape == BGR.shape
 
 
-def test_damaged_pictures_never_crash() -> None:
+def test_damaged_pictures_never_crash():
     for suffix in ('.jpg', '.png'):
         data = encoded(suffix, BGR)
         for seed in range(300):
@@ -233,12 +222,12 @@ def test_damaged_pictures_never_crash() -> None:
             assert picture.size <= 3 * 2**26
 
 
-def with_size(png: bytes, width: int, height: int) -> bytes:
+def with_size(png, width, height):
     header = b'IHDR' + struct.pack('>II', width, height) + png[24:29]
     return png[:12] + header + struct.pack('>I', zlib.crc32(header)) + png[33:]
 
 
-def test_defects_of_compressed_images() -> None:
+def test_defects_of_compressed_images():
     jpeg = encoded('.jpg', BGR)
     frame = jpeg.index(b'\xff\xc0')
     huge = jpeg[: frame + 5] + b'\xff\xff\xff\xff' + jpeg[frame + 9 :]
@@ -263,7 +252,7 @@ def test_defects_of_compressed_images() -> None:
 # Encoding
 
 
-def test_jpeg_with_scans_without_end_is_refused_undecoded() -> None:
+def test_jpeg_with_scans_without_end_is_refused_undecoded():
     done, file = cv2.imencode('.jpg', scene(), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
     assert done
     plain = file.tobytes()
@@ -283,14 +272,14 @@ SHAPE = np.where(MOSAIC > 99, MOSAIC - np.uint8(99), np.uint8(0))
 
 @pytest.mark.parametrize('padding', [0, 3])
 @pytest.mark.parametrize('encoding', ['mono8', '8UC1'])
-def test_masks_are_true_where_they_are_not_zero(encoding: str, padding: int) -> None:
+def test_masks_are_true_where_they_are_not_zero(encoding, padding):
     mask = decode_mask(raw(SHAPE, encoding, padding=padding))
     assert mask.dtype == np.bool_
     np.testing.assert_array_equal(mask, SHAPE > 0)
 
 
 @pytest.mark.parametrize('values', [SHAPE, SHAPE // 100])
-def test_masks_as_png(values: Any) -> None:
+def test_masks_as_png(values):
     np.testing.assert_array_equal(
         decode_mask(compressed(encoded('.png', values), 'mono8; png compressed ')), values > 0
     )
@@ -315,19 +304,19 @@ def test_masks_as_png(values: Any) -> None:
         (compressed(encoded('.png', GREY)[:-20], 'png'), r'breaks off or is damaged'),
     ],
 )
-def test_defects_of_masks(message: Any, error: str) -> None:
+def test_defects_of_masks(message, error):
     with pytest.raises(ImageError, match=error):
         decode_mask(message)
 
 
-def test_pictures_of_files() -> None:
+def test_pictures_of_files():
     png = encoded('.png', scene())
     np.testing.assert_array_equal(decode_picture(png), scene())
     with pytest.raises(ImageError, match=r"unknown format starts with b'BM"):
         decode_picture(encoded('.bmp', scene()))
 
 
-def test_encoding_is_repeatable_and_near(messages: RosbagsMessages) -> None:
+def test_encoding_is_repeatable_and_near(messages):
     assert encode_jpeg(BGR, 90) == encode_jpeg(BGR.copy(), 90)
     assert len(encode_jpeg(BGR, 95)) > len(encode_jpeg(BGR, 50))
     message = compressed_image_message(messages, BGR, 1_500_000_000, 'camera', quality=95)
@@ -336,7 +325,7 @@ def test_encoding_is_repeatable_and_near(messages: RosbagsMessages) -> None:
     assert np.abs(decode_image(message).astype(int) - BGR).mean() < 3
 
 
-def test_image_message_round_trip(messages: RosbagsMessages) -> None:
+def test_image_message_round_trip(messages):
     view = np.dstack([BGR, BGR])[:, ::2, 1:4]
     message = image_message(messages, view, 5, 'camera')
     assert (message.encoding, message.step) == ('bgr8', WIDTH // 2 * 3)
@@ -347,7 +336,7 @@ def test_image_message_round_trip(messages: RosbagsMessages) -> None:
 
 
 @pytest.mark.parametrize('image', [BGR.astype(float), BGR[..., :2], BGR[0, 0], BGR[:0]])
-def test_what_is_no_picture_is_not_encoded(messages: RosbagsMessages, image: Any) -> None:
+def test_what_is_no_picture_is_not_encoded(messages, image):
     with pytest.raises(ImageError):
         encode_jpeg(image)
     with pytest.raises(ImageError):

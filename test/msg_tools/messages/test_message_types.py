@@ -1,7 +1,5 @@
 """The types of the project, and types that come with their definition."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,7 @@ from msg_tools.messages.message_types import typestore, typestore_of_definition
 DEFINITIONS = Path(msg_tools.__file__).parent / 'hmt_msgs' / 'msg'
 
 
-def test_all_definitions_are_registered() -> None:
+def test_all_definitions_are_registered():
     names = {f'hmt_msgs/msg/{path.stem}' for path in DEFINITIONS.glob('*.msg')}
     assert len(names) == 11
     assert names <= typestore().fielddefs.keys()
@@ -32,12 +30,12 @@ def test_all_definitions_are_registered() -> None:
         'sensor_msgs/msg/JointState',
     ],
 )
-def test_input_of_older_distributions_agrees_with_ours(distribution: Stores, msgtype: str) -> None:
+def test_input_of_older_distributions_agrees_with_ours(distribution, msgtype):
     definition, _ = get_typestore(distribution).generate_msgdef(msgtype, ros_version=2)
     assert typestore_of_definition(msgtype, 'ros2msg', definition) is typestore()
 
 
-def test_names_of_camera_info_in_capitals() -> None:
+def test_names_of_camera_info_in_capitals():
     definition, _ = typestore().generate_msgdef('sensor_msgs/msg/CameraInfo', ros_version=2)
     for name in 'dkrp':
         for kind in ('float64[]', 'float64[9]', 'float64[12]'):
@@ -47,7 +45,7 @@ def test_names_of_camera_info_in_capitals() -> None:
     assert store is typestore()
 
 
-def test_only_what_differs_is_taken_from_a_definition() -> None:
+def test_only_what_differs_is_taken_from_a_definition():
     rule = '=' * 80
     definition = f'std_msgs/Header header\nint32 x\n{rule}\nMSG: std_msgs/Header\nuint32 seq\n'
     store = typestore_of_definition('my_msgs/msg/X', 'ros2msg', definition)
@@ -61,7 +59,7 @@ def test_only_what_differs_is_taken_from_a_definition() -> None:
     assert store.fielddefs['hmt_msgs/msg/Body'] == typestore().fielddefs['hmt_msgs/msg/Body']
 
 
-def test_definition_in_idl() -> None:
+def test_definition_in_idl():
     definition = """================================================================================
 IDL: my_msgs/msg/X
 module my_msgs {
@@ -96,8 +94,6 @@ module my_msgs {
         ('my_msgs/msg/X', 'protobuf', '\x01\x02', 'the bag does not define it'),
     ],
 )
-def test_types_that_can_not_be_known(
-    msgtype: str, encoding: str, definition: str, error: str
-) -> None:
+def test_types_that_can_not_be_known(msgtype, encoding, definition, error):
     with pytest.raises(ValueError, match=error):
         typestore_of_definition(msgtype, encoding, definition)
