@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+import hmt_ros
 from hmt_ros.app import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -18,6 +19,11 @@ def test_help_names_all_commands(option, capsys):
         assert f'  {name}' in text
         assert what in text
     assert max(len(line) for line in text.splitlines()) <= 100
+
+
+def test_version(capsys):
+    assert main(['--version']) == 0
+    assert capsys.readouterr().out == f'hmt_ros {hmt_ros.__version__}\n'
 
 
 @pytest.mark.parametrize(

@@ -222,6 +222,16 @@ def test_bad_people_are_told_once(session, outputs, small_camera, people, text):
     assert len(one.state.people) == 2
 
 
+def test_messages_that_contradict_themselves_are_no_detections(session, small_camera):
+    one = started(session(), small_camera)
+    message = seen(small_camera, 0, somebody_at(15))
+    message.ids.append('b')
+    (fault,) = one.take(DETECTIONS, message).faults
+    assert 'people: 2 ids with 1 keypoints, wanted 2 or none' in fault
+    assert one.take(IMAGE, small_camera.image(0)).faults == ()
+    assert StubTracker.made == []
+
+
 def test_detections_without_an_image_and_images_without_detections(session, small_camera):
     one = started(session(), small_camera)
     show(one, small_camera, 0, somebody_at(15))

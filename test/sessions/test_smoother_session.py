@@ -336,6 +336,14 @@ def test_transforms_are_the_links_of_the_heaviest_pose(session, outputs, likelih
     assert len(read(outputs, '/tf')) == 4
 
 
+@pytest.mark.parametrize('model', ['constant_velocity', 'learned'])
+def test_motion_models_with_velocities(model, session, outputs, likelihoods):
+    one = session(dynamics=SmootherDynamics(model=model))
+    for index in range(4):
+        assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
+    assert len(smoothed(outputs)) == 2
+
+
 def test_a_new_body_begins_a_new_window(session, outputs, likelihoods):
     one = session()
     other = likelihoods.body.with_stature(1.6)

@@ -90,6 +90,22 @@ def test_jpeg_files_are_copied_and_masks_are_found_by_name(folder, tmp_path):
     assert np.array_equal(decode_mask(found['/mask'][0][1]), picture > 0)
 
 
+def test_masks_of_a_video(video, tmp_path):
+    size = (64, 48)
+    writer = cv2.VideoWriter(
+        str(tmp_path / 'masks.mp4'), cv2.VideoWriter_fourcc(*'mp4v'), 25.0, size
+    )
+    for i in range(10):
+        picture = np.zeros((48, 64, 3), np.uint8)
+        picture[:, : 8 + 4 * i] = 255
+        writer.write(picture)
+    writer.release()
+    options = ['--masks', tmp_path / 'masks.mp4', '--start', '0.1', '--every', 3]
+    assert run(video, tmp_path / 'bag', *options) == 0
+    masks = [decode_mask(x) for _, x in content(tmp_path / 'bag')['/mask']]
+    assert [round(x.mean() * 64) for x in masks] == pytest.approx([20, 32, 44], abs=1)
+
+
 def test_same_command_same_bytes(video, tmp_path):
     for name in ('a', 'b'):
         assert run(video, tmp_path / name / 'bag') == 0
@@ -149,6 +165,30 @@ def test_detector(video, tmp_path, monkeypatch):
     assert [decode_mask(x).any(1).sum() for _, x in found['/mask']] == [1, 2, 3, 4, 5]
 
 
+def test_detector_sees_square_pixels(video, with_pixel_aspect, tmp_path, monkeypatch):
+    sizes = []
+
+    class Pose(FakePose):
+        def detect(self, image, stamp_ns):
+            sizes.append(image.shape[:2])
+            return super().detect(image, stamp_ns)
+
+    monkeypatch.setitem(DETECTORS, 'mediapipe', replace(DETECTORS['mediapipe'], make=Pose))
+    video.write_bytes(with_pixel_aspect(video.read_bytes(), 2, 1))
+    options = ['--detector', 'mediapipe', '--detector-masks']
+    assert run(video, tmp_path / 'bag', *options) == 0
+    assert set(sizes) == {(48, 128)}
+    found = content(tmp_path / 'bag')
+    second = found['/keypoints'][1][1]
+    # Where it sees (2, 2); the centre of the first pixel is 0.
+    assert (second.u[0], second.v[0]) == (0.75, 2.0)
+    assert np.allclose(np.reshape(second.covariance, (3, 2, 2))[0], [[0.25, 0], [0, 1]])
+    assert decode_mask(found['/mask'][3][1]).sum() == 4 * 64
+    camera = camera_from_info(found['/camera_info'][0][1], (64, 48))
+    assert camera.fx == pytest.approx(32 / np.tan(np.radians(30)))
+    assert camera.fy == pytest.approx(2 * camera.fx)
+
+
 def test_video_that_breaks_off_is_told(video, tmp_path, capsys):
     path = tmp_path / 'broken.avi'
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 25.0, (64, 48))
@@ -170,6 +210,17 @@ def test_video_that_breaks_off_is_told(video, tmp_path, capsys):
         topics = content(out)
         assert 0 < len(topics['/keypoints']) == len(topics['/image/compressed']) < 20
     assert run(path, tmp_path / 'few', '--keypoints', arrays(tmp_path / 'few.npz', 19)) == 1
+
+
+def test_a_part_of_the_video_in_which_nobody_is(video, tmp_path, capsys):
+    found = arrays(tmp_path / 'late.npz', 10, detected=np.arange(10) > 6)
+    out = tmp_path / 'bag'
+    assert run(video, out, '--keypoints', found, '--end', '0.2') == 0
+    assert 'none of the 5 imported frames has keypoints' in capsys.readouterr().err
+    topics = content(out)
+    for topic in ('/keypoints', '/keypoints_3d'):
+        assert [len(message.names) for _, message in topics[topic]] == [0] * 5
+    assert run(video, tmp_path / 'one', '--keypoints', found, '--person', 'index:1') == 1
 
 
 @pytest.mark.parametrize(
@@ -229,3 +280,26 @@ def test_images_of_several_sizes(folder, tmp_path, capsys):
     (line,) = capsys.readouterr().err.splitlines()
     assert 'img_5.jpg has 64x40 pixels, the frames before it 64x48; wanted one size' in line
     assert not (tmp_path / 'bag').exists()
+
+
+def test_a_mirrored_recording(video, tmp_path):
+    """Frames, keypoints, positions and masks are turned; sides have each other's names."""
+    (tmp_path / 'masks').mkdir()
+    picture = np.zeros((48, 64), np.uint8)
+    picture[:, :10] = 255
+    for i in range(10):
+        assert cv2.imwrite(str(tmp_path / 'masks' / f'{i}.png'), picture)
+    options = ['--keypoints', arrays(tmp_path / 'k.npz', 10), '--masks', tmp_path / 'masks']
+    for name, more in (('plain', []), ('turned', ['--mirror'])):
+        assert run(video, tmp_path / name, *options, *more) == 0
+    plain, turned = content(tmp_path / 'plain'), content(tmp_path / 'turned')
+    before, after = (decode_image(x['/image/compressed'][3][1]) for x in (plain, turned))
+    assert np.abs(before[:, ::-1].astype(int) - after).mean() < 2.0
+    assert np.array_equal(
+        decode_mask(turned['/mask'][3][1]), decode_mask(plain['/mask'][3][1])[:, ::-1]
+    )
+    one, other = plain['/keypoints'][3][1], turned['/keypoints'][3][1]
+    assert tuple(other.names) == ('right_hip', 'left_hip', 'right_knee')
+    assert list(other.u) == [63 - x for x in one.u]
+    assert list(other.v) == list(one.v)
+    assert list(turned['/keypoints_3d'][3][1].x) == [-1.0] * 3

@@ -160,6 +160,19 @@ def test_folder_is_read_in_the_order_of_numbers(folder, number_in):
     assert natural_order('a_9.png') < natural_order('a_10.png')
 
 
+def test_jpeg_that_was_taken_turned_is_made_upright(folder):
+    content = (folder / 'img_1.jpg').read_bytes()
+    # Orientation 6 of Exif: turn by 90 degrees clockwise.
+    entry = struct.pack('<HHIHH', 0x0112, 3, 1, 6, 0)
+    exif = b'Exif\0\0' + struct.pack('<2sHIH', b'II', 42, 8, 1) + entry + bytes(4)
+    segment = b'\xff\xe1' + struct.pack('>H', 2 + len(exif)) + exif
+    (folder / 'img_1.jpg').write_bytes(content[:2] + segment + content[2:])
+    frame = open_source(folder, 1.0).frame(0)
+    assert frame.jpeg is None
+    assert frame.image.shape == (64, 48, 3)
+    assert frame.image[:16, 40:].min() > 200  # the bright corner is at the right
+
+
 def test_labels_of_frames(folder, video):
     images, film = open_source(folder, 1.0), open_source(video, None, first_number=1)
     assert images.number_of('img_10') == 9

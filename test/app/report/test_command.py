@@ -369,3 +369,9 @@ def test_floor_is_that_of_the_bag(body, poses, tmp_path):
     ground = data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground']
     assert ground['planes'] == [None, *[[0.0, -0.8, -0.6, 1.5]] * (FRAMES - 1)]
     assert ground['contacts'] == [{}, *[{'left': 0.9, 'right': 0.1}] * (FRAMES - 1)]
+
+
+def test_floor_that_contradicts_itself(body, poses, tmp_path, capsys):
+    bag = with_ground(tmp_path, body, poses, spoil=lambda m: setattr(m, 'height', 7.0))
+    assert report.main([str(bag), '-o', str(tmp_path / 'report'), '--quiet']) == 1
+    assert f'ground at {STAMPS[1]} ns: ground: plane is' in capsys.readouterr().err
