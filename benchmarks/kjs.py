@@ -18,7 +18,7 @@ from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips import enumerate_flips
-from hmt_ros.flips.interpretation_tree import distinct_poses, flip_counts
+from hmt_ros.flips.interpretation_tree import distinct_poses
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.image_term import TermSettings
@@ -122,7 +122,7 @@ def measure(count: int = SAMPLES, seed: int = 0, runs: int = RUNS) -> dict[str, 
         'machine': description(),
         'dgemm_gflops': dgemm_rate() / 1e9,
         'trees': {
-            chain: int(flip_counts(body, setting.start.x, chain)[0]) for chain in body.chains
+            chain: int(leaf_counts(body, setting.start.x, chain)[0]) for chain in body.chains
         },
         'rows': rows,
         'ratios': ratios(rows),
@@ -291,9 +291,14 @@ def chosen_pose(body: Body) -> Array:
     """
     poses = drawn_poses(body)
     poses = poses[out_of_plane(body, poses) > OUT_OF_PLANE]
-    leaves = np.prod([flip_counts(body, poses, chain) for chain in body.chains], axis=0)
+    leaves = np.prod([leaf_counts(body, poses, chain) for chain in body.chains], axis=0)
     result: Array = poses[np.argmax(leaves)]
     return result
+
+
+def leaf_counts(body: Body, poses: Array, chain: str) -> Array:
+    """Number of leaves (N,) that the tree of one chain has at each pose."""
+    return np.bincount(enumerate_flips(body, poses, chain)[1], minlength=len(poses))
 
 
 def out_of_plane(body: Body, poses: Array) -> Array:

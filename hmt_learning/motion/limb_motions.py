@@ -35,8 +35,7 @@ CLEARANCE = 0.02  # added to the arc of the ankle in the air, m of a body of the
 
 def minimum_jerk(share: Array) -> Array:
     """The step from 0 to 1, over a share of the time from 0 to 1, with the least jerk."""
-    result: Array = share**3 * (10.0 + share * (6.0 * share - 15.0))
-    return result
+    return share**3 * (10.0 + share * (6.0 * share - 15.0))
 
 
 def arm_posture(body: Body, upper: Sequence[ArrayLike], fore: Sequence[ArrayLike]) -> Posture:
@@ -205,5 +204,4 @@ def walking_foot(
 def cubic(share: Array, start: float, slope: float, end: Array | float) -> Array:
     """The cubic with a value and a slope at 0, and a value and no slope at 1."""
     u, v = share, 1.0 - share
-    result: Array = (1 + 2 * u) * v * v * start + u * v * v * slope + u * u * (3 - 2 * u) * end
-    return result
+    return (1 + 2 * u) * v * v * start + u * v * v * slope + u * u * (3 - 2 * u) * end

@@ -302,8 +302,7 @@ def _views(count: int, s: TrainingSettings, rng: np.random.Generator) -> Array:
     heading = rng.uniform(-np.pi, np.pi, count)
     elevation = np.radians(np.clip(rng.normal(s.elevation, s.elevation_spread, count), -20.0, 50.0))
     roll = np.radians(rng.normal(0.0, s.roll_spread, count))
-    result: Array = about(2, roll) @ about(0, elevation) @ about(1, heading)
-    return result
+    return about(2, roll) @ about(0, elevation) @ about(1, heading)
 
 
 def about(axis: int, angle: Array) -> Array:

@@ -112,11 +112,6 @@ class MixtureLikelihood:
         at = self.first[:-1] + path
         return self.log_scales[at], self.means[at], self.precisions[at]
 
-    def modes_at(self, t: int) -> tuple[Array, Array, Array]:
-        """log scales (K_t,), means (K_t, d) and precisions (K_t, d, d) of the modes at a time."""
-        at = slice(self.first[t], self.first[t + 1])
-        return self.log_scales[at], self.means[at], self.precisions[at]
-
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
@@ -173,12 +168,6 @@ class WindowLikelihood:
             np.concatenate([mean, means]),
             np.concatenate([precision, precisions]),
         )
-
-    def modes_at(self, t: int) -> tuple[Array, Array, Array]:
-        """As for `MixtureLikelihood`: over n variables at the first time, over d later."""
-        if t == 0 or self.later is None:
-            return self.first.modes_at(t)
-        return self.later.modes_at(t - 1)
 
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
@@ -325,12 +314,8 @@ def or_missed(mixture: GaussianMixture, variances: Array) -> GaussianMixture:
     )
 
 
-def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = True) -> None:
-    """Checks that the mixtures of a window can be smoothed.
-
-    Args:
-        mixtures: one for each time.
-        factorise: whether covariances are checked to be positive definite.
+def check_mixtures(mixtures: Sequence[GaussianMixture]) -> None:
+    """Checks that the mixtures of a window, one for each time, can be smoothed.
 
     Raises:
         ValueError: a mixture that can not be smoothed, with its place.
@@ -348,8 +333,6 @@ def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = Tru
                 f'mixture {t} has {mixture.dimension} variables, those before '
                 f'{mixtures[0].dimension}'
             )
-        if not factorise:
-            continue
         try:
             mixture.cholesky()
         except ValueError as error:
