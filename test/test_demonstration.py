@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from hmt_learning.app import make_bag
-from hmt_ros.app.demo import main
 from hmt_ros.app.report.skeletons import LEFT, RIGHT
 from hmt_ros.app.truth import read_truth
 from hmt_ros.evaluation.pose_scores import HIPS
@@ -18,6 +17,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.keypoints import keypoints_message, positions_message
+from tools.demonstration.demo import main
 
 PICTURES = ('overview.png', 'overlays.png', 'side_views.png', 'weights.png', 'calibration.png')
 
