@@ -50,15 +50,15 @@ from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.existence import CLEAR, Existence
 from hmt_ros.tracking.ground import Gravity
+from hmt_ros.tracking.hypotheses import PosePrediction
 from hmt_ros.tracking.initialisation import (
     mixture_from_box,
     poses_from_keypoints,
     poses_from_outline,
     start_from_keypoints,
 )
-from hmt_ros.tracking.pose_prediction import PosePrediction
+from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOMENT
-from hmt_ros.tracking.view import View
 
 # What a prediction is sure of by itself, nats: in the first image nothing else has spoken.
 AT_ONCE = 1.5 * CLEAR.nats

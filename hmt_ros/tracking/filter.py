@@ -35,14 +35,12 @@ from hmt_ros.tracking.classes import (
     ways,
     weigh_ways,
 )
-from hmt_ros.tracking.contact import contacts_of
-from hmt_ros.tracking.evaluation_plan import is_surprising
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import (
     Identities,
     Modes,
     Optimised,
-    joined,
+    PosePrediction,
     new_hypotheses,
 )
 from hmt_ros.tracking.laplace_approximation import posterior_modes
@@ -54,13 +52,12 @@ from hmt_ros.tracking.misfit import (
     of_keypoints,
     of_silhouette,
 )
-from hmt_ros.tracking.optimisation import Search
+from hmt_ros.tracking.optimisation import Search, is_surprising
 from hmt_ros.tracking.point_estimate import PointEstimate
-from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
-from hmt_ros.tracking.proposals import proposals_of
-from hmt_ros.tracking.proposals.keypoint_poses import KeypointHistory
+from hmt_ros.tracking.proposals import proposals_of, propose
+from hmt_ros.tracking.proposals.whole_poses import PoseByKeypoints
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import FIRST_SHAPE_FITS, POSTURE_BITS, SHAPE_MODES, TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
@@ -148,7 +145,8 @@ class MixtureFilter:
         self._identities = Identities()
         self._outline_costs = np.empty((0, 0))
         self._points: SurfacePoints | None = None
-        self._by_keypoints = KeypointHistory()
+        self._by_keypoints = PoseByKeypoints()
+        self._proposals = proposals_of(settings.proposals)
         self._use_body(body)
 
     @property
@@ -213,7 +211,7 @@ class MixtureFilter:
 
     def _initialise(self, optimised: Optimised, observation: Observation) -> None:
         """Sets the modes of a new track, at zero velocity."""
-        self._by_keypoints = KeypointHistory()
+        self._by_keypoints = PoseByKeypoints()
         optimised = _finite(optimised)
         log_weights = optimised.hypotheses.log_weights
         log_weights = log_weights - ERRORS['image'].independent * optimised.minima.value
@@ -265,8 +263,8 @@ class MixtureFilter:
             self._by_keypoints.contradicted,
             prediction,
         )
-        candidates = [x.propose(search, base, predicted, self._rng) for x in self._proposals]
-        self._select(self._weigh(search, search.optimise(joined(candidates))), observation)
+        candidates = propose(self._proposals, search, base, predicted, self._rng)
+        self._select(self._weigh(search, search.optimise(candidates)), observation)
         self._fit_shape(observation, ERRORS['shape'].share(dt))
         return self._judge(observation, search)
 
@@ -339,8 +337,7 @@ class MixtureFilter:
             identities=self._identities.of(selected.hypotheses, before),
         )
         if posterior.ground is not None:
-            plane, still = posterior.ground.plane, posterior.ground.still
-            modes = contacts_of(posterior.body, plane, modes, before, dt, still=still)
+            modes = posterior.ground.with_contacts(posterior.body, modes, before, dt)
         self.modes = modes
         self._publish(modes)
         self._outline_costs = posterior.fit(modes.poses, observation).outline_costs
@@ -429,7 +426,6 @@ class MixtureFilter:
         self.posterior = Posterior(
             body, self.camera, self.settings, self._extra, self._ground, self.spent
         )
-        self._proposals = proposals_of(self.posterior)
 
 
 def _finite(optimised: Optimised) -> Optimised:

@@ -118,6 +118,18 @@ class Posterior:
         s = self.settings
         return ImageLikelihood(self.body, self.camera, s.likelihood, threads=s.threads)
 
+    @cached_property
+    def divided(self) -> dict[str, tuple[ImageLikelihood, ImageLikelihood]]:
+        """By limb the likelihoods of its flesh, and of the rest of the body without it."""
+        chains, parts = self.body.skeleton.chains, self.body.flesh.parts
+        result = {}
+        for chain in (chain for pair in self.body.chain_pairs for chain in pair):
+            own = tuple(i for i, part in enumerate(parts) if part.segment in chains[chain])
+            rest = tuple(i for i in range(len(parts)) if i not in own)
+            of_limb = replace(self.likelihood, parts=own)
+            result[chain] = of_limb, replace(self.likelihood, parts=rest, occluders=rest)
+        return result
+
     def of_image(self, observation: Observation, exchanges: Array | None = None) -> PoseEnergy:
         """The energy without the motion prior; its evaluations are counted.
 

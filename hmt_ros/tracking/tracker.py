@@ -44,7 +44,6 @@ from hmt_ros.tracking.beginning import (
     poses_to_search,
 )
 from hmt_ros.tracking.camera_motion import CameraPath
-from hmt_ros.tracking.contact import by_foot
 from hmt_ros.tracking.existence import GIVEN, Existence
 from hmt_ros.tracking.filter import Judged, MixtureFilter
 from hmt_ros.tracking.ground import (
@@ -52,15 +51,14 @@ from hmt_ros.tracking.ground import (
     KnownGround,
     unit_vector,
 )
+from hmt_ros.tracking.hypotheses import PosePrediction
 from hmt_ros.tracking.initialisation import check_box
 from hmt_ros.tracking.laplace_approximation import likelihood_modes
 from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE, of_depth_at_best
-from hmt_ros.tracking.observer import Observer
-from hmt_ros.tracking.pose_prediction import PosePrediction
+from hmt_ros.tracking.observer import Observer, View
 from hmt_ros.tracking.settings import GIVEN_UP_SIGMA, LIKELY_NATS, RESTING_SHARE, TrackerSettings
 from hmt_ros.tracking.track_state import Estimate, TrackState, no_likelihood
 from hmt_ros.tracking.validity import DEPTH, Validity
-from hmt_ros.tracking.view import View
 
 
 class Tracker:
@@ -464,8 +462,7 @@ class Tracker:
             self.silhouettes.complete(view.image, track.person, self.camera, likely)
         dt = state.age(view.stamp)
         if self.settings.ground.on:
-            contacts = by_foot(modes) if self._ground.still else {}
-            resting = min(contacts.values(), default=RESTING_SHARE)
+            resting = min(self._ground.by_foot(modes).values(), default=RESTING_SHARE)
             self._ground.update(track.person, modes, resting, dt)
         # The motion takes in one image after another, so each with its own covariance alone.
         found = modes.mixture
@@ -517,7 +514,7 @@ class Tracker:
             misfit=track.misfit,
             evaluations=sum(track.spent),
             validity=state.validity,
-            contacts=by_foot(track.modes) if ground.still else {},
+            contacts=ground.by_foot(track.modes),
             ground=ground.estimate,
             vertical=ground.vertical,
             gravity_contradicted=ground.contradicted,

@@ -20,7 +20,6 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings, read_subject
 from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath
-from hmt_ros.tracking.contact import by_foot, contacts_of
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.point_estimate import PointEstimate
@@ -166,6 +165,7 @@ def test_feet_rest_before_a_moving_camera(body):
     found = []
     for carried in (True, False):
         rested, estimator = None, GroundEstimator(KnownGround(UP, 1.0))
+        estimator.still = True
         before = drive(0.0)
         for t, pose in enumerate(standing):
             now = drive(0.1 * t)
@@ -176,10 +176,10 @@ def test_feet_rest_before_a_moving_camera(body):
             if step is not None and carried:
                 rested = step.modes(body, rested)
                 estimator.carry(step)
-            rested = contacts_of(body, estimator.plane, modes, rested, 0.1, still=True)
+            rested = estimator.with_contacts(body, modes, rested, 0.1)
             estimator.update(body, modes, 1.0, 0.1)
             before = now
-        found.append(max(by_foot(rested).values()))
+        found.append(max(estimator.by_foot(rested).values()))
     assert found[0] > 0.8
     assert found[1] < 0.3
 

@@ -10,10 +10,9 @@ import pytest
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.sessions.tracking_parameters import LIVE_BUDGET
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.evaluation_plan import is_surprising
+from hmt_ros.tracking.optimisation import is_surprising
 from hmt_ros.tracking.settings import (
     ACCURATE_BUDGET,
-    PROPOSALS,
     SURPRISING_FACTOR,
     SURPRISING_RATIO,
 )
@@ -47,13 +46,6 @@ def test_the_least_budget_still_follows_one_mode():
     least = ACCURATE_BUDGET // SURPRISING_FACTOR
     assert TrackerSettings(evaluation_budget=least - 1).plan.searched_chains == 0
     assert TrackerSettings(evaluation_budget=least).plan.searched_chains == 1
-
-
-def test_settings_name_the_proposals_that_there_are():
-    for name in PROPOSALS:
-        assert TrackerSettings(proposals=name).proposals == name
-    with pytest.raises(ValueError, match='proposals must be one of'):
-        TrackerSettings(proposals='guesses')
 
 
 @pytest.mark.parametrize('seconds', [0.03, 0.3])

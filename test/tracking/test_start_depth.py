@@ -20,8 +20,8 @@ from hmt_ros.tracking.beginning import Shown, first_start
 from hmt_ros.tracking.existence import Existence
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.misfit import of_depth_at_best
+from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.validity import DEPTH, Validity
-from hmt_ros.tracking.view import View
 
 STATURE, AWAY = 1.9, 3.5
 MS = 1_000_000
