@@ -176,10 +176,6 @@ class Identities:
     def __init__(self) -> None:
         self._last = 0
 
-    def restart(self) -> None:
-        """Counts from 1 again: a track begins."""
-        self._last = 0
-
     def new(self, count: int) -> Index:
         """Numbers (count,) that no mode has had."""
         first, self._last = self._last + 1, self._last + count

@@ -133,13 +133,6 @@ class Observer:
             changed=silhouettes.background.changed if mask is None else 0.0,
         )
 
-    def seen_anywhere(self, view: View) -> View:
-        """The same view, with the silhouette of somebody who may be anywhere in it."""
-        found = self._silhouettes.silhouette(view.image, view.stamp, view.mask, None, view.others)
-        if found is None:
-            return view
-        return view._replace(silhouette=found.foreground, unsure=found.unsure)
-
     def observation(self, view: View, pose: Array | None, validity: Validity) -> Observation:
         """The evidence of an image about a person.
 

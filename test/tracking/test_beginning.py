@@ -239,7 +239,7 @@ def test_keypoints_of_a_detector_start_a_track(human37, name):
 
 
 def test_no_start_is_less_sure_than_existence():
-    assert all(kind.sure >= 0.0 for kind in STARTS)
+    assert all(sure >= 0.0 for _, _, sure, _ in STARTS)
 
 
 def test_why_no_track_starts_is_said(camera, human37, filmed):

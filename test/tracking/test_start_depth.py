@@ -14,9 +14,8 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.joint_depths import depths_of, joint_depths, moved_to_depth
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import Subject, Tracker
-from hmt_ros.tracking.beginning import Shown, first_start
+from hmt_ros.tracking.beginning import Shown, Source, first_start
 from hmt_ros.tracking.existence import Existence
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.misfit import of_depth_at_best
@@ -124,7 +123,7 @@ def test_poses_move_along_their_rays(tall, camera):
 def shown(view, stamp, model, camera, given=None, box=None):
     """An image without any other input."""
     view = view._replace(stamp=stamp)
-    return Shown(view, model, model, camera, None, given, box, lambda: None)
+    return Shown(view, model, model, camera, None, given, box)
 
 
 def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
@@ -135,9 +134,9 @@ def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
     found = {}
     for name, depth in (('with', depths[0]), ('without', None)):
         view = View(images[0], depth=depth)
-        beginning = first_start(shown(view, 0, model, camera, box=box), Existence())
-        assert isinstance(beginning.start, GaussianMixture)
-        found[name] = np.abs(beginning.start.means[:, 2] - poses[0, 2]).max()
+        source, start = first_start(shown(view, 0, model, camera, box=box), Existence())
+        assert source is Source.BOX
+        found[name] = np.abs(start.expected.means[:, 2] - poses[0, 2]).max()
     assert found['with'] < 0.18 < found['without']
 
 
@@ -149,7 +148,7 @@ def test_the_joints_of_an_older_image_are_not_looked_up_in_this_depth(tall, came
     # A wall stands where the person was.
     view = View(images[0], depth=np.full_like(depths[0], 1.5))
     late, plain = (
-        first_start(shown(x, 900 * MS, model, camera, given=given), Existence())
+        first_start(shown(x, 900 * MS, model, camera, given=given), Existence())[1]
         for x in (view, View(images[0]))
     )
     assert np.array_equal(late.best, plain.best)
