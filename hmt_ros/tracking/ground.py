@@ -83,21 +83,11 @@ class KnownGround:
             raise ValueError(f'camera_height must be a positive number of metres, saw {height}')
 
 
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """The present estimate of the ground.
+class Ground(FloorPlane):
+    """The present estimate of the ground, at the camera or where the person is.
 
-    Attributes:
-        up: (3,) unit vector against gravity in the camera frame.
-        up_sigma: standard deviation of its angle about each horizontal axis, rad.
-        height: height of the camera above the floor, m; None: unknown.
-        height_sigma: its standard deviation, m; inf where it is unknown.
+    The height has the deviation inf where it is unknown.
     """
-
-    up: Array
-    up_sigma: float
-    height: float | None
-    height_sigma: float
 
     @property
     def plane(self) -> Array | None:
@@ -329,9 +319,8 @@ class GroundEstimator:
                 stands = (
                     2.0 * UPRIGHT_CONCENTRATION * np.exp(UPRIGHT_CONCENTRATION * (cosine - 1.0))
                 )
-                lies = np.exp(-RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0)))
-                said = -np.log(stands + lies) * min(dt / VERTICAL_TIME, 1.0)
                 most = RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0))
+                said = -np.log(stands + np.exp(-most)) * min(dt / VERTICAL_TIME, 1.0)
                 self._by_person = float(np.clip(self._by_person + said, -RIGHT_VERTICAL_NATS, most))
             elif self._seen is None:
                 self._follow_axis(axis, place, resting, dt)
@@ -376,19 +365,14 @@ class GroundEstimator:
             seen = Vertical(given, known.up_sigma)
         if seen is None:
             seen = Vertical(self._mean, float(np.sqrt(self._covariance.trace() / len(self._mean))))
-        up, up_sigma = seen.up, seen.sigma
-        tracked, tracked_sigma = self._tracked_level()
-        height, sigma = tracked, tracked_sigma
+        tracked = Ground(seen.up, seen.sigma, *self._tracked_level(), measured=False)
+        self.estimate = self.plane = tracked
         if known.camera_height is not None:
-            height, sigma = known.camera_height, 2.0 * MEASURED_SIGMA
-        self.estimate = Ground(up, up_sigma, height, sigma)
-        # An error of the vertical lifts the floor where the person is.
-        measured = known.camera_height is not None
-        if measured:
-            sigma = float(np.hypot(sigma, up_sigma * self._distance))
-        if sigma > tracked_sigma:
-            height, sigma, measured = tracked, tracked_sigma, False
-        self.plane = FloorPlane(up, up_sigma, height, sigma, measured)
+            self.estimate = Ground(seen.up, seen.sigma, known.camera_height, 2.0 * MEASURED_SIGMA)
+            # An error of the vertical lifts the floor where the person is.
+            sigma = float(np.hypot(self.estimate.height_sigma, seen.sigma * self._distance))
+            if sigma <= tracked.height_sigma:
+                self.plane = replace(self.estimate, height_sigma=sigma)
 
     def _tracked_level(self) -> tuple[float | None, float]:
         """Height of the camera over the lowest soles of the last seconds, and its deviation, m."""

@@ -101,13 +101,14 @@ class Observer:
         if last is not None and given.stamp <= last:
             raise ValueError(f'stamps must increase, saw {given.stamp} after {last} ns')
         size = (self._camera.height, self._camera.width)
-        masks = {'a mask of ': (given.mask, given.others), 'depths of ': (given.depth,)}
-        for name, arrays in {'': (given.image,), **masks}.items():
-            for each in arrays:
-                if each is not None and each.shape[:2] != size:
-                    raise ValueError(
-                        f'the camera gives images of {size}, saw {name}{each.shape[:2]}'
-                    )
+        for name, each in (
+            ('', given.image),
+            ('a mask of ', given.mask),
+            ('a mask of ', given.others),
+            ('depths of ', given.depth),
+        ):
+            if each is not None and each.shape[:2] != size:
+                raise ValueError(f'the camera gives images of {size}, saw {name}{each.shape[:2]}')
 
     def view(self, given: View, body: Body, poses: Array | None, dt: float) -> View:
         """The view of a person in an image.
