@@ -41,7 +41,7 @@ demo:
 	@$(WITH_DETECTOR)
 	@rm -rf build/demo && mkdir -p build/demo
 	@echo 'starting the demonstration'
-	@$(SOURCED) python -m hmt_ros.app.demo $(DEMO_BAG) -o build/demo --live
+	@$(SOURCED) python tools/demonstration/demo.py $(DEMO_BAG) -o build/demo --live
 
 test:
 	@$(WORKSPACE) ros test kernels

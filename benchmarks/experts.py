@@ -20,7 +20,7 @@ from benchmarks.runs import in_processes
 from benchmarks.tracking_means import GROUPS, group_of
 from hmt_ros.evaluation.pose_scores import joint_mixtures, origin_joints, score
 from hmt_ros.evaluation.track_scores import Truth
-from hmt_ros.experts.descriptor.contour import NoSilhouetteError
+from hmt_ros.experts.descriptor.contour import NoSilhouetteError, person_blob
 from hmt_ros.experts.pose_predictor import ALONE, BY_DYNAMICS, PosePredictor, load_predictor
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
@@ -86,7 +86,7 @@ def speed(folder: Path, seconds: float) -> dict[str, float]:
     mask = silhouette.view(np.uint8)
     return {
         'descriptor': 1e3
-        * best_time(lambda: predictor.describe(mask, clip.camera), seconds=seconds),
+        * best_time(lambda: predictor.described(person_blob(mask), clip.camera), seconds=seconds),
         'whole': 1e3 * best_time(lambda: predictor.predict(mask, clip.camera), seconds=seconds),
     }
 

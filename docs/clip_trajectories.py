@@ -27,11 +27,7 @@ from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, Paths
 from hmt_ros.smoothing.likelihood import counted
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories, limits_of_states, refine
-from hmt_ros.smoothing.variational_mixture import (
-    VariationalMixture,
-    minimise_free_energy,
-    peak_weights,
-)
+from hmt_ros.smoothing.variational_mixture import VariationalMixture, minimise_free_energy
 
 Array = NDArray[np.float64]
 
@@ -174,8 +170,9 @@ def descent(found: ClipTrajectories) -> VariationalMixture:
     low, high = limits_of_states(
         found.lower, found.upper, prior.dimension, distinct.states.shape[2]
     )
+    heights = np.exp(-distinct.energies - logsumexp(-distinct.energies))
     return minimise_free_energy(
-        peak_weights(distinct.energies), distinct.states, distinct.factors, prior,
+        heights, distinct.states, distinct.factors, prior,
         found.sequence.likelihood, low=low, high=high, samples=SAMPLES, max_iterations=ITERATIONS,
     )  # fmt: skip
 

@@ -38,12 +38,13 @@ from clip_trajectories import (  # noqa: E402
 )
 from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.ticker import MaxNLocator  # noqa: E402
+from scipy.special import logsumexp  # noqa: E402
 
 from benchmarks.clips import ROOT, Clip, read_clip, with_file  # noqa: E402
 from benchmarks.runs import IMAGES, UNKNOWN, Seen, tracked  # noqa: E402
 from hmt_ros.app.report.skeletons import save_picture  # noqa: E402
 from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories  # noqa: E402
-from hmt_ros.smoothing.variational_mixture import VariationalMixture, laplace_weights  # noqa: E402
+from hmt_ros.smoothing.variational_mixture import VariationalMixture, laplace_masses  # noqa: E402
 
 # A usual motion, one with the arms towards the camera, and one with many explanations.
 CLIPS = ('walk', 'signals', 'laugh')
@@ -242,7 +243,8 @@ def draw_reach(clip: Clip) -> None:
     seen = tracked(clip, IMAGES, UNKNOWN)[::EVERY]
     found = clip_trajectories(seen, through_modes=True)
     d = found.sequence.dynamics.dimension
-    masses = laplace_weights(found.distinct.energies, found.distinct.factors)
+    log_masses = laplace_masses(found.distinct.energies, found.distinct.factors)
+    masses = np.exp(log_masses - logsumexp(log_masses))
     order = np.argsort(-masses, kind='stable')
     distinct, weights = found.distinct[order], masses[order]
     optima = found.joints(distinct.states)

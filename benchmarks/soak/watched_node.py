@@ -170,14 +170,14 @@ class Watched:
     def values(self) -> dict[str, str]:
         """The values of its next diagnostics."""
         diagnostics = self.player.diagnostics
-        diagnostics.pop(self.node.full_name, None)
+        diagnostics.pop(self.node.name, None)
         end = time.monotonic() + PATIENCE
-        while self.node.full_name not in diagnostics:
+        while self.node.name not in diagnostics:
             if time.monotonic() > end:
                 raise LiveNodeError(f'{self.scene.node} tells no diagnostics')
             self.check_alive()
             self.player.executor.spin_once(timeout_sec=0.1)
-        return diagnostics[self.node.full_name]
+        return diagnostics[self.node.name]
 
     def traces(self) -> list[str]:
         """What it has said that no user should see.

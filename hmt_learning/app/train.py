@@ -303,7 +303,7 @@ def _affinity_figure(body: Body, sequences: Sequence[PoseSequence], training: De
             step = 2 if len(sequence.poses) >= 2 * FRAMES else 1
             poses, masks = seen_from(body, sequence, 90.0, frames=slice(0, FRAMES * step, step))
             parts = [silhouette_parts(mask, training.descriptor.points) for mask in masks]
-            histograms = [training.descriptor.codebook_.histogram(part.contexts) for part in parts]
+            histograms = [training.descriptor.codebook.histogram(part.contexts) for part in parts]
             vectors = (
                 poses[:, AXES:],
                 np.sqrt(np.array(histograms)),
@@ -358,8 +358,7 @@ def _multimodality_figure(training: Described) -> Figure:
 
 
 def _scaled(values: Array) -> Array:
-    result: Array = values / np.maximum(values.std(0), 1e-6)
-    return result
+    return values / np.maximum(values.std(0), 1e-6)
 
 
 def _example_figure(pairs: TrainingSet) -> Figure:

@@ -116,44 +116,12 @@ def read_amc(path: Path, text: str, skeleton: Acclaim) -> Array:
             degrees = words[0].upper() == ':DEGREES'
     else:
         raise MotionFileError(path, len(lines), 'the file ends, wanted frames')
-    values = _regular_frames(lines[at:], skeleton)
-    if values is None:
-        values = _any_frames(path, lines, at, skeleton)
+    values = _frames(path, lines, at, skeleton)
     return values * np.where(skeleton.rig.is_rotation, np.pi / 180 if degrees else 1.0, 1.0)
 
 
-def _regular_frames(lines: Sequence[str], skeleton: Acclaim) -> Array | None:
-    """The values where every frame lists the same bones in the same order, all at once."""
-    words = ' '.join(lines).split()
-    if not words[0].isdecimal() or not skeleton.dimension:
-        return None
-    first_frame = int(words[0])
-    layout: list[tuple[str, int]] = []  # bone, place of its first number
-    at = 1
-    while at < len(words) and words[at] in skeleton.columns:
-        layout.append((words[at], at + 1))
-        at += 1 + len(skeleton.columns[words[at]])
-    if {bone for bone, _ in layout} != set(skeleton.columns) or len(words) % at:
-        return None
-    frames = len(words) // at
-    if frames * at > LARGEST_MOTION:
-        return None
-    if words[::at] != [str(first_frame + i) for i in range(frames)]:
-        return None
-    values = np.empty((frames, skeleton.dimension))
-    try:
-        for bone, first in layout:
-            if words[first - 1 :: at].count(bone) != frames:
-                return None
-            for i, column in enumerate(skeleton.columns[bone]):
-                values[:, column] = np.array(words[first + i :: at], dtype=np.float64)
-    except ValueError:
-        return None
-    return values if np.isfinite(values).all() else None
-
-
-def _any_frames(path: Path, lines: Sequence[str], at: int, skeleton: Acclaim) -> Array:
-    """The values line by line; errors name the line."""
+def _frames(path: Path, lines: Sequence[str], at: int, skeleton: Acclaim) -> Array:
+    """The values (T, d) of the frames from a line on."""
     frames: list[Array] = []
     missing: set[str] = set()
     first_frame = 0

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from hmt_learning.motion.inverse_kinematics import solve_joint_positions
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import forward
 from hmt_ros.body.limb_angles import SIDES
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.inference.arrays import Array
@@ -35,8 +34,7 @@ CLEARANCE = 0.02  # added to the arc of the ankle in the air, m of a body of the
 
 def minimum_jerk(share: Array) -> Array:
     """The step from 0 to 1, over a share of the time from 0 to 1, with the least jerk."""
-    result: Array = share**3 * (10.0 + share * (6.0 * share - 15.0))
-    return result
+    return share**3 * (10.0 + share * (6.0 * share - 15.0))
 
 
 def arm_posture(body: Body, upper: Sequence[ArrayLike], fore: Sequence[ArrayLike]) -> Posture:
@@ -125,7 +123,7 @@ def _intersects(body: Body, before: Mapping[str, float], after: Mapping[str, flo
         if name in body.dof_names:
             start = before.get(name, 0.0)
             poses[:, body.dof_names.index(name)] = start + share * (after[name] - start)
-    energy, _, _ = self_intersection_energy(body, forward(body.skeleton, poses))
+    energy = self_intersection_energy(body, poses)
     return bool(energy.max() > 0.0)
 
 
@@ -205,5 +203,4 @@ def walking_foot(
 def cubic(share: Array, start: float, slope: float, end: Array | float) -> Array:
     """The cubic with a value and a slope at 0, and a value and no slope at 1."""
     u, v = share, 1.0 - share
-    result: Array = (1 + 2 * u) * v * v * start + u * v * v * slope + u * u * (3 - 2 * u) * end
-    return result
+    return (1 + 2 * u) * v * v * start + u * v * v * slope + u * u * (3 - 2 * u) * end

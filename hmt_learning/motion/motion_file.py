@@ -91,8 +91,7 @@ class Motion:
         joints = self.body.joint_positions(self.poses)
         if names is not None:
             joints = joints[:, self.body.skeleton.joint_index(tuple(names))]
-        result: Array = joints @ self.world_from_file.T
-        return result
+        return joints @ self.world_from_file.T
 
     def part(self, start: int = 0, stop: int | None = None, step: int = 1) -> Motion:
         """Every step-th of the frames from start to stop.

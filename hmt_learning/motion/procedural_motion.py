@@ -258,8 +258,7 @@ def dance(
 
     def wave(low: float, high: float, beats: float) -> Array:
         phase = rng.uniform(0, 2 * np.pi)
-        result: Array = rng.uniform(low, high) * DEGREE * np.sin(2 * np.pi * clock / beats + phase)
-        return result
+        return rng.uniform(low, high) * DEGREE * np.sin(2 * np.pi * clock / beats + phase)
 
     angles = {
         'root_z': yaws.mean(0),
@@ -346,8 +345,7 @@ def rests(time: Array, times: ArrayLike, values: ArrayLike) -> Array:
     at, value = np.asarray(times, dtype=np.float64), np.asarray(values, dtype=np.float64)
     after = np.clip(np.searchsorted(at, time, side='right'), 1, len(at) - 1)
     share = np.clip((time - at[after - 1]) / (at[after] - at[after - 1]), 0.0, 1.0)
-    result: Array = value[after - 1] + minimum_jerk(share) * (value[after] - value[after - 1])
-    return result
+    return value[after - 1] + minimum_jerk(share) * (value[after] - value[after - 1])
 
 
 def smooth_below(limit: Array, half_width: int) -> Array:

@@ -211,8 +211,7 @@ def _recorded_front(motion: Motion, rotation: Array, skeleton: Skeleton, start: 
     axes = np.einsum('cw,iwt->tci', rotation @ motion.world_from_file, columns)
     front = forward(skeleton, start).columns[0, 1].T
     mean = np.einsum('tci,tc->i', axes, front)
-    result: Array = axes @ (mean / max(float(np.linalg.norm(mean)), 1e-9))
-    return result
+    return np.asarray(axes @ (mean / max(float(np.linalg.norm(mean)), 1e-9)))
 
 
 def _refined(body: Body, misfit: Misfit, start: Array, fps: float) -> Array:

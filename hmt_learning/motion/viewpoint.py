@@ -46,15 +46,12 @@ class Viewpoint:
     @property
     def translation(self) -> Array:
         """The world's origin (3,) in the camera optical frame, m."""
-        result: Array = self.rotation @ np.array([0.0, -self.distance, -self.height])
-        return result
+        return np.asarray(self.rotation @ np.array([0.0, -self.distance, -self.height]))
 
     def to_camera(self, points: ArrayLike) -> Array:
         """Points (..., 3) of the world in the camera optical frame, m."""
-        result: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
-        return result
+        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
 
     def to_world(self, points: ArrayLike) -> Array:
         """Points (..., 3) of the camera optical frame in the world, m."""
-        result: Array = (np.asarray(points, dtype=np.float64) - self.translation) @ self.rotation
-        return result
+        return (np.asarray(points, dtype=np.float64) - self.translation) @ self.rotation

@@ -297,8 +297,7 @@ def sensed_depth(depth: Depth, camera: Camera, seed: int, frame: int = 0) -> NDA
 def _smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], blur: float) -> Depth:
     """Noise of unit variance that is alike over some pixels."""
     noise = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), blur)
-    result: Depth = noise / noise.std()
-    return result
+    return np.asarray(noise / noise.std())
 
 
 def _shadowed(inverse: Depth, shift: float) -> NDArray[np.bool_]:
@@ -307,5 +306,4 @@ def _shadowed(inverse: Depth, shift: float) -> NDArray[np.bool_]:
     # A pixel is seen there at this column; a nearer surface, further right, covers it.
     there = column - shift * inverse
     nearest_right = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
-    result: NDArray[np.bool_] = there > nearest_right + 0.5
-    return result
+    return there > nearest_right + 0.5

@@ -93,8 +93,7 @@ class Scene:
     @property
     def light_direction(self) -> Array:
         """Unit vector (3,) towards the light, camera frame."""
-        result: Array = self.viewpoint.rotation @ _unit(np.array(self.light))
-        return result
+        return self.viewpoint.rotation @ _unit(np.array(self.light))
 
     def lambert(self, cosine: NDArray[Real]) -> NDArray[Real]:
         """Light that a surface reflects, by the cosine of its normal to the light; at most 1."""
@@ -140,8 +139,7 @@ def _normal_quantiles() -> Picture:
     p = (np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS
     values = np.interp(p, cumulative / cumulative[-1], grid)
     values -= values.mean()
-    result: Picture = (values / values.std()).astype(np.float32)
-    return result
+    return np.asarray((values / values.std()).astype(np.float32))
 
 
 def smooth_noise(points: Array, rng: np.random.Generator) -> Array:
@@ -154,8 +152,7 @@ def smooth_noise(points: Array, rng: np.random.Generator) -> Array:
     k, m = (i + 1) % 64, (j + 1) % 64
     low = table[i, j] * (1 - f[:, 0]) + table[k, j] * f[:, 0]
     high = table[i, m] * (1 - f[:, 0]) + table[k, m] * f[:, 0]
-    result: Array = low * (1 - f[:, 1]) + high * f[:, 1]
-    return result
+    return low * (1 - f[:, 1]) + high * f[:, 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,8 +287,7 @@ def _empty_depth(scene: Scene, camera: Camera) -> Array:
 
 
 def _unit(vector: Array) -> Array:
-    result: Array = vector / np.linalg.norm(vector)
-    return result
+    return vector / np.linalg.norm(vector)
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,8 +409,7 @@ class Clothes:
 
 
 def _choose(where: NDArray[np.bool_], one: Picture | np.float32, other: Picture) -> Picture:
-    result: Picture = np.where(where[:, None], one, other)
-    return result
+    return np.where(where[:, None], one, other)
 
 
 def _kind(segment: str) -> str:

@@ -263,8 +263,7 @@ def _varied(body: Body, poses: Array, others: Sequence[Array], rng: np.random.Ge
     size[4:AXES] = LEAN
     size[[name.startswith('trunk') for name in names]] = LEAN
     wandering = size * lfilter([1.0], [1.0, -keep], drawn, axis=0)
-    result: Array = np.clip(poses + wandering, body.lower, body.upper)
-    return result
+    return np.asarray(np.clip(poses + wandering, body.lower, body.upper))
 
 
 def _places(body: Body, poses: Array, rng: np.random.Generator | None) -> Array:

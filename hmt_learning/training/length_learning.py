@@ -46,8 +46,7 @@ class LengthSpread:
     def covariance(self) -> Array:
         """(L, L) of relative lengths."""
         count = len(self.proportions)
-        result: Array = np.diag(self.proportions**2) + np.full((count, count), self.stature**2)
-        return result
+        return np.asarray(np.diag(self.proportions**2) + np.full((count, count), self.stature**2))
 
 
 def usual_spread(body: Body) -> LengthSpread:
@@ -81,8 +80,7 @@ def relative_lengths(body: Body, lengths: Array) -> Array:
             f'this skeleton are not those of a person'
         )
     logarithms = np.log(np.where(additive, 1.0, lengths))
-    result: Array = np.where(additive, lengths / body.skeleton.lengths, logarithms)
-    return result
+    return np.where(additive, lengths / body.skeleton.lengths, logarithms)
 
 
 def own_skeletons(

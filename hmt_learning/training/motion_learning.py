@@ -84,8 +84,7 @@ def _displacements(body: Body, sequences: Sequence[Array], step: int) -> Array:
     if len(every) == 0:
         return every
     limit = np.quantile(np.abs(every), USUAL, axis=(0, 1))
-    result: Array = np.clip(every, -limit, limit)
-    return result
+    return np.clip(every, -limit, limit)
 
 
 def _groups(body: Body) -> list[list[int]]:
@@ -155,5 +154,4 @@ def _couplings(
     size = np.sqrt(np.maximum(np.diagonal(both), 1e-300))
     correlation = (1.0 - SHRINKAGE) * both / np.outer(size, size)
     np.fill_diagonal(correlation, 1.0)
-    result: Array = 0.5 * (correlation + correlation.T)
-    return result
+    return np.asarray(0.5 * (correlation + correlation.T))

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_learning.training.descriptor_learning import learned_descriptor
 from hmt_learning.training.network_learning import LearningNetwork, tools_are_there
 from hmt_learning.training.training_set import TrainingSet
 from hmt_ros.body import Body
@@ -165,7 +166,7 @@ class Described:
         count = min(count, self.descriptor.size)
         return replace(
             self,
-            descriptor=self.descriptor.with_components(count),
+            descriptor=replace(self.descriptor, basis=self.descriptor.basis[:, :count]),
             descriptors=self.descriptors[:, :count],
         )
 
@@ -173,18 +174,20 @@ class Described:
 def described(
     body: Body,
     pairs: TrainingSet,
-    descriptor: SilhouetteDescriptor | None = None,
     progress: Progress | None = None,
+    **of_descriptor: int,
 ) -> Described:
     """Descriptors and targets of a training set.
 
     Args:
         progress: Iterates over the silhouettes, given their number.
+        of_descriptor: see `learned_descriptor`.
     """
-    descriptor = descriptor or SilhouetteDescriptor()
     # Shape contexts of all silhouettes would fill the memory.
-    some = np.random.default_rng(descriptor.seed).permutation(len(pairs))[:FOR_DESCRIPTOR]
-    descriptor.fit([silhouette_parts(pairs.mask(i), descriptor.points) for i in np.sort(some)])
+    some = np.sort(np.random.default_rng(0).permutation(len(pairs))[:FOR_DESCRIPTOR])
+    descriptor = learned_descriptor(
+        [silhouette_parts(pairs.mask(i)) for i in some], **of_descriptor
+    )
     masks: Iterable[Bytes] = pairs.masks()
     if progress is not None:
         masks = progress(masks, len(pairs))
@@ -261,8 +264,7 @@ def target_basis(encoding: PoseEncoding, targets: Array) -> Array:
     slopes = slopes.reshape(len(chosen), -1, body.dimension) @ by_target
     metric = np.einsum('nij,nik->jk', slopes, slopes, optimize=True)
     metric /= len(chosen) * (len(body.joint_names) - 1)
-    factor: Array = np.linalg.cholesky(metric + SMALLEST**2 * np.eye(encoding.size))
-    return factor
+    return np.linalg.cholesky(metric + SMALLEST**2 * np.eye(encoding.size))
 
 
 def affinities(vectors: Array) -> Array:
@@ -270,8 +272,7 @@ def affinities(vectors: Array) -> Array:
     squared = squared_distances(vectors, vectors)
     off = squared[~np.eye(len(squared), dtype=bool)]
     scale = max(float(np.median(off)) if len(off) else 1.0, 1e-12)
-    result: Array = np.exp(-0.5 * squared / scale)
-    return result
+    return np.exp(-0.5 * squared / scale)
 
 
 def multimodality(inputs: Array, targets: Array, clusters: int, seed: int = 0) -> Index:
@@ -295,5 +296,4 @@ def multimodality(inputs: Array, targets: Array, clusters: int, seed: int = 0) -
     ]
     pairs = np.unique(np.stack(labels, axis=1), axis=0)
     under = np.bincount(pairs[:, 0], minlength=clusters)
-    counts: Index = np.bincount(under[under > 0])[1:]
-    return counts
+    return np.bincount(under[under > 0])[1:]

@@ -348,8 +348,7 @@ def plain_log_density(body: Body, dofs: Index, poses: Array) -> Array:
     """Log density (N,) of some angles of poses (N, d) under the Gaussians of the model file."""
     sigma = body.prior_sigma[dofs]
     z = (poses[:, dofs] - body.prior_mean[dofs]) / sigma
-    result: Array = -0.5 * (z * z).sum(1) - np.log(sigma * np.sqrt(2.0 * np.pi)).sum()
-    return result
+    return np.asarray(-0.5 * (z * z).sum(1) - np.log(sigma * np.sqrt(2.0 * np.pi)).sum())
 
 
 def _mixture(

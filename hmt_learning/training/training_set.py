@@ -302,8 +302,7 @@ def _views(count: int, s: TrainingSettings, rng: np.random.Generator) -> Array:
     heading = rng.uniform(-np.pi, np.pi, count)
     elevation = np.radians(np.clip(rng.normal(s.elevation, s.elevation_spread, count), -20.0, 50.0))
     roll = np.radians(rng.normal(0.0, s.roll_spread, count))
-    result: Array = about(2, roll) @ about(0, elevation) @ about(1, heading)
-    return result
+    return about(2, roll) @ about(0, elevation) @ about(1, heading)
 
 
 def about(axis: int, angle: Array) -> Array:
@@ -341,7 +340,9 @@ def random_build(body: Body, s: TrainingSettings, rng: np.random.Generator) -> B
     }
     whole = rng.uniform(*s.width_range)
     widths = whole * np.exp(s.width_spread * rng.normal(size=len(body.shapes)))
-    return body.with_segment_lengths(lengths).with_widths(np.clip(widths, 0.6, 1.8).tolist())
+    growth = body.growth.copy()
+    growth[:, :2] += np.log(np.clip(widths, 0.6, 1.8))[:, None]
+    return body.with_segment_lengths(lengths).with_growth(growth)
 
 
 def _fitting_camera(body: Body, poses: Array) -> Camera:

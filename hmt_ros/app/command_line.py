@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 import hmt_ros
 from msg_tools.files.error_line import error_line
@@ -17,6 +17,8 @@ from msg_tools.files.error_line import error_line
 # Exit codes of programs that the interrupt key or SIGPIPE has ended, as shells report them.
 INTERRUPTED, NOBODY_READS = 130, 141
 LARGEST = 10_000  # largest side of an image, px
+
+Number = TypeVar('Number', int, float)
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -217,17 +219,23 @@ def number(
     low: float, high: float, *, what: str = 'a number', unit: str = ''
 ) -> Callable[[str], float]:
     """Reader of a number in a range; errors name the range and the unit."""
+    return _reader(float, low, high, f'{what} from {low:g} to {high:g}{unit}')
 
-    def read(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(
-                f'wanted {what} from {low:g} to {high:g}{unit}, saw {text!r}'
-            )
-        return value
+
+def whole_number(low: int, high: int = 2**63 - 1) -> Callable[[str], int]:
+    """Reader of a whole number in a range."""
+    return _reader(int, low, high, f'a whole number from {low} to {high}')
+
+
+def _reader(kind: type[Number], low: float, high: float, wanted: str) -> Callable[[str], Number]:
+    """Reader of a number of a kind in a range."""
+
+    def read(text: str) -> Number:
+        with suppress(ValueError):
+            value = kind(text)
+            if low <= value <= high:
+                return value
+        raise argparse.ArgumentTypeError(f'wanted {wanted}, saw {text!r}')
 
     return read
 
@@ -240,20 +248,3 @@ def image_size(text: str) -> tuple[int, int]:
     if not (8 <= int(width) <= LARGEST and 8 <= int(height) <= LARGEST):
         raise argparse.ArgumentTypeError(f'wanted sides of 8 to {LARGEST} px, saw {text!r}')
     return int(width), int(height)
-
-
-def whole_number(low: int, high: int = 2**63 - 1) -> Callable[[str], int]:
-    """Reader of a whole number in a range."""
-
-    def read(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(
-                f'wanted a whole number from {low} to {high}, saw {text!r}'
-            )
-        return value
-
-    return read

@@ -10,11 +10,11 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import show_progress
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
+from hmt_ros.app.recorded_bodies import RecordedBodies, body_topics
 from hmt_ros.app.truth import is_truth, mixture_topics, read_truth, recorded_truth
 from hmt_ros.body import Body
 from hmt_ros.evaluation.ground_scores import GravityScores, gravity_scores
@@ -22,7 +22,7 @@ from hmt_ros.evaluation.pose_scores import MODEL_SIGMA
 from hmt_ros.evaluation.track_scores import Estimate, TrackScorer, TrackScores, Truth
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from msg_tools import BagMessage, BagReader, MessageError
+from msg_tools import BagMessage, BagReader
 from msg_tools.messages.ground import GROUND, ground_of
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import (
@@ -30,8 +30,6 @@ from msg_tools.messages.trajectory_mixtures import (
     TrajectoryMixture,
     trajectory_mixture_of,
 )
-
-_Content = TypeVar('_Content')
 
 EPILOG = """\
 Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from their true
@@ -91,12 +89,14 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     truth = recorded_truth(bag) if arguments.truth is None else read_truth(arguments.truth)
     if truth is None:
         raise ValueError(f'{bag} has no ground truth: name a .npz file or a bag with --truth')
-    total = message_count(bag, arguments.topics)
+    with BagReader(bag) as reader:
+        names = chosen_topics(reader, arguments.topics)
+        total = reader.message_count({*body_topics(reader), *names})
     with show_progress('evaluate', 'messages', total, quiet=arguments.quiet) as bar:
         found = score_bag(
             bag,
             truth,
-            topics=arguments.topics,
+            topics=names,
             model_sigma=model_sigma,
             body_model=arguments.body,
             seed=arguments.seed,
@@ -151,8 +151,6 @@ def as_text(
     found: dict[str, TrackScores],
     truth: Truth,
     verticals: Mapping[str, GravityScores] | None = None,
-    *,
-    by_joint: bool = True,
 ) -> str:
     """Tables for people: one row per topic, and the errors joint by joint."""
     rows: list[tuple[str, ...]] = [
@@ -197,12 +195,11 @@ def as_text(
             )
         )
     lines = [f'against {truth.source}, {len(truth.joints)} frames', '', *table(rows)]
-    if by_joint:
-        joints = [('best of K, mm', *found)]
-        for joint in next(iter(found.values())).scores.names:
-            cells = [summary['by_joint'][joint]['best_mm'] for summary in summaries.values()]
-            joints.append((joint, *(f'{cell:.0f}' for cell in cells)))
-        lines += ['', *table(joints)]
+    joints = [('best of K, mm', *found)]
+    for joint in next(iter(found.values())).scores.names:
+        cells = [summary['by_joint'][joint]['best_mm'] for summary in summaries.values()]
+        joints.append((joint, *(f'{cell:.0f}' for cell in cells)))
+    lines += ['', *table(joints)]
     feet = [f'{name}: {scores}' for name, scores in (verticals or {}).items()]
     feet += [f'{name}: {topic.ground}' for name, topic in found.items() if topic.ground is not None]
     lines += ['', *feet] if feet else []
@@ -253,14 +250,11 @@ def score_bag(
             name: TrackScorer(name, truth, model_sigma=model_sigma, seed=seed) for name in names
         }
         bodies = RecordedBodies(body_model)
-        for stored in bag.messages([*body_topics(bag), *names]):
-            if stored.msgtype == BODY:
-                bodies.learn(stored)
-            elif stored.msgtype == POSE_MIXTURE:
+        for stored in bodies.messages(bag, names, progress):
+            if stored.msgtype == POSE_MIXTURE:
                 _read_pose(stored, found[stored.topic], bodies)
             else:
                 _read_trajectories(stored, found[stored.topic], bodies)
-            progress(1)
         return {name: track.finish() for name, track in found.items()}
 
 
@@ -277,20 +271,10 @@ def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
         if not ups or not truth.ground:
             return {}
         for stored in bag.messages(ups):
-            content = _content(ground_of, stored)
+            content = stored.content(ground_of)
             ups[stored.topic][content.stamp_ns] = content.up, content.up_sigma
     found = {name: gravity_scores(mine, truth.ground) for name, mine in ups.items()}
     return {name: scores for name, scores in found.items() if scores is not None}
-
-
-def message_count(path: Path, topics: Iterable[str] = ()) -> int:
-    """Number of messages that `score_bag` reads.
-
-    Raises:
-        ValueError: see `chosen_topics`.
-    """
-    with BagReader(path) as bag:
-        return bag.message_count({*body_topics(bag), *chosen_topics(bag, topics)})
 
 
 def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
@@ -322,7 +306,7 @@ def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
 
 
 def _read_pose(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -> None:
-    content = _content(pose_mixture_of, stored)
+    content = stored.content(pose_mixture_of)
     _check_frame(track, content.frame_id)
     track.kind = content.kind.name.lower()
     if not len(content.weights):
@@ -343,19 +327,11 @@ def _read_pose(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -
 
 def _read_trajectories(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -> None:
     """Takes the marginals of a window."""
-    content = _content(trajectory_mixture_of, stored)
+    content = stored.content(trajectory_mixture_of)
     _check_frame(track, content.frame_id)
     track.kind = 'trajectories'
     body = bodies.of(stored.topic, content)
     track.take_window([_marginal(content, t, body) for t in range(len(content.stamps_ns))])
-
-
-def _content(read: Callable[[Any], _Content], stored: BagMessage) -> _Content:
-    """The content of a message."""
-    try:
-        return read(stored.message)
-    except MessageError as error:
-        raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
 
 
 def _marginal(content: TrajectoryMixture, t: int, body: Body | None) -> Estimate:

@@ -12,6 +12,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,12 @@ import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import show_progress
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics, read_grounds
+from hmt_ros.app.recorded_bodies import RecordedBodies, read_grounds
 from hmt_ros.app.truth import mixture_topics
 from hmt_ros.body import Body
 from hmt_ros.body.moving_skeleton import CAMERA_TO_ROOM, MovingSkeleton, bvh_text
 from hmt_ros.inference.arrays import Array
-from msg_tools import BagReader, MessageError
+from msg_tools import BagReader
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import (
     POSE_MIXTURE,
@@ -352,17 +353,10 @@ def _mixtures(
     bag: BagReader, name: str, bodies: RecordedBodies, progress: Callable[[int], object]
 ) -> Iterator[PoseMixture]:
     """The mixtures on a topic, which are all over the same variables; teaches the bodies."""
-    names: tuple[tuple[str, ...], tuple[str, ...]] | None = None
-    for stored in bag.messages([*body_topics(bag), name]):
-        progress(1)
-        if stored.msgtype == BODY:
-            bodies.learn(stored)
-            continue
-        try:
-            content = pose_mixture_of(stored.message, *(names or (None, None)))
-        except MessageError as error:
-            raise ValueError(f'{name} at {stored.log_time_ns} ns: {error}') from error
-        names = content.dof_names, content.joint_names
+    names: dict[str, tuple[str, ...]] = {}
+    for stored in bodies.messages(bag, [name], progress):
+        content = stored.content(partial(pose_mixture_of, **names))
+        names = {'dof_names': content.dof_names, 'joint_names': content.joint_names}
         yield content
 
 

@@ -8,7 +8,7 @@ See `experts.lifter`; with images, `track-video` says more.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from hmt_ros.app.import_video.command import (
     add_keypoint_arguments,
     camera_of,
 )
-from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection
+from hmt_ros.app.import_video.frames import FrameSource
 from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons
 from hmt_ros.app.import_video.keypoint_files.reading import (
     ClipReading,
@@ -145,21 +145,13 @@ def _parser() -> CommandParser:
     return parser
 
 
-class _NoFrames(FrameSource):
-    """A source without frames, which numbers the frames of keypoints."""
-
-    def frames(self, selection: Selection) -> Iterator[Frame]:
-        """None."""
-        yield from ()
-
-
 def _lift(arguments: argparse.Namespace) -> int:
     folder, quiet = arguments.output, arguments.quiet
     taken = [x for x in (LIFTED, REPORT) if (folder / x).exists()]
     if taken and not arguments.overwrite:
         raise ValueError(f'{folder / taken[0]} exists; give another name, or --overwrite')
     lifter = load_lifter(arguments.lifter)
-    source = _NoFrames(arguments.keypoints, (), arguments.first_number)
+    source = FrameSource(arguments.keypoints, (), arguments.first_number)
     found = read_keypoints(arguments.keypoints, source, arguments.first_stamp)
     size = arguments.size or found.size
     if size is None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from threading import Event, Thread
 from typing import Any, TypeAlias, TypeVar
 
@@ -24,6 +24,7 @@ from hmt_ros.compiled_code import compiling
 
 Item = TypeVar('Item')
 Progress: TypeAlias = 'tqdm[Any]'
+Tell = Callable[[str], object]  # a line for the user
 
 INTERVAL = 3.0  # s, between two lines; a bar shows the time every second
 
@@ -71,19 +72,18 @@ def show_progress(
         unit: name of the unit, in the plural; '' if nothing is counted.
         total: number of units of the whole; None if unknown.
     """
-    return _shown(None, what, unit, total, quiet)
+    return with_progress(None, what, unit, total, quiet=quiet)
 
 
 def with_progress(
-    items: Iterable[Item], what: str, unit: str, total: float | None = None, *, quiet: bool = False
+    items: Iterable[Item] | None,
+    what: str,
+    unit: str,
+    total: float | None = None,
+    *,
+    quiet: bool = False,
 ) -> tqdm[Item]:
-    """The items; shows how many of them are done."""
-    return _shown(items, what, unit, total, quiet)
-
-
-def _shown(
-    items: Iterable[Any] | None, what: str, unit: str, total: float | None, quiet: bool
-) -> Progress:
+    """The items; shows how many of them are done. None: `update` counts."""
     options: dict[str, Any] = {'iterable': items, 'desc': what, 'unit': f' {unit}', 'total': total}
     if not unit:
         options['bar_format'] = '{desc}: {elapsed} so far{postfix}'

@@ -6,6 +6,7 @@ about the body on the Body topic of its namespace, or of the bag's only Body top
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,25 @@ class RecordedBodies:
         self._described: dict[str, Body] = {}
         self._newest: dict[str, tuple[Any, Body]] = {}
 
-    def learn(self, stored: BagMessage) -> None:
+    def messages(
+        self, bag: BagReader, topics: Iterable[str], progress: Callable[[int], object]
+    ) -> Iterator[BagMessage]:
+        """The messages on topics of mixtures, when the bodies told before them are known.
+
+        Args:
+            progress: called with the number of messages that were read.
+
+        Raises:
+            ValueError: a message about a body that can not be understood; the bag is damaged.
+        """
+        for stored in bag.messages([*body_topics(bag), *topics]):
+            progress(1)
+            if stored.msgtype == BODY:
+                self._learn(stored)
+            else:
+                yield stored
+
+    def _learn(self, stored: BagMessage) -> None:
         """Takes a message about a body; a model that is not known leaves the body unknown."""
         message = stored.message
         try:
@@ -97,11 +116,7 @@ def read_grounds(path: Path, topic: str, frame_id: str) -> dict[int, GroundState
             return {}
         found = {}
         for stored in bag.messages([chosen]):
-            try:
-                content = ground_of(stored.message)
-            except ValueError as error:
-                where = f'{path}: {stored.topic} at {stored.log_time_ns} ns'
-                raise ValueError(f'{where}: {error}') from error
+            content = stored.content(ground_of)
             if content.frame_id == frame_id:
                 found[content.stamp_ns] = content
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hmt_ros.evaluation.ground_scores import TrueGround
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.transform_buffer import rotation_matrix
-from msg_tools import BagReader, MessageError
+from msg_tools import BagReader
 from msg_tools.files.array_file import read_archive
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
 
@@ -49,8 +50,10 @@ def recorded_truth(path: Path) -> Truth | None:
         ValueError: there are several, or messages that can not be understood.
     """
     with BagReader(path) as bag:
-        topic = _truth_topic(bag)
-        return None if topic is None else _truth_of(bag, topic)
+        found = [topic for topic in mixture_topics(bag) if is_truth(bag, topic)]
+        if len(found) > 1:
+            raise ValueError(f'{bag.path} has several ground truths ({", ".join(found)})')
+        return _truth_of(bag, found[0]) if found else None
 
 
 def _from_arrays(path: Path) -> Truth:
@@ -107,14 +110,6 @@ def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int
     }
 
 
-def _truth_topic(bag: BagReader) -> str | None:
-    """The topic of the ground truth in a bag; None if it has none."""
-    found = [topic for topic in mixture_topics(bag) if is_truth(bag, topic)]
-    if len(found) > 1:
-        raise ValueError(f'{bag.path} has several ground truths ({", ".join(found)})')
-    return found[0] if found else None
-
-
 def mixture_topics(bag: BagReader) -> list[str]:
     """Topics of pose mixtures that have messages."""
     return [
@@ -137,10 +132,7 @@ def _truth_of(bag: BagReader, topic: str) -> Truth:
     names: tuple[str, ...] | None = None
     frame_id = ''
     for stored in bag.messages([topic]):
-        try:
-            content = pose_mixture_of(stored.message, None, names)
-        except MessageError as error:
-            raise ValueError(f'{source}: message at {stored.log_time_ns} ns: {error}') from error
+        content = stored.content(partial(pose_mixture_of, joint_names=names))
         names, frame_id = content.joint_names, frame_id or content.frame_id
         if len(content.weights):
             joints[content.stamp_ns] = content.joint_positions[0]

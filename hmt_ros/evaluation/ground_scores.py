@@ -175,5 +175,4 @@ def _sliding(
 
 def _placed(point: Array, truth: TrueGround) -> Array:
     """A point (3,) of the camera frame in the world."""
-    result: Array = truth.camera_rotation @ point + truth.camera_position
-    return result
+    return truth.camera_rotation @ point + truth.camera_position

@@ -93,8 +93,7 @@ def relative_positions(
     if missing:
         raise ValueError(f'a skeleton of {list(names)} has no joints {missing}')
     centre = positions[..., [names.index(name) for name in origin], :].mean(-2, keepdims=True)
-    result: Array = positions[..., [names.index(name) for name in joints], :] - centre
-    return result
+    return np.asarray(positions[..., [names.index(name) for name in joints], :] - centre)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +165,7 @@ def joint_mixtures(
         if not origin:
             return at
         centre = body.skeleton.joint_index([*origin])
-        found: Array = at - positions[:, centre].mean(1, keepdims=True)
-        return found
+        return np.asarray(at - positions[:, centre].mean(1, keepdims=True))
 
     own = np.diag(np.repeat(np.square(body.joint_errors[which]) + model_sigma**2, 3))
     result = []

@@ -68,10 +68,6 @@ class Truth:
             if not np.isfinite(positions).all():
                 raise ValueError(f'{self.source}: joints at {stamp} ns are not finite')
 
-    def span(self) -> str:
-        """First and last stamp, for messages."""
-        return f'{min(self.joints)} to {max(self.joints)} ns'
-
     def evaluated_joints(self) -> tuple[str, ...]:
         """The joints among `EVALUATED_JOINTS` that the truth has.
 
@@ -203,7 +199,7 @@ class TrackScorer:
         if not self._parts:
             raise ValueError(
                 f'no stamp of {self.name} is among those of {self.truth.source}, '
-                f'{self.truth.span()}'
+                f'{min(self.truth.joints)} to {max(self.truth.joints)} ns'
             )
         missing = len(self.truth.joints) - len(self._seen)
         return TrackScores(

@@ -32,8 +32,7 @@ class LinearBasis:
 
     def evaluate(self, inputs: Array) -> Array:
         """phi (n, 1 + p) at inputs (n, p)."""
-        result: Array = np.hstack([np.ones((len(inputs), 1)), self.standardisation.apply(inputs)])
-        return result
+        return np.hstack([np.ones((len(inputs), 1)), self.standardisation.apply(inputs)])
 
     def jacobians(self, inputs: Array, weights: Array) -> Array:
         """Derivatives (n, D, p) of W' phi(r) at inputs (n, p), with weights W (1 + p, D)."""
@@ -79,10 +78,9 @@ class RadialBasis:
         kernels = self.evaluate(inputs)[:, 1:]
         total = kernels @ weights[1:]
         pull = np.einsum('nk,kd,kp->ndp', kernels, weights[1:], self.centres, optimize=True)
-        result: Array = (pull - total[:, :, None] * z[:, None]) / (
-            self.width**2 * self.standardisation.scale
+        return np.asarray(
+            (pull - total[:, :, None] * z[:, None]) / (self.width**2 * self.standardisation.scale)
         )
-        return result
 
     def subset(self, kernels: NDArray[np.intp]) -> RadialBasis:
         """The basis of the constant and some of the K kernels."""

@@ -175,8 +175,7 @@ def folds_of(groups: NDArray[Any], folds: int) -> Index:
     """Fold (N,) of each sample: each fold gets two runs of neighbouring groups."""
     names, which = np.unique(groups, return_inverse=True)
     runs = np.arange(len(names)) * min(2 * folds, len(names)) // len(names)
-    result: Index = (runs % folds)[which].astype(np.intp)
-    return result
+    return (runs % folds)[which].astype(np.intp)
 
 
 def calibration(left_out: list[tuple[Components, Array]]) -> Calibration:
@@ -228,5 +227,4 @@ def _squared_distances(found: Components, targets: Array) -> Array:
         away = np.einsum('ni,ni->n', offsets, np.linalg.solve(noise, offsets.T).T)
         squares[:, i] = away / found.inflation[:, i]
     light = np.exp(found.log_weights - found.log_weights.max(1, keepdims=True)) < LIGHT
-    result: Array = np.where(light, np.inf, squares).min(1)
-    return result
+    return np.asarray(np.where(light, np.inf, squares).min(1))

@@ -58,8 +58,9 @@ class Components:
 
     def log_density(self, targets: Array) -> Array:
         """log p(x | r), (n,), of one target per input, (n, D)."""
-        result: Array = logsumexp(self.log_weights + self.component_log_densities(targets), axis=1)
-        return result
+        return np.asarray(
+            logsumexp(self.log_weights + self.component_log_densities(targets), axis=1)
+        )
 
     def component_log_densities(self, targets: Array) -> Array:
         """log N(x; f_i(r), c_i(r) O_i), (n, M)."""

@@ -75,7 +75,8 @@ def propagate(
     if without_past is not None and lost > 0:
         parts.append((lost, without_past))
     whole = joined(parts)
-    return reduced(whole, n_components or _experts(model, inputs)).sorted()
+    count = n_components or model.components(inputs[:1]).means.shape[1]
+    return reduced(whole, count).sorted()
 
 
 def propagate_by_dynamics(
@@ -201,7 +202,3 @@ def _inputs(model: ConditionalDensity, previous: GaussianMixture, observation: A
         )
     rows = np.broadcast_to(observation, (len(previous), len(observation)))
     return np.hstack([previous.means, rows])
-
-
-def _experts(model: ConditionalDensity, inputs: Array) -> int:
-    return int(model.components(inputs[:1]).means.shape[1])

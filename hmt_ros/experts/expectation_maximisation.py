@@ -70,8 +70,7 @@ def e_step(features: TrainingPairs, state: EMState) -> Array:
         log_det = 2.0 * np.log(np.diagonal(factor)).sum()
         size = len(factor) * (np.log(2.0 * np.pi) + one.spread(features.inputs))
         log[:, i] -= 0.5 * ((z * z).sum(0) + log_det + size)
-    result: Array = np.exp(log_softmax(log))
-    return result
+    return np.exp(log_softmax(log))
 
 
 def m_step(features: TrainingPairs, state: EMState, shares: Array, learn: Learner) -> EMState:

@@ -35,7 +35,6 @@ from hmt_ros.experts.sparse_bayes import (
     SparseRegression,
     WeightedSums,
     maximise_evidence,
-    maximum_likelihood,
 )
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs, checked_pairs
 from hmt_ros.inference.arrays import Array
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-LEARNING = ('bayesian', 'maximum_likelihood')
 # Candidate kernel widths, in typical distances between inputs.
 WIDTHS = (0.5, 1.0, 2.0)
 # Iterations of a start in each round of the choice, and samples that it sees.
@@ -66,7 +64,6 @@ class ExpertMixture(ConditionalDensity):
         n_starts: Number of starts of the iterations, for each width.
         tolerance: Gain of an iteration below which EM ends, nats per sample.
         scaling: Scaling of inputs before distances are taken; see `Standardisation.of`.
-        learning: 'bayesian', or 'maximum_likelihood' without priors (linear experts only).
 
     Attributes:
         n_experts_: Number of experts that remain.
@@ -74,7 +71,6 @@ class ExpertMixture(ConditionalDensity):
         experts_: Regressions of the experts, in units of standardised targets.
         gates_: Gates of the experts.
         bound_: F after each iteration since the last expert was pruned, nats, standardised targets.
-        width_: Width of the kernels.
     """
 
     n_experts_: int
@@ -96,7 +92,6 @@ class ExpertMixture(ConditionalDensity):
         max_iterations: int = 100,
         tolerance: float = 1e-4,
         scaling: str = 'each',
-        learning: str = 'bayesian',
     ) -> None:
         self.n_experts = n_experts
         self.basis = basis
@@ -107,21 +102,14 @@ class ExpertMixture(ConditionalDensity):
         self.max_iterations = max_iterations
         self.tolerance = tolerance
         self.scaling = scaling
-        self.learning = learning
 
     def fit(
-        self,
-        inputs: ArrayLike,
-        targets: ArrayLike,
-        sample_weight: ArrayLike | None = None,
-        *,
-        responsibilities: ArrayLike | None = None,
+        self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> Self:
         """Learns from inputs (N, p) and targets (N, D).
 
         Args:
             sample_weight: (N,) not negative; a sample of weight 2 counts like two equal samples.
-            responsibilities: (N, M) to start from, instead of several starts.
 
         Raises:
             ValueError: shapes are wrong, values are not finite, there are fewer samples than
@@ -134,23 +122,9 @@ class ExpertMixture(ConditionalDensity):
         self.n_inputs_, self.n_outputs_ = pairs.inputs.shape[1], pairs.targets.shape[1]
         self._scaling = Standardisation.of(pairs.inputs, pairs.weights, self.scaling)
         self._target_scaling = Standardisation.of(pairs.targets, pairs.weights)
-        strength = 0.0 if self.learning == 'maximum_likelihood' else self.n_outputs_ + 3.0
+        strength = self.n_outputs_ + 3.0
         self._prior = RegressionPrior(strength, strength * NOISE_FLOOR * np.eye(self.n_outputs_))
-        if responsibilities is not None:
-            given = np.asarray(responsibilities, dtype=np.float64)
-            wanted = (len(np.atleast_1d(np.asarray(inputs))), self.n_experts)
-            if given.shape != wanted or not np.isfinite(given).all() or (given < 0).any():
-                raise ValueError(
-                    f'responsibilities of shape {given.shape}, wanted {wanted}, finite and >= 0'
-                )
-            if sample_weight is not None:
-                given = given[np.asarray(sample_weight) > 0]
-            basis = self._bases(pairs)[0]
-            start = given / np.maximum(given.sum(1, keepdims=True), 1e-300)
-            features, state = self._begin(pairs, basis, start)
-        else:
-            basis, features, state = self._best_start(pairs)
-        self.basis_ = basis
+        self.basis_, features, state = self._best_start(pairs)
         state, bounds = climb(features, state, self._expert, self.max_iterations, self.tolerance)
         self.experts_, self.gates_ = state.experts, state.gates
         self.bound_ = np.array(bounds)
@@ -182,8 +156,7 @@ class ExpertMixture(ConditionalDensity):
             squares = squared_distances(points, self._candidates).min(1) / self.basis_.width**2
         else:
             squares = (points**2).mean(1)
-        result: Array = np.exp(-0.5 * squares)
-        return result
+        return np.asarray(np.exp(-0.5 * squares))
 
     # Learning.
 
@@ -193,13 +166,6 @@ class ExpertMixture(ConditionalDensity):
                 raise ValueError(f'{name} is {getattr(self, name)}, wanted at least 1')
         if self.basis not in BASES:
             raise ValueError(f'basis is {self.basis!r}, wanted one of {", ".join(BASES)}')
-        if self.learning not in LEARNING:
-            raise ValueError(f'learning is {self.learning!r}, wanted one of {", ".join(LEARNING)}')
-        if self.learning == 'maximum_likelihood' and self.basis != 'linear':
-            raise ValueError(
-                f"learning is 'maximum_likelihood' with basis {self.basis!r}, which needs a prior; "
-                "wanted basis='linear'"
-            )
         if self.width is not None and not self.width > 0:
             raise ValueError(f'width is {self.width}, wanted a positive number or None')
 
@@ -223,8 +189,7 @@ class ExpertMixture(ConditionalDensity):
         self, pairs: TrainingPairs, basis: Basis, first: Array
     ) -> tuple[TrainingPairs, EMState]:
         """The features, and the state after an M-step from the first responsibilities."""
-        prior = self.learning != 'maximum_likelihood'
-        gates = self._gates.first(self.n_experts, basis, pairs, self._scaling, prior)
+        gates = self._gates.first(self.n_experts, basis, pairs, self._scaling)
         features = self._features(pairs, basis)
         state = EMState((), gates, gates.features(pairs.inputs), -np.inf)
         return features, m_step(features, state, first, self._expert)
@@ -274,8 +239,6 @@ class ExpertMixture(ConditionalDensity):
         return result
 
     def _expert(self, sums: WeightedSums, old: SparseRegression | None) -> SparseRegression:
-        if self.learning == 'maximum_likelihood':
-            return maximum_likelihood(sums)
         return maximise_evidence(sums, self._prior, old, rounds=6 if old is None else 3)
 
     # Predictions and files.
@@ -284,7 +247,6 @@ class ExpertMixture(ConditionalDensity):
         """Drops kernels that no expert uses, and prepares predictions."""
         if isinstance(self.basis_, RadialBasis):
             self._candidates = self.basis_.centres
-            self.width_ = self.basis_.width
             used = np.unique(np.concatenate([one.active for one in self.experts_] + [[0]]))
             used = used.astype(np.intp)
             self.basis_ = self.basis_.subset(used[used > 0] - 1)
@@ -333,9 +295,6 @@ class ExpertMixture(ConditionalDensity):
         self.basis_ = basis_of(part('basis', arrays))
         if isinstance(self.basis_, RadialBasis):
             self._candidates = np.asarray(arrays['candidates'])
-            self.width_ = self.basis_.width
-        # Older files have a factor on all covariances.
-        inflation = float(arrays.get('inflation', np.array(1.0)))
         stored = [part(f'expert{i}', arrays) for i in range(int(arrays['n_experts']))]
         self.experts_ = tuple(
             SparseRegression(
@@ -343,7 +302,7 @@ class ExpertMixture(ConditionalDensity):
                 own['precisions'],
                 own['weights'],
                 own['covariance'],
-                inflation * own['noise'],
+                own['noise'],
                 np.nan,
             )
             for own in stored

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -60,22 +61,17 @@ class SoftmaxGates:
     penalty: float
 
     @classmethod
-    def flat(cls, basis: Basis, experts: int) -> SoftmaxGates:
-        """Equal gates of M experts, before learning."""
-        count = len(basis)
-        return cls(basis, np.zeros((experts, count)), np.full(count, 1e-1), -np.inf)
-
-    @classmethod
     def first(
-        cls, experts: int, basis: Basis, pairs: TrainingPairs, scaling: Standardisation, prior: bool
+        cls, experts: int, basis: Basis, pairs: TrainingPairs, scaling: Standardisation
     ) -> SoftmaxGates:
-        """Gates of M experts before learning, over some of the kernels of the experts' basis."""
+        """Equal gates of M experts, before learning, over some kernels of the experts' basis."""
         if experts == 1:
             basis = LinearBasis(scaling)
         elif isinstance(basis, RadialBasis):
             count = min(GATE_KERNELS, max(experts, len(pairs) // SAMPLES_PER_KERNEL))
             basis = basis.subset(np.arange(min(count, len(basis.centres))))
-        return cls.flat(basis, experts)
+        count = len(basis)
+        return cls(basis, np.zeros((experts, count)), np.full(count, 1e-1), -np.inf)
 
     def features(self, inputs: Array) -> Array:
         """Features (n, K) of inputs (n, p), for `log_scores` and `learned`."""
@@ -91,18 +87,18 @@ class SoftmaxGates:
         """Improved gates, and the features (n, K') that remain after pruning."""
         if len(self.weights) == 1:
             return replace(self, penalty=0.0), features
-        problem = _Softmax(features, responsibilities, sample_weights)
-        best = self._settled(problem, self.weights, self.precisions, steps=0)
-        moved = self._settled(problem, self.weights, self.precisions)
-        best = max(best, moved, key=lambda one: one.value)
-        updated = self._settled(problem, moved.weights, problem.better_precisions(moved))
-        best = max(best, updated, key=lambda one: one.value)
+        problem = _Softmax(features, responsibilities * sample_weights[:, None], sample_weights)
+        same = problem.laplace(self.weights, self.precisions)
+        moved = problem.settled(self.weights, self.precisions)
+        updated = problem.settled(moved.weights, moved.better_precisions())
+        best = max(same, moved, updated, key=lambda one: one.value)
         useless = best.determined < USELESS * len(self.weights)
         useless[0] = False
         kept = np.flatnonzero(~useless)
         basis = self.basis
         if useless.any() and isinstance(basis, RadialBasis):
-            fewer = self._settled(problem.of(kept), best.weights[:, kept], best.precisions[kept])
+            smaller = replace(problem, features=features[:, kept])
+            fewer = smaller.settled(best.weights[:, kept], best.precisions[kept])
             if fewer.value >= best.value:
                 best, features = fewer, features[:, kept]
                 basis = basis.subset(kept[1:] - 1)
@@ -123,12 +119,6 @@ class SoftmaxGates:
         basis = basis_of(part('basis', arrays))
         return cls(basis, arrays['weights'], arrays['precisions'], 0.0)
 
-    @staticmethod
-    def _settled(
-        problem: _Softmax, weights: Array, precisions: Array, steps: int = NEWTON_STEPS
-    ) -> _SoftmaxFit:
-        return problem.laplace(problem.newton(weights, precisions, steps), precisions)
-
 
 @dataclass(frozen=True, eq=False)
 class _SoftmaxFit:
@@ -146,20 +136,26 @@ class _SoftmaxFit:
     penalty: float
     determined: Array
 
+    def better_precisions(self) -> Array:
+        """MacKay's fixed point with the hyperprior."""
+        determined = np.maximum(self.determined, 0.0)
+        precisions = (determined + 2.0 * SHAPE) / ((self.weights**2).sum(0) + 2.0 * RATE)
+        return np.asarray(np.maximum(precisions, LEAST_PRECISION))
 
+
+@dataclass(frozen=True, eq=False)
 class _Softmax:
-    """Likelihood, gradient and Hessian of the softmax for given responsibilities."""
+    """Likelihood, gradient and Hessian of the softmax for given responsibilities.
 
-    def __init__(self, features: Array, responsibilities: Array, sample_weights: Array) -> None:
-        self.features = features
-        self.targets = responsibilities * sample_weights[:, None]
-        self.sample_weights = sample_weights
+    Attributes:
+        features: (N, K).
+        targets: (N, M) responsibilities times the weights of the samples.
+        sample_weights: (N,).
+    """
 
-    def of(self, functions: Index) -> _Softmax:
-        result = _Softmax.__new__(_Softmax)
-        result.features = self.features[:, functions]
-        result.targets, result.sample_weights = self.targets, self.sample_weights
-        return result
+    features: Array
+    targets: Array
+    sample_weights: Array
 
     def likelihood(self, weights: Array) -> tuple[float, Array]:
         """sum s h log g, and the gates (N, M)."""
@@ -178,6 +174,10 @@ class _Softmax:
             scale = self.sample_weights * gates[:, i]
             result[own, own] += self.features.T @ (scale[:, None] * self.features)
         return result
+
+    def settled(self, weights: Array, precisions: Array) -> _SoftmaxFit:
+        """The fit after some Newton steps."""
+        return self.laplace(self.newton(weights, precisions, NEWTON_STEPS), precisions)
 
     def newton(self, weights: Array, precisions: Array, steps: int) -> Array:
         """Damped Newton steps; the ratio of true to predicted gain sets the damping."""
@@ -232,14 +232,6 @@ class _Softmax:
         determined = experts - precisions * variances.sum(0)
         return _SoftmaxFit(weights, precisions, likelihood + penalty, penalty, determined)
 
-    @staticmethod
-    def better_precisions(found: _SoftmaxFit) -> Array:
-        """MacKay's fixed point with the hyperprior."""
-        determined = np.maximum(found.determined, 0.0)
-        precisions = (determined + 2.0 * SHAPE) / ((found.weights**2).sum(0) + 2.0 * RATE)
-        result: Array = np.maximum(precisions, LEAST_PRECISION)
-        return result
-
 
 @dataclass(frozen=True, eq=False)
 class GaussianGates:
@@ -263,19 +255,18 @@ class GaussianGates:
     target: Array
     penalty: float
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _whitening(self) -> tuple[Array, Array]:
+        """Inverse Cholesky factors (M, p, p) of the covariances, and log |C| (M,)."""
         factors = np.linalg.cholesky(self.covariances)
-        size = factors.shape[1]
-        inverse = np.array([solve_triangular(f, np.eye(size), lower=True) for f in factors])
-        object.__setattr__(self, '_whiteners', inverse)
-        log_det = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
-        object.__setattr__(self, '_log_dets', log_det)
+        inverse = [solve_triangular(f, np.eye(len(f)), lower=True) for f in factors]
+        return np.array(inverse), 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
 
     @classmethod
     def first(
-        cls, experts: int, basis: Basis, pairs: TrainingPairs, scaling: Standardisation, prior: bool
+        cls, experts: int, basis: Basis, pairs: TrainingPairs, scaling: Standardisation
     ) -> GaussianGates:
-        """Gates of M experts before learning, with or without a prior of their covariances."""
+        """Gates of M experts before learning."""
         p = pairs.inputs.shape[1]
         share = pairs.weights / pairs.weights.sum()
         z = scaling.apply(pairs.inputs)
@@ -287,7 +278,7 @@ class GaussianGates:
             np.full(experts, -np.log(experts)),
             np.zeros((experts, p)),
             np.broadcast_to(target, (experts, p, p)).copy(),
-            p + 1.0 if prior else 0.0,
+            p + 1.0,
             target,
             0.0,
         )
@@ -298,15 +289,13 @@ class GaussianGates:
 
     def log_scores(self, features: Array) -> Array:
         """log a_i N(r; m_i, C_i), (n, M), not normalised over experts, of standardised r (n, p)."""
-        whiteners: Array = self.__dict__['_whiteners']
-        log_dets: Array = self.__dict__['_log_dets']
+        whiteners, log_dets = self._whitening
         result = np.empty((len(features), len(self.means)))
         for i, mean in enumerate(self.means):
             z = (features - mean) @ whiteners[i].T
             result[:, i] = (z * z).sum(1)
         size = features.shape[1] * np.log(2.0 * np.pi)
-        log_scores: Array = self.log_shares - 0.5 * (result + log_dets + size)
-        return log_scores
+        return np.asarray(self.log_shares - 0.5 * (result + log_dets + size))
 
     def learned(
         self, features: Array, responsibilities: Array, sample_weights: Array
@@ -329,9 +318,8 @@ class GaussianGates:
         result = replace(
             self, log_shares=np.log(total / total.sum()), means=means, covariances=covariances
         )
-        log_dets: Array = result.__dict__['_log_dets']
         traces = np.einsum('mij,ji->m', np.linalg.inv(covariances), self.target)
-        penalty = -0.5 * self.strength * float((log_dets + traces).sum())
+        penalty = -0.5 * self.strength * float((result._whitening[1] + traces).sum())
         return replace(result, penalty=penalty), features
 
     def of_experts(self, kept: Index) -> GaussianGates:

@@ -31,9 +31,9 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body
 from hmt_ros.body.camera import Camera, roll
 from hmt_ros.body.model_file import load_body
+from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.model_file import (
     FAULTS,
-    check_header,
     damaged,
     header,
     parameters_of,
@@ -123,8 +123,7 @@ def proportions(usual: Body, lengths: Mapping[str, float]) -> Array:
     own = usual.segment_lengths
     weight = np.array([own[name] for name in PROPORTIONED])
     ratio = np.array([max(lengths[name] / own[name], SHORTEST) for name in PROPORTIONED])
-    result: Array = np.log(ratio) - weight @ np.log(ratio) / weight.sum()
-    return result
+    return np.asarray(np.log(ratio) - weight @ np.log(ratio) / weight.sum())
 
 
 def places_of(keypoints: Keypoints, scheme: str = AUTO) -> list[int]:
@@ -262,21 +261,16 @@ class Network(Layers):
     scale: Floats
     middle: Floats
 
-    @property
-    def experts(self) -> int:
-        """Number of experts, K."""
-        return int(self.last.shape[1]) // (1 + 6 * len(self.middle))
-
     def __call__(self, inputs: Floats) -> tuple[Array, Array, Array]:
         """Log gates (N, K), means (N, K, J, 3) and deviations (N, K, J, 3), m, of inputs (N, p)."""
         whitened: Floats = (inputs - self.mean) / self.scale
         out = self.outputs(whitened).astype(np.float64)
-        n, k, j = len(inputs), self.experts, len(self.middle)
+        n, j = len(inputs), len(self.middle)
+        k = out.shape[1] // (1 + 6 * j)
         gates, means = out[:, :k], out[:, k : k * (1 + 3 * j)].reshape(n, k, j, 3)
         spreads = out[:, k * (1 + 3 * j) :].reshape(n, k, j, 3)
-        gates = gates - gates.max(1, keepdims=True)
-        gates = gates - np.log(np.exp(gates).sum(1, keepdims=True))
-        return gates, MEANS * means + self.middle, np.exp(np.clip(spreads + SPREAD, *SPREADS))
+        deviations = np.exp(np.clip(spreads + SPREAD, *SPREADS))
+        return log_softmax(gates), MEANS * means + self.middle, deviations
 
 
 # Scale of the means, m; log of the usual deviation, and its limits, log m.
@@ -367,7 +361,6 @@ class Lifter:
             ValueError: the file is no lifter, or one of another version.
         """
         arrays = read_arrays(path, KIND)
-        check_header(arrays, KIND, str(path))
         try:
             parameters = parameters_of(arrays)
             if parameters['landmarks'] != list(LANDMARKS) or parameters['times'] != TIMES.tolist():
@@ -403,9 +396,8 @@ class KeypointHistory:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._stamps: list[float] = []
-        self._rays: list[Array] = []
-        self._confidences: list[Array] = []
+        # Stamp, rays and confidences of each image.
+        self._seen: list[tuple[float, Array, Array]] = []
 
     def add(self, keypoints: Keypoints, stamp: float) -> tuple[Array, Array]:
         """Takes the keypoints of the next image; returns their `landmark_rays`.
@@ -414,19 +406,16 @@ class KeypointHistory:
             stamp: of the image, s; later than those before.
         """
         rays, confidences = landmark_rays(self._camera, keypoints)
-        while self._stamps and self._stamps[0] < stamp + EARLIEST:
-            for values in (self._stamps, self._rays, self._confidences):
-                values.pop(0)
-        self._stamps.append(stamp)
-        self._rays.append(rays)
-        self._confidences.append(confidences)
+        recent = [one for one in self._seen if one[0] >= stamp + EARLIEST]
+        self._seen = [*recent, (stamp, rays, confidences)]
         return rays, confidences
 
     def carry(self, rotation: Array) -> None:
         """Takes the history into the frame (rotation (3, 3)) of a camera that has turned."""
-        for i, rays in enumerate(self._rays):
+        for i, (stamp, rays, confidences) in enumerate(self._seen):
             turned = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) @ rotation.T
-            self._rays[i] = turned[:, :2] / np.maximum(turned[:, 2:], BEFORE)
+            turned = turned[:, :2] / np.maximum(turned[:, 2:], BEFORE)
+            self._seen[i] = stamp, turned, confidences
 
     def lift(
         self, lifter: Lifter, up: Array | None = None, person: Array | None = None
@@ -437,9 +426,9 @@ class KeypointHistory:
             up: (3,) unit vector against gravity, camera frame; None: unknown.
             person: proportions of the person; None: unknown.
         """
-        stamps, ups = np.array(self._stamps), None if up is None else np.asarray(up)[None]
-        seen = np.array(self._rays), np.array(self._confidences)
-        return lifter.lift(stamps, *seen, stamps[-1:], ups, person, causal=True)[0]
+        stamps, rays, confidences = (np.array(x) for x in zip(*self._seen, strict=True))
+        ups = None if up is None else np.asarray(up)[None]
+        return lifter.lift(stamps, rays, confidences, stamps[-1:], ups, person, causal=True)[0]
 
 
 def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> tuple[Array, Array]:

@@ -182,14 +182,12 @@ class NearestNeighbours(_NeighbourModel):
     def support(self, inputs: ArrayLike) -> Array:
         """exp(-(d / s)^2 / 2), (n,): d is the distance to the nearest sample, s the spacing."""
         distances, _ = self._neighbours(inputs, 1)
-        result: Array = np.exp(-0.5 * (distances[:, 0] / self.spacing_) ** 2)
-        return result
+        return np.exp(-0.5 * (distances[:, 0] / self.spacing_) ** 2)
 
     def _shares(self, distances: Array, index: Index) -> Array:
         closeness = 1.0 / np.maximum(distances, CLOSEST * self.spacing_)
         closeness *= self.sample_weight_[index]
-        result: Array = closeness / closeness.sum(1, keepdims=True)
-        return result
+        return np.asarray(closeness / closeness.sum(1, keepdims=True))
 
 
 class LocalExperts(_NeighbourModel):
@@ -272,8 +270,7 @@ class LocalExperts(_NeighbourModel):
     def support(self, inputs: ArrayLike) -> Array:
         """exp(-(d / 3 s)^2 / 2), (n,): d is the distance to the nearest sample, s the spacing."""
         distances, _ = self._neighbours(inputs, 1)
-        result: Array = np.exp(-0.5 * (distances[:, 0] / (3.0 * self.spacing_)) ** 2)
-        return result
+        return np.exp(-0.5 * (distances[:, 0] / (3.0 * self.spacing_)) ** 2)
 
     def _modes(self, distances: Array, index: Index) -> tuple[Array, Array, Array, Array]:
         """Clusters of the neighbours (n, K) of n inputs.

@@ -58,8 +58,7 @@ class Layers:
         units = _leaky(inputs @ self.first + self.first_bias)
         for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
             units = units + _leaky(units @ weights + bias)
-        result: Floats = units @ self.last + self.last_bias
-        return result
+        return units @ self.last + self.last_bias
 
     def jacobians(self, inputs: Floats, which: slice | Index) -> Floats:
         """Derivatives (N, o, p) of some of the numbers by inputs (N, p) that are whitened."""
@@ -70,8 +69,7 @@ class Layers:
             before = units @ weights + bias
             units = units + _leaky(before)
             slopes = slopes + _slopes(before)[:, :, None] * (weights.T @ slopes)
-        result: Floats = self.last[:, which].T @ slopes
-        return result
+        return self.last[:, which].T @ slopes
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays for a file: in half precision, except single rows."""
@@ -164,15 +162,13 @@ class NetworkExperts(ConditionalDensity):
         seen = self._of_inputs.apply(self._checked(inputs)).astype(np.float32)
         slopes = self._layers.jacobians(seen, slice(2 * self.n_experts, None)).astype(np.float64)
         slopes = slopes.reshape(len(seen), self.n_experts, self.n_outputs_, self.n_inputs_)
-        result: Array = self._of_targets.scale[0] * slopes / self._of_inputs.scale
-        return result
+        return np.asarray(self._of_targets.scale[0] * slopes / self._of_inputs.scale)
 
     def support(self, inputs: ArrayLike) -> Array:
         """exp(-(d / 2 s)^2 / 2), (n,): d to the nearest cluster of inputs, s the spread of one."""
         seen = self._of_inputs.apply(self._checked(inputs))
         away = squared_distances(seen, self._centres).min(1)
-        result: Array = np.exp(-0.5 * away / (2.0 * self._spacing) ** 2)
-        return result
+        return np.asarray(np.exp(-0.5 * away / (2.0 * self._spacing) ** 2))
 
     def _learned(self) -> Arrays:
         return {
@@ -205,8 +201,7 @@ def read_outputs(out: Any, m: int, d: int) -> tuple[Any, Any, Any]:
 
 def _leaky(x: Floats) -> Floats:
     """Outputs of leaky units."""
-    result: Floats = np.maximum(x, np.float32(LEAK) * x)
-    return result
+    return np.asarray(np.maximum(x, np.float32(LEAK) * x))
 
 
 def _slopes(x: Floats) -> Floats:

@@ -125,14 +125,12 @@ class PoseEncoding:
     def _from_view(self, points: Array) -> Array:
         """Rotations (N, 3, 3) from a camera that looks at points (N, 3), upright by the level."""
         level = self.body.level
-        result: Array = level @ ray_rotations(points @ level)
-        return result
+        return level @ ray_rotations(points @ level)
 
     def _view_by_root(self, points: Array) -> Array:
         """Derivatives (N, 3, 3) of that rotation by the points, camera frame."""
         level = self.body.level
-        result: Array = level @ _rotation_by_root(points @ level) @ level.T
-        return result
+        return level @ _rotation_by_root(points @ level) @ level.T
 
     def _checked(self, targets: ArrayLike, roots: ArrayLike) -> tuple[Array, Array]:
         targets = np.asarray(targets, dtype=np.float64)
@@ -191,10 +189,7 @@ def _orthogonal(axes: Array) -> Array:
     up = axes[:, 3:] - (axes[:, 3:] * front).sum(1, keepdims=True) * front
     up = _unit(up)
     result = np.empty((len(axes), 3, 3))
-    result[:, :, 1], result[:, :, 2] = front, up
-    for k in range(3):  # the cross product of both
-        i, j = (k + 1) % 3, (k + 2) % 3
-        result[:, k, 0] = front[:, i] * up[:, j] - front[:, j] * up[:, i]
+    result[:, :, 0], result[:, :, 1], result[:, :, 2] = np.cross(front, up), front, up
     return result
 
 

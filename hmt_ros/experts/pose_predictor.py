@@ -39,7 +39,6 @@ from hmt_ros.experts.model_file import (
 from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
 from hmt_ros.experts.root_placement import (
     SIZE_SPREAD,
-    RootPlacement,
     place_roots,
     placed_gaussians,
 )
@@ -77,13 +76,11 @@ class Prediction:
     Attributes:
         mixture: Mixture over poses, heaviest component first.
         place: Person in the image; its remarks are for the user.
-        placement: Roots of the components, in the order of the mixture.
         support: Support of the silhouette by training data, from 0 to 1.
     """
 
     mixture: GaussianMixture
     place: PersonBlob
-    placement: RootPlacement
     support: float
 
 
@@ -189,7 +186,7 @@ class PosePredictor:
                 f'({camera.height}, {camera.width})'
             )
         blob = person_blob(seen)
-        descriptor = self._described(blob, camera)
+        descriptor = self.described(blob, camera)
         support = float(self.model.support(descriptor[None])[0])
         targets = self.targets_after(
             descriptor, previous, interval, propagation=propagation, max_components=max_components
@@ -207,17 +204,13 @@ class PosePredictor:
         )
         covariances += JITTER * np.eye(self.encoding.size)
         mixture = GaussianMixture(targets.weights, means, covariances)
-        return Prediction(mixture, blob, placement, support)
+        return Prediction(mixture, blob, support)
 
-    def describe(self, mask: ArrayLike, camera: Camera) -> Array:
-        """Descriptor (p,) of the person in a mask (H, W)."""
-        return self._described(person_blob(mask), camera)
-
-    def _described(self, blob: PersonBlob, camera: Camera) -> Array:
+    def described(self, blob: PersonBlob, camera: Camera) -> Array:
+        """Descriptor (p,) of a person."""
         view = centred_view(blob, camera, self.body.level)
         parts = silhouette_parts(view, self.descriptor.points)
-        result: Array = self.descriptor.describe([parts])[0]
-        return result
+        return np.asarray(self.descriptor.describe([parts])[0])
 
     def targets_after(
         self,
@@ -320,7 +313,7 @@ class PosePredictor:
             'body': body.name,
             'dof_names': list(body.dof_names),
             'lengths': body.segment_lengths,
-            'descriptor': self.descriptor.parameters(),
+            'descriptor': {'points': self.descriptor.points},
             'notes': self.notes,
         }
         arrays: Arrays = header(KIND, parameters)
@@ -357,7 +350,7 @@ class PosePredictor:
             else:
                 _check_body(body, names, where)
             descriptor = SilhouetteDescriptor.from_arrays(
-                parameters['descriptor'], part('descriptor', arrays)
+                part('descriptor', arrays), int(parameters['descriptor']['points'])
             )
             model = stored_model(part('model', arrays), where)
             dynamics = part('dynamics', arrays)

@@ -51,17 +51,12 @@ class RootPlacement:
         roots: (M, 3) in the camera frame, m.
         covariances: (M, 3, 3) for fixed postures, m^2.
         by_targets: (M, 3, D) derivatives of the roots with respect to the targets of the postures.
-        misfits: (M,) root mean squared distance between the sides of the boxes, px; for a side that
-            is cut, the part that is missing.
-        cut: Whether the border of the image cuts the person, which makes the depth uncertain.
         jacobians: Derivatives of the encoding at the postures and their roots.
     """
 
     roots: Array
     covariances: Array
     by_targets: Array
-    misfits: Array
-    cut: bool
     jacobians: tuple[Array, Array]
 
 
@@ -119,15 +114,14 @@ def place_roots(
         if share.max() > TURNED:
             slopes = encoding.jacobians(targets, roots)
     slopes = encoding.jacobians(targets, roots)
-    residual, by_root, by_target, weighted = linearised(slopes)
+    _, by_root, by_target, weighted = linearised(slopes)
     gain = np.linalg.solve(weighted @ by_root + prior, weighted)  # (M, 3, 4)
     left = np.eye(3) - gain @ by_root
     own = noise * gain @ gain.transpose(0, 2, 1)
     own += left @ np.linalg.inv(prior) @ left.transpose(0, 2, 1)
     relative = size_spread**2 + (CUT_SPREAD**2 if cut.any() else 0.0)
     own += relative * roots[:, :, None] * roots[:, None, :]
-    misfits = np.sqrt((residual**2).mean(1))
-    return RootPlacement(roots, own, -gain @ by_target, misfits, bool(cut.any()), slopes)
+    return RootPlacement(roots, own, -gain @ by_target, slopes)
 
 
 def placed_gaussians(
@@ -164,8 +158,7 @@ def _first_roots(encoding: PoseEncoding, camera: Camera, sides: Array, targets: 
     extent = np.linalg.norm(joints.max(1) - joints.min(1), axis=1) + 0.2 * encoding.body.scale
     depth = 0.5 * extent / np.tan(0.5 * max(float(angle), 1e-3))
     depth = np.clip(depth, 2.0 * encoding.body.lower[2], 0.9 * encoding.body.upper[2])
-    result: Array = depth[:, None] * ray / max(float(ray[2]), 0.1)
-    return result
+    return np.asarray(depth[:, None] * ray / max(float(ray[2]), 0.1))
 
 
 def _prior(roots: Array) -> Array:
@@ -225,9 +218,6 @@ def _by_pose(frames: Frames, mesh: Mesh, vertices: Index, points: Array) -> Arra
     skeleton = frames.skeleton
     axes, origins = frames.dofs_by_pose()  # (M, d, 3)
     arm = points[:, :, None] - origins[:, None]
-    x, y, z = np.moveaxis(axes[:, None], -1, 0)
-    u, v, w = np.moveaxis(arm, -1, 0)
-    turning = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+    turning = np.cross(axes[:, None], arm)
     moved = np.where(skeleton.dof_is_rotation[:, None], turning, axes[:, None])
-    result: Array = moved * skeleton.moves[mesh.segments[vertices]][..., None]
-    return result
+    return moved * skeleton.moves[mesh.segments[vertices]][..., None]

@@ -96,14 +96,12 @@ class SparseRegression:
 
     def mean(self, features: Array) -> Array:
         """M' phi, (n, D), of features (n, K) of all candidates."""
-        result: Array = features[:, self.active] @ self.weights
-        return result
+        return features[:, self.active] @ self.weights
 
     def spread(self, features: Array) -> Array:
         """phi' L^-1 phi, (n,): the variance of the mean in units of the noise."""
         phi = features[:, self.active]
-        result: Array = ((phi @ self.covariance) * phi).sum(1)
-        return result
+        return np.asarray(((phi @ self.covariance) * phi).sum(1))
 
 
 def posterior(
@@ -184,33 +182,6 @@ def maximise_evidence(
     return found
 
 
-def maximum_likelihood(sums: WeightedSums) -> SparseRegression:
-    """Least squares with all functions, without prior and without uncertainty of the weights.
-
-    Raises:
-        ValueError: the functions are linearly dependent, or residuals vanish.
-    """
-    count = len(sums.gram)
-    try:
-        root = 1.0 / np.sqrt(np.diagonal(sums.gram))
-        factor = cholesky(sums.gram * root[:, None] * root, lower=True)
-        half = solve_triangular(factor, root[:, None] * sums.cross, lower=True)
-        noise = (sums.outer - half.T @ half) / sums.total
-        noise_factor = cholesky(noise, lower=True)
-    except (np.linalg.LinAlgError, ValueError) as fault:
-        raise ValueError(
-            f'least squares have no solution for {count} functions and {sums.total:.3g} samples '
-            "of an expert; use fewer experts, or learning='bayesian'"
-        ) from fault
-    weights = root[:, None] * solve_triangular(factor, half, lower=True, trans=1)
-    log_det = 2.0 * float(np.log(np.diagonal(noise_factor)).sum())
-    outputs = len(noise)
-    evidence = -0.5 * sums.total * (outputs * (np.log(2.0 * np.pi) + 1.0) + log_det)
-    noise = 0.5 * (noise + noise.T)
-    covariance = np.zeros((count, count))
-    return SparseRegression(np.arange(count), np.zeros(count), weights, covariance, noise, evidence)
-
-
 def _greedy(
     sums: WeightedSums,
     found: SparseRegression,
@@ -227,9 +198,6 @@ def _greedy(
         moved = True
     if not moved:
         return found, False
-    if len(state.active) == 0:
-        none: Index = np.zeros(0, dtype=np.intp)
-        return posterior(sums, none, np.zeros(0), found.noise, prior), True
     better = posterior(sums, state.active, state.precisions, found.noise, prior)
     # Rank-one updates drift, and the gain may not be real.
     if not better.evidence > found.evidence:

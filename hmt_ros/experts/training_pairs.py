@@ -77,8 +77,7 @@ class Standardisation:
 
     def apply(self, values: Array) -> Array:
         """Scaled values, of the same shape."""
-        result: Array = (values - self.centre) / self.scale
-        return result
+        return (values - self.centre) / self.scale
 
 
 def checked_pairs(

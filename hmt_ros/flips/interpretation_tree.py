@@ -67,56 +67,16 @@ def enumerate_flips(
     return result, parents
 
 
-def flip_counts(body: Body, poses: ArrayLike, chain: str) -> Index:
-    """Number of leaves (N,) that the tree of one chain has at each pose."""
-    q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
-    _, valid = _leaves(forward(body.skeleton, q), q, chain_links(body.skeleton, chain))
-    counts: Index = valid.sum(1)
-    return counts
-
-
 def _leaves(frames: Frames, poses: Array, chain: ChainLinks) -> tuple[Array, NDArray[np.bool_]]:
     """Angles (N, leaves, chain dofs) and validity (N, leaves); leaf 0 is the given pose."""
-    angles, valid = _grown(frames, poses, chain, _ends(frames, chain), 0.0, given_stays=True)
-    valid[:, 0] = True
-    angles[:, 0] = poses[:, chain.dofs]
-    return angles, valid
-
-
-def _ends(frames: Frames, chain: ChainLinks) -> Array:
-    """Ends of the links of a chain, (K, 3, N)."""
     lengths = chain.lengths[:, None, None]
-    ends: Array = frames.origins[chain.segments] - lengths * frames.columns[chain.segments, 2]
-    return ends
-
-
-def _grown(
-    frames: Frames,
-    poses: Array,
-    chain: ChainLinks,
-    targets: Array,
-    slack: float,
-    *,
-    given_stays: bool = False,
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Leaves of the trees of one chain: angles (N, 2^K, D), and where there is one (N, 2^K).
-
-    The arguments are those of `grow_leaves`.
-    """
+    ends = frames.origins[chain.segments] - lengths * frames.columns[chain.segments, 2]
     count = 2 ** len(chain.lengths)
     angles = np.empty((len(poses), count, len(chain.dofs)))
     valid = np.zeros((len(poses), count), dtype=np.bool_)
-    grow_leaves(
-        chain,
-        frames.columns,
-        frames.origins,
-        poses,
-        targets,
-        float(slack),
-        given_stays,
-        angles,
-        valid,
-    )
+    grow_leaves(chain, frames.columns, frames.origins, poses, ends, 0.0, True, angles, valid)
+    valid[:, 0] = True
+    angles[:, 0] = poses[:, chain.dofs]
     return angles, valid
 
 

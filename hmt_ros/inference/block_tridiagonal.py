@@ -139,13 +139,12 @@ class BlockCholesky:
         below = np.where(n + row - column <= width, self._windows(n, t - 1), 0.0)
         return own, below
 
-    def inverse_blocks(self) -> tuple[Array, Array]:
-        """Blocks of P^-1: (T, n, n) on the diagonal and (T-1, n, n) below it.
+    def inverse_blocks(self) -> Array:
+        """Blocks (T, n, n) on the diagonal of P^-1: for a precision the marginal covariances.
 
-        For a precision these are the marginal covariances and those of neighbours,
-        Cov(x_{t+1}, x_t). Backwards, with G_t = L_{t+1,t} L_t^-1:
+        Backwards, with G_t = L_{t+1,t} L_t^-1:
 
-            C_T = (L_T L_T')^-1,  C_{t+1,t} = -C_{t+1} G_t,  C_t = (L_t L_t')^-1 + G_t' C_{t+1} G_t
+            C_T = (L_T L_T')^-1,    C_t = (L_t L_t')^-1 + G_t' C_{t+1} G_t
         """
         own, below = self.blocks
         t, n = self.times, self.size
@@ -154,14 +153,11 @@ class BlockCholesky:
             inverse[i] = dtrtri(own[i], lower=1)[0]
         gain = below @ inverse[:-1]
         covariances = inverse.swapaxes(1, 2) @ inverse
-        neighbours = np.empty((t - 1, n, n))
         for i in range(t - 2, -1, -1):
-            np.matmul(covariances[i + 1], gain[i], out=neighbours[i])
-            covariances[i] += gain[i].T @ neighbours[i]
-        np.negative(neighbours, out=neighbours)
+            covariances[i] += gain[i].T @ (covariances[i + 1] @ gain[i])
         covariances += covariances.swapaxes(1, 2).copy()
         covariances *= 0.5
-        return covariances, neighbours
+        return covariances
 
     def matrix(self) -> BlockTridiagonal:
         """P."""

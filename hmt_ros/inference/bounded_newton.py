@@ -134,8 +134,7 @@ def minimise(
 
 def resting(x: Array, gradient: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
     """Variables (N, d) on a limit with a gradient of the energy that pushes them outwards."""
-    result: NDArray[np.bool_] = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
-    return result
+    return ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

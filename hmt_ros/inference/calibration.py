@@ -29,8 +29,7 @@ def levels_of(at_points: Array, at_samples: Array) -> Array:
         at_samples: (S, ...) the same of samples from the density; further axes are densities of
             their own.
     """
-    result: Array = (at_samples[:, None] > at_points[None]).mean(0)
-    return result
+    return np.asarray((at_samples[:, None] > at_points[None]).mean(0))
 
 
 def stratified_samples(mixture: GaussianMixture, count: int, rng: np.random.Generator) -> Array:
@@ -74,8 +73,7 @@ def marginal_log_densities(mixture: GaussianMixture, points: ArrayLike, size: in
     top = each.max(0)
     each -= top
     np.exp(each, out=each)
-    result: Array = (np.log(each.sum(0)) + top).T
-    return result
+    return np.asarray((np.log(each.sum(0)) + top).T)
 
 
 def coverage(levels: ArrayLike, probability: float) -> float:

@@ -133,7 +133,7 @@ class Quadratic:
     ) -> Energy:
         """See `EnergyTerm`."""
         if self.precisions.ndim == 1:
-            offset = x - _of_rows(self.centres, rows, 2)
+            offset = x - _of_rows(self.centres, rows)
             value = 0.5 * (offset * offset) @ self.precisions
             if not derivatives:
                 return Energy(value)
@@ -179,7 +179,7 @@ class Student:
 
 def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Array, Array]:
     """x - m (n, d), P (x - m) (n, d) and P (n, d, d) of each point."""
-    offset = x - _of_rows(term.centres, rows, 2)
+    offset = x - _of_rows(term.centres, rows)
     if term.precisions.ndim == 2:
         shape = (*x.shape, x.shape[1])
         return offset, offset @ term.precisions, np.broadcast_to(term.precisions, shape)
@@ -187,5 +187,5 @@ def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Arr
     return offset, np.einsum('nij,nj->ni', precisions, offset), precisions
 
 
-def _of_rows(value: Array, rows: Index, axes: int) -> Array:
-    return value[rows] if value.ndim == axes else value
+def _of_rows(centres: Array, rows: Index) -> Array:
+    return centres[rows] if centres.ndim == 2 else centres

@@ -28,8 +28,7 @@ def pair_log_densities(
         pairs, np.ones((len(pairs), 2)), means_a, covariances_a, means_b, covariances_b
     )
     constant = means_a.shape[1] * np.log(2 * np.pi)
-    result: Array = -0.5 * (squares + log_determinants + constant)
-    return result
+    return np.asarray(-0.5 * (squares + log_determinants + constant))
 
 
 def pair_distances(means: Array, covariances: Array, scales: Array, pairs: Index) -> Array:
@@ -47,8 +46,7 @@ def pair_mixture_log_determinants(
     """
     shares = weights[pairs] / weights[pairs].sum(1, keepdims=True)
     squares, log_determinants = _of_pairs(pairs, shares, means, covariances, means, covariances)
-    result: Array = log_determinants + np.log1p(shares[:, 0] * shares[:, 1] * squares)
-    return result
+    return np.asarray(log_determinants + np.log1p(shares[:, 0] * shares[:, 1] * squares))
 
 
 def _of_pairs(pairs: Index, scales: Array, *sets: Array) -> tuple[Array, Array]:

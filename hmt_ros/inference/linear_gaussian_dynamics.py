@@ -12,17 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, TypeVar
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import expm, logm
+from scipy.linalg import expm
 
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
-
-T = TypeVar('T', bound=tuple[Any, ...])
 
 # Number of intervals whose transitions are kept.
 MOST_INTERVALS = 64
@@ -70,7 +67,7 @@ class TrajectoryPrior:
 class LinearGaussianDynamics:
     """Dynamics of a state of n variables, of which the first d are the pose.
 
-    Use `random_walk`, `constant_velocity` or `discrete`, or `DampedVelocity.of`.
+    Use `random_walk`, `constant_velocity` or `DampedVelocity.of`, or any drift and diffusion.
 
     Attributes:
         drift: (n, n) F, per second.
@@ -122,24 +119,15 @@ class LinearGaussianDynamics:
                 )
 
     @classmethod
-    def random_walk(
-        cls,
-        rates: ArrayLike,
-        *,
-        initial_mean: ArrayLike | None = None,
-        initial_covariance: ArrayLike | None = None,
-        step: float = 1.0,
-    ) -> LinearGaussianDynamics:
-        """First-order dynamics, x_{t+1} = x_t + noise.
+    def random_walk(cls, rates: ArrayLike, *, step: float = 1.0) -> LinearGaussianDynamics:
+        """First-order dynamics, x_{t+1} = x_t + noise; the first pose is unknown.
 
         Args:
             rates: (d,) variances, or (d, d) covariance, that the pose gains per second.
-            initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
         """
         diffusion = _matrix(rates)
         d = len(diffusion)
-        mean, precision = _initial(d, initial_mean, initial_covariance)
-        return cls(np.zeros((d, d)), diffusion, d, mean, precision, step)
+        return cls(np.zeros((d, d)), diffusion, d, np.zeros(d), np.zeros((d, d)), step)
 
     @classmethod
     def constant_velocity(
@@ -147,90 +135,52 @@ class LinearGaussianDynamics:
         rates: ArrayLike,
         velocity_sigma: ArrayLike,
         *,
-        initial_mean: ArrayLike | None = None,
-        initial_covariance: ArrayLike | None = None,
         step: float = 1.0,
     ) -> LinearGaussianDynamics:
-        """Second-order dynamics; the state is the pose and its velocity.
+        """Second-order dynamics; the state is the pose, at first unknown, and its velocity.
 
         Args:
             rates: (d,) variances, or (d, d) covariance, that the velocity gains per second.
             velocity_sigma: (d,) or scalar, standard deviation of the first velocity, per second.
-            initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
         """
         white = _matrix(rates)
         d = len(white)
         sigma = np.broadcast_to(np.asarray(velocity_sigma, dtype=np.float64), (d,))
         if not (sigma > 0).all():
             raise ValueError(f'dynamics: velocity_sigma must be positive, saw {sigma.min()}')
-        drift, diffusion = np.zeros((2, 2 * d, 2 * d))
+        drift, diffusion, precision = np.zeros((3, 2 * d, 2 * d))
         drift[:d, d:] = np.eye(d)
         diffusion[d:, d:] = white
-        mean, precision = np.zeros(2 * d), np.zeros((2 * d, 2 * d))
-        mean[:d], precision[:d, :d] = _initial(d, initial_mean, initial_covariance)
         precision[d:, d:] = np.diag(sigma**-2.0)
-        return cls(drift, diffusion, d, mean, precision, step)
-
-    @classmethod
-    def discrete(
-        cls,
-        transition: ArrayLike,
-        covariance: ArrayLike,
-        *,
-        initial_mean: ArrayLike | None = None,
-        initial_covariance: ArrayLike | None = None,
-        step: float = 1.0,
-    ) -> LinearGaussianDynamics:
-        """The dynamics with x_{t+1} = A x_t + N(0, Q) over one step.
-
-        Args:
-            transition: (d, d) A.
-            covariance: (d, d) Q.
-            initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
-            step: interval that A and Q belong to, s.
-
-        Raises:
-            ValueError: no process in continuous time has this transition.
-        """
-        a, q = np.asarray(transition, dtype=np.float64), _matrix(covariance)
-        d = len(q)
-        inverse = np.linalg.inv(a)
-        # exp of [[-F, Qc], [0, F']] dt is [[A^-1, A^-1 Q], [0, A']].
-        both = logm(np.block([[inverse, inverse @ q], [np.zeros((d, d)), a.T]]))
-        if np.abs(np.imag(both)).max() > 1e-9:
-            raise ValueError('dynamics: the transition has no real logarithm')
-        both = np.real(both) / step
-        mean, precision = _initial(d, initial_mean, initial_covariance)
-        diffusion = 0.5 * (both[:d, d:] + both[:d, d:].T)
-        return cls(both[d:, d:].T, diffusion, d, mean, precision, step)
+        return cls(drift, diffusion, d, np.zeros(2 * d), precision, step)
 
     @property
     def state_dimension(self) -> int:
         """n."""
         return len(self.drift)
 
-    def transition(self, interval: float) -> tuple[Array, Array]:
+    @cached_property
+    def transition(self) -> Callable[[float], tuple[Array, Array]]:
         """A and Q, both (n, n), over an interval in seconds; those of the last ones are kept."""
-        return _kept(self._transitions, interval, self._transition)
+
+        def made(interval: float) -> tuple[Array, Array]:
+            found = self._transition(interval)
+            for part in found:
+                part.setflags(write=False)
+            return found
+
+        return lru_cache(MOST_INTERVALS)(made)
 
     @cached_property
-    def _transitions(self) -> dict[float, tuple[Array, Array]]:
-        return {}
-
-    @cached_property
-    def _couplings(self) -> dict[float, tuple[Array, Array, Array, float]]:
-        return {}
+    def coupling(self) -> Callable[[float], tuple[Array, Array, Array, float]]:
+        """A' Q^-1 A, Q^-1 and Q^-1 A, all (n, n), and log |Q|, kept like transitions."""
+        return lru_cache(MOST_INTERVALS)(self._coupling)
 
     def _coupling(self, interval: float) -> tuple[Array, Array, Array, float]:
-        """A' Q^-1 A, Q^-1 and Q^-1 A, all (n, n), and log |Q| over an interval in seconds."""
-
-        def make(interval: float) -> tuple[Array, Array, Array, float]:
-            a, q = self.transition(interval)
-            inverse, log_det = _precision_of(q)
-            forth = inverse @ a
-            return a.T @ forth, inverse, forth, log_det
-
-        return _kept(self._couplings, interval, make)
+        a, q = self.transition(interval)
+        inverse, log_det = _precision_of(q)
+        forth = inverse @ a
+        return a.T @ forth, inverse, forth, log_det
 
     @cached_property
     def unknown_velocity(self) -> Array:
@@ -313,7 +263,7 @@ class LinearGaussianDynamics:
         )
         different, which = np.unique(intervals, return_inverse=True)
         for i, interval in enumerate(different):
-            before, after, forth, log_det = self._coupling(float(interval))
+            before, after, forth, log_det = self.coupling(float(interval))
             at = np.flatnonzero(which == i)
             diagonal[at] += before
             diagonal[at + 1] += after
@@ -321,20 +271,6 @@ class LinearGaussianDynamics:
             constant += 0.5 * len(at) * (n * np.log(2 * np.pi) + log_det)
         precision = BlockTridiagonal(diagonal, lower)
         return TrajectoryPrior(precision, information, float(constant), self.dimension)
-
-
-def _kept(known: dict[float, T], interval: float, make: Callable[[float], T]) -> T:
-    """The value kept for an interval; else one that is made, and kept."""
-    found = known.get(interval)
-    if found is None:
-        found = make(interval)
-        for part in found:
-            if isinstance(part, np.ndarray):
-                part.setflags(write=False)
-        if len(known) >= MOST_INTERVALS:
-            known.clear()
-        known[interval] = found
-    return found
 
 
 def _precision_of(covariance: Array) -> tuple[Array, float]:
@@ -363,17 +299,3 @@ def _precision_of(covariance: Array) -> tuple[Array, float]:
 def _matrix(rates: ArrayLike) -> Array:
     value = np.atleast_1d(np.asarray(rates, dtype=np.float64))
     return np.diag(value) if value.ndim == 1 else value
-
-
-def _initial(d: int, mean: ArrayLike | None, covariance: ArrayLike | None) -> tuple[Array, Array]:
-    if (mean is None) != (covariance is None):
-        raise ValueError('dynamics: give both initial_mean and initial_covariance, or neither')
-    if mean is None or covariance is None:
-        return np.zeros(d), np.zeros((d, d))
-    matrix = _matrix(covariance)
-    try:
-        np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        raise ValueError('dynamics: initial_covariance is not positive definite') from None
-    precision = np.linalg.inv(matrix)
-    return np.asarray(mean, dtype=np.float64), 0.5 * (precision + precision.T)

@@ -65,11 +65,9 @@ class GaussianMixture:
         if not isinstance(other, GaussianMixture):
             return NotImplemented
         return all(
-            np.array_equal(a, b) for a, b in zip(self._arrays(), other._arrays(), strict=True)
+            np.array_equal(getattr(self, name), getattr(other, name))
+            for name in ('weights', 'means', 'covariances')
         )
-
-    def _arrays(self) -> tuple[Array, Array, Array]:
-        return self.weights, self.means, self.covariances
 
     @property
     def dimension(self) -> int:
@@ -99,11 +97,13 @@ class GaussianMixture:
 
     def component_log_densities(self, x: ArrayLike) -> Array:
         """log N(x; m_k, S_k), shape (N, K), of points x (N, d)."""
-        points = _points(x, self.dimension)
-        factors = self.cholesky()
+        points = np.asarray(x, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != self.dimension:
+            raise ValueError(f'points have shape {points.shape}, wanted (N, {self.dimension})')
         result = np.empty((len(points), len(self)))
-        for k, factor in enumerate(factors):
-            z = _solve_lower(factor, (points - self.means[k]).T)
+        for k, factor in enumerate(self.cholesky()):
+            offsets = (points - self.means[k]).T
+            z = solve_triangular(factor, offsets, lower=True, check_finite=False)
             log_det = 2.0 * np.log(np.diagonal(factor)).sum()
             result[:, k] = -0.5 * ((z * z).sum(0) + log_det + self.dimension * np.log(2 * np.pi))
         return result
@@ -112,27 +112,23 @@ class GaussianMixture:
         """log p(x), shape (N,), of points x (N, d)."""
         with np.errstate(divide='ignore'):
             log_weights = np.log(self.weights)
-        result: Array = logsumexp(self.component_log_densities(x) + log_weights, axis=1)
-        return result
+        return np.asarray(logsumexp(self.component_log_densities(x) + log_weights, axis=1))
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws n points, (n, d)."""
         k = rng.choice(len(self), size=n, p=self.normalised().weights)
         noise = rng.standard_normal((n, self.dimension))
-        result: Array = self.means[k] + np.einsum('nij,nj->ni', self.cholesky()[k], noise)
-        return result
+        return np.asarray(self.means[k] + np.einsum('nij,nj->ni', self.cholesky()[k], noise))
 
     def mean(self) -> Array:
         """Mean of the normalised mixture, (d,)."""
-        result: Array = self.normalised().weights @ self.means
-        return result
+        return self.normalised().weights @ self.means
 
     def covariance(self) -> Array:
         """Covariance of the normalised mixture, (d, d)."""
         w = self.normalised().weights
         offsets = self.means - self.mean()
-        result: Array = np.einsum('k,kij->ij', w, self.covariances) + (w * offsets.T) @ offsets
-        return result
+        return np.asarray(np.einsum('k,kij->ij', w, self.covariances) + (w * offsets.T) @ offsets)
 
     def normalised(self) -> GaussianMixture:
         """The same mixture with weights that sum to 1.
@@ -155,15 +151,3 @@ class GaussianMixture:
         """The mixture of some of the components; weights are kept as they are."""
         i = np.atleast_1d(np.arange(len(self))[index])
         return GaussianMixture(self.weights[i], self.means[i], self.covariances[i])
-
-
-def _points(x: ArrayLike, dimension: int) -> Array:
-    points = np.asarray(x, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != dimension:
-        raise ValueError(f'points have shape {points.shape}, wanted (N, {dimension})')
-    return points
-
-
-def _solve_lower(factor: Array, right: Array) -> Array:
-    result: Array = solve_triangular(factor, right, lower=True, check_finite=False)
-    return result

@@ -165,8 +165,7 @@ def _pair_moments(w: Array, m: Array, s: Array, i: int, j: int) -> tuple[float, 
 
 def _divergence_costs(w: Array, m: Array, s: Array, log_det: Array, pairs: Index) -> Array:
     together = w[pairs].sum(1) * pair_mixture_log_determinants(m, s, w, pairs)
-    result: Array = 0.5 * (together - (w * log_det)[pairs].sum(1))
-    return result
+    return np.asarray(0.5 * (together - (w * log_det)[pairs].sum(1)))
 
 
 def _squared_distances(w: Array, m: Array, s: Array, log_det: Array, pairs: Index) -> Array:
@@ -245,5 +244,4 @@ def gaussian_divergences(a: GaussianMixture, b: GaussianMixture) -> Array:
     offsets = a.means - b.means[:, None]
     square = ((offsets @ inverse) * offsets).sum(2).T
     log_det = b.log_determinants - a.log_determinants[:, None]
-    result: Array = 0.5 * (trace + square + log_det - a.dimension)
-    return result
+    return np.asarray(0.5 * (trace + square + log_det - a.dimension))

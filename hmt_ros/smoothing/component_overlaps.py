@@ -48,7 +48,6 @@ def add_overlaps(
     mean_gradient: Array,
     inflation_gradient: Array,
     weight_gradient: Array,
-    band_gradient: Array,
 ) -> None:
     """Evaluates log q at the samples of one component, and adds its derivatives.
 
@@ -68,7 +67,6 @@ def add_overlaps(
         gradient: (S, D) of log q with regard to the sample, written.
         mean_gradient, inflation_gradient, weight_gradient: (M, D), (M,), (M,); the derivatives of
             the sum of log q with regard to means, log s and log a at fixed samples are added.
-        band_gradient: (M, D, width + 1), likewise with regard to L, without log |L|; or empty.
     """
     count, total = samples.shape
     components, width = len(means), bands.shape[2]
@@ -135,12 +133,5 @@ def add_overlaps(
                 move = factor * pull[c]
                 gradient[s, c] -= move
                 mean_gradient[j, c] += share * move
-            if len(band_gradient):
-                for c in range(total):
-                    delta[c] = (samples[s, c] - means[j, c]) / inflation[j]
-                for c in range(total):
-                    y = share * responsibility * white[j, c]
-                    for b in range(min(width, total - c)):
-                        band_gradient[j, c, b] -= y * delta[c + b]
             inflation_gradient[j] += share * responsibility * (squares[j] - total)
             weight_gradient[j] += share * responsibility

@@ -25,7 +25,6 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.gaussian_pairs import pair_log_densities
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.smoothing.likelihood import check_mixtures
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +57,9 @@ def embedded_network(
         intervals: (T-1,) s; (T,) with `first`.
         first: a density of the state (n variables) at a time before the mixtures; its components
             are the first layer of nodes.
-
-    Raises:
-        ValueError: mixtures that can not be smoothed.
     """
     if first is not None:
         return _with_first(first, mixtures, dynamics, intervals)
-    check_mixtures(mixtures, factorise=False)
     d, n = dynamics.dimension, dynamics.state_dimension
     begin = np.concatenate([[0], np.cumsum([len(mixture) for mixture in mixtures])])
     means = np.concatenate([mixture.means for mixture in mixtures])
@@ -80,12 +75,8 @@ def embedded_network(
         at: Any = slice(0, begin[-2])
         if len(different) > 1:
             at = np.repeat(which == i, np.diff(begin[:-1])).nonzero()[0]
-        if np.array_equal(own, np.eye(d)):
-            predicted[at] = means[at]
-            spread[at] = covariances[at] + noise
-        else:
-            predicted[at] = means[at] @ own.T
-            spread[at] = own @ covariances[at] @ own.T + noise
+        predicted[at] = means[at] @ own.T
+        spread[at] = own @ covariances[at] @ own.T + noise
 
     # All pairs in one go: the modes of a time with each other, and with those of the next time.
     within = [_pairs_within(len(mixture)) for mixture in mixtures]
@@ -98,32 +89,28 @@ def embedded_network(
     ).T
     node_values = pair_log_densities(means, covariances, means, covariances, node_pairs)
     link_values = pair_log_densities(predicted, spread, means, covariances, link_pairs)
-    if not np.isfinite(node_values).all():
-        # A factorisation has failed: the check says where.
-        check_mixtures(mixtures)
-
-    nodes, links = [], []
-    done = 0
-    for mixture, pairs in zip(mixtures, within):
-        nodes.append(_node_values(mixture.weights, node_values[done:], pairs))
-        done += pairs.shape[1]
-    done = 0
-    for left, right in pairwise(mixtures):
-        size = len(left) * len(right)
-        links.append(link_values[done : done + size].reshape(len(left), len(right)))
-        done += size
-    return EmbeddedNetwork(tuple(nodes), tuple(links))
+    each_node = np.split(node_values, np.cumsum([pairs.shape[1] for pairs in within]))
+    each_link = np.split(link_values, np.cumsum([pairs.shape[1] for pairs in across]))
+    return EmbeddedNetwork(
+        tuple(
+            _node_values(mixture.weights, values, pairs)
+            for mixture, values, pairs in zip(mixtures, each_node, within)
+        ),
+        tuple(
+            values.reshape(len(left), len(right))
+            for (left, right), values in zip(pairwise(mixtures), each_link)
+        ),
+    )
 
 
 def _node_values(weights: Array, densities: Array, pairs: Index) -> Array:
     """log (K,) of the sums over modes of weights times densities, given for pairs (2, P)."""
     row, column = pairs
     log = np.empty((len(weights), len(weights)))
-    log[row, column] = log[column, row] = densities[: len(row)]
+    log[row, column] = log[column, row] = densities
     # scipy's logsumexp, without its overhead for axes and signs.
     top = log.max(1, keepdims=True)
-    result: Array = np.log(np.exp(log - top) @ weights) + top[:, 0]
-    return result
+    return np.asarray(np.log(np.exp(log - top) @ weights) + top[:, 0])
 
 
 @lru_cache(maxsize=256)
@@ -184,8 +171,7 @@ class Paths:
     @property
     def weights(self) -> Array:
         """Probabilities (P,) of the paths among themselves."""
-        result: Array = np.exp(self.log_values - logsumexp(self.log_values))
-        return result
+        return np.asarray(np.exp(self.log_values - logsumexp(self.log_values)))
 
 
 def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
@@ -201,7 +187,8 @@ def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
     sources = len(network.nodes[0])
     # best (sources, nodes, rank); a path that does not exist has value -inf.
     best = np.where(np.eye(sources, dtype=bool), network.nodes[0][:, None], -np.inf)[:, :, None]
-    back: list[Index] = []
+    # Where each kept path comes from, and how many were kept there per source and node.
+    back: list[tuple[Index, int]] = []
     for t, links in enumerate(network.links):
         before, after = links.shape
         ranks = best.shape[2]
@@ -213,16 +200,15 @@ def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
             chosen = np.argsort(-each, axis=1, kind='stable')[:, :wanted]
         best = np.take_along_axis(each, chosen, axis=1).transpose(0, 2, 1)
         best = best + network.nodes[t + 1][None, :, None]
-        back.append(chosen.transpose(0, 2, 1) + 0)
+        back.append((chosen.transpose(0, 2, 1) + 0, ranks))
     source, node, rank = np.nonzero(np.isfinite(best))
     values = best[source, node, rank]
     order = np.argsort(-values, kind='stable')
     source, node, rank = source[order], node[order], rank[order]
     nodes = np.empty((len(order), network.times), dtype=np.intp)
     nodes[:, -1] = node
-    for t in range(len(back) - 1, -1, -1):
-        flat = back[t][source, nodes[:, t + 1], rank]
-        ranks = min(k, _ranks_at(network, t, k))
+    for t, (kept, ranks) in reversed([*enumerate(back)]):
+        flat = kept[source, nodes[:, t + 1], rank]
         nodes[:, t], rank = flat // ranks, flat % ranks
     return Paths(nodes, values[order])
 
@@ -262,14 +248,6 @@ def distinct_paths(paths: Paths) -> Paths:
     _, first = np.unique(paths.nodes, axis=0, return_index=True)
     first = first[np.isfinite(paths.log_values[first])]
     return paths[first[np.argsort(-paths.log_values[first], kind='stable')]]
-
-
-def _ranks_at(network: EmbeddedNetwork, t: int, k: int) -> int:
-    """How many paths per source and node are kept at time t."""
-    ranks = 1
-    for links in network.links[:t]:
-        ranks = min(k, ranks * len(links))
-    return ranks
 
 
 def diverse_subset(paths: Paths, count: int, penalty: float = 2.0) -> Paths:

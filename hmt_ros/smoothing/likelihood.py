@@ -1,14 +1,14 @@
 """Likelihoods of observations for a smoother: -log p(r_t | x_t), its gradient and its curvature.
 
-The mixtures that a filter made, `MixtureLikelihood`, or the images themselves, `ImageSequence`, or
-any other `EnergyTerm` whose rows are times (VMS 5).
+The mixtures that a filter made, `MixtureLikelihood`, or any other `EnergyTerm` whose rows are
+times, such as the images themselves (VMS 5).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -21,11 +21,6 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
 from hmt_ros.inference.exact_sums import dot
 from hmt_ros.inference.reduction import merged_if_close
-
-if TYPE_CHECKING:
-    from hmt_ros.image.likelihood import ImageLikelihood
-    from hmt_ros.image.observation import Observation
-
 
 # Modes whose density is below exp(-60) of the greatest are left out: less than rounding.
 NEGLIGIBLE = 60.0
@@ -112,11 +107,6 @@ class MixtureLikelihood:
         at = self.first[:-1] + path
         return self.log_scales[at], self.means[at], self.precisions[at]
 
-    def modes_at(self, t: int) -> tuple[Array, Array, Array]:
-        """log scales (K_t,), means (K_t, d) and precisions (K_t, d, d) of the modes at a time."""
-        at = slice(self.first[t], self.first[t + 1])
-        return self.log_scales[at], self.means[at], self.precisions[at]
-
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
@@ -174,12 +164,6 @@ class WindowLikelihood:
             np.concatenate([precision, precisions]),
         )
 
-    def modes_at(self, t: int) -> tuple[Array, Array, Array]:
-        """As for `MixtureLikelihood`: over n variables at the first time, over d later."""
-        if t == 0 or self.later is None:
-            return self.first.modes_at(t)
-        return self.later.modes_at(t - 1)
-
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
@@ -199,36 +183,6 @@ class WindowLikelihood:
             value[at], gradient[at, :d] = found.value, found.gradient
             if hessian is not None:
                 hessian[at, :d, :d] = found.hessian
-        return Energy(value, gradient, hessian)
-
-
-@dataclass(frozen=True, eq=False)
-class ImageSequence:
-    """p(r_t | x_t) of the images themselves, the likelihood that the tracker minimises.
-
-    Attributes:
-        likelihood: the terms and the soft prior.
-        observations: of the T images.
-    """
-
-    likelihood: ImageLikelihood
-    observations: Sequence[Observation]
-
-    @property
-    def times(self) -> int:
-        """T."""
-        return len(self.observations)
-
-    def energy(
-        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        """See `EnergyTerm`; the rows are times, the Hessian is that of Gauss-Newton."""
-        n, d = x.shape
-        value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
-        for t in np.unique(rows):
-            at = rows == t
-            found = self.likelihood.given(self.observations[t]).energy(x[at])
-            value[at], gradient[at], hessian[at] = found.value, *found.derivatives()
         return Energy(value, gradient, hessian)
 
 
@@ -325,12 +279,8 @@ def or_missed(mixture: GaussianMixture, variances: Array) -> GaussianMixture:
     )
 
 
-def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = True) -> None:
-    """Checks that the mixtures of a window can be smoothed.
-
-    Args:
-        mixtures: one for each time.
-        factorise: whether covariances are checked to be positive definite.
+def check_mixtures(mixtures: Sequence[GaussianMixture]) -> None:
+    """Checks that the mixtures of a window, one for each time, can be smoothed.
 
     Raises:
         ValueError: a mixture that can not be smoothed, with its place.
@@ -348,8 +298,6 @@ def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = Tru
                 f'mixture {t} has {mixture.dimension} variables, those before '
                 f'{mixtures[0].dimension}'
             )
-        if not factorise:
-            continue
         try:
             mixture.cholesky()
         except ValueError as error:

@@ -8,7 +8,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
@@ -17,10 +16,7 @@ from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.smoothing.embedded_network import Paths
 from hmt_ros.smoothing.likelihood import LikelihoodPart, SequenceLikelihood, check_mixtures
-from hmt_ros.smoothing.mode_sequence import (
-    ModeSequence,
-    path_gaussians,
-)
+from hmt_ros.smoothing.mode_sequence import ModeSequence, TrajectoryGaussians, path_gaussians
 from hmt_ros.smoothing.path_hypotheses import FilteredPaths, SmoothedPath, smoothed_paths
 from hmt_ros.smoothing.resting_points import RestingPoints
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
@@ -29,9 +25,7 @@ from hmt_ros.smoothing.variational_mixture import (
     ADAPTABLE,
     VariationalMixture,
     laplace_masses,
-    laplace_weights,
     minimise_free_energy,
-    peak_weights,
 )
 
 # Noise values that the descent of the free energy holds: few samples where the state is large.
@@ -51,21 +45,6 @@ MERGE_DISTANCES = (1.75, 2.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
-    """Components before the free energy is minimised.
-
-    Attributes:
-        weights: (M,).
-        states: (M, T, n).
-        factors: of the precisions.
-    """
-
-    weights: Array
-    states: Array
-    factors: tuple[BlockCholesky, ...]
-
-
-@dataclass(frozen=True, eq=False)
 class MixtureSmoother:
     """Smooths sequences of mixtures whose errors are independent; else see `likelihood.counted`.
 
@@ -73,9 +52,7 @@ class MixtureSmoother:
         dynamics: of the state.
         lower, upper: (d,) limits of the pose at every time; None: none.
         max_trajectories: components of the result at most.
-        adapt: variables of the descent of the free energy: some of 'weights', 'means', 'inflation',
-            'covariances'; empty: no descent.
-        start: 'laplace' weighs optima by their mass, 'peak' by their height, as VMS does.
+        adapt: variables of the descent of the free energy, some of `ADAPTABLE`; empty: no descent.
         max_iterations: of the descent of the free energy.
         through_modes: whether, besides the best paths between the ends, those through every single
             mode are starts: more alternatives for each pose, fewer for the whole motion.
@@ -90,8 +67,7 @@ class MixtureSmoother:
     lower: ArrayLike | None = None
     upper: ArrayLike | None = None
     max_trajectories: int = 64
-    adapt: Sequence[str] = ('weights', 'means', 'inflation')
-    start: str = 'laplace'
+    adapt: Sequence[str] = ADAPTABLE
     max_iterations: int = 15
     through_modes: bool = False
     points: Callable[[Array], Array] | None = None
@@ -102,8 +78,6 @@ class MixtureSmoother:
         wrong = [name for name in self.adapt if name not in ADAPTABLE]
         if wrong:
             raise ValueError(f'adapt: no {wrong[0]!r}, wanted some of {ADAPTABLE}')
-        if self.start not in ('laplace', 'peak'):
-            raise ValueError(f"start must be 'laplace' or 'peak', saw {self.start!r}")
         self._limits()
 
     def smooth(
@@ -162,7 +136,7 @@ class MixtureSmoother:
             return sequence.filtered.paths
         return sequence.paths(self.max_trajectories, through_modes=self.through_modes)
 
-    def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> Candidates:
+    def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> TrajectoryGaussians:
         """Distinct optima, found from the paths, and paths beside them if they are few."""
         low, high = self._limits()
         prior, paths = sequence.prior, self.paths(sequence)
@@ -176,11 +150,8 @@ class MixtureSmoother:
             starts = with_refined_parts(starts, shared, prior, likelihood, low[:d], high[:d])
         refined = refine(starts, prior, likelihood, low[:d], high[:d])
         refined = refined.without_duplicates()
-        if self.start == 'laplace':
-            weights = laplace_weights(refined.energies, refined.factors)
-        else:
-            weights = peak_weights(refined.energies)
-        result = Candidates(weights, refined.states, refined.factors)
+        masses = laplace_masses(refined.energies, refined.factors)
+        result = TrajectoryGaussians(refined.states, refined.factors, masses)
         room = self.max_trajectories - len(refined)
         if room == 0 or len(refined) == len(paths) or likelihood is not sequence.likelihood:
             return result
@@ -194,42 +165,36 @@ class MixtureSmoother:
                 for factor, state in zip(refined.factors, refined.states)
             )
         ][:room]
-        masses = laplace_masses(refined.energies, refined.factors)
-        log = np.concatenate([masses, beside.log_weights[distinct]])
-        return Candidates(
-            np.exp(log - logsumexp(log)),
+        return TrajectoryGaussians(
             np.concatenate([refined.states, np.clip(beside.states[distinct], low, high)]),
             refined.factors + tuple(beside.factors[i] for i in distinct),
+            np.concatenate([masses, beside.log_weights[distinct]]),
         )
 
-    def merged_paths(self, sequence: ModeSequence) -> Iterator[Candidates]:
+    def merged_paths(self, sequence: ModeSequence) -> Iterator[TrajectoryGaussians]:
         """Gaussians of paths through modes that were merged, for each distance that merges some."""
         count = sum(len(mixture) for mixture in sequence.mixtures)
         for distance in MERGE_DISTANCES:
             merged = sequence.merged(distance)
             left = sum(len(mixture) for mixture in merged.mixtures)
             if left < count:
-                yield self._on_paths(merged, self.paths(merged))
+                nodes = self.paths(merged).nodes
+                found = path_gaussians(nodes, merged.prior, merged.likelihood)
+                yield replace(found, states=np.clip(found.states, *self._limits()))
                 count = left
 
     def _free_energy(
         self,
-        candidates: Candidates,
+        candidates: TrajectoryGaussians,
         prior: TrajectoryPrior,
         likelihood: SequenceLikelihood,
         seed: int,
     ) -> float:
         return self._descended(candidates, prior, likelihood, seed, 0).fresh[0]
 
-    def _on_paths(self, sequence: ModeSequence, paths: Paths) -> Candidates:
-        low, high = self._limits()
-        found = path_gaussians(paths.nodes, sequence.prior, sequence.likelihood)
-        weights = np.exp(found.log_weights - logsumexp(found.log_weights))
-        return Candidates(weights, np.clip(found.states, low, high), found.factors)
-
     def _descended(
         self,
-        candidates: Candidates,
+        candidates: TrajectoryGaussians,
         prior: TrajectoryPrior,
         likelihood: SequenceLikelihood,
         seed: int,
@@ -237,11 +202,12 @@ class MixtureSmoother:
     ) -> VariationalMixture:
         """Descent over the components that count; the others stay as they are."""
         low, high = self._limits()
-        heavy = candidates.weights > LEAST_SHARE * candidates.weights.max()
-        states = candidates.states[heavy]
+        weights, means = candidates.weights, candidates.states.copy()
+        heavy = weights > LEAST_SHARE * weights.max()
+        states = means[heavy]
         samples = int(np.clip(SAMPLE_BUDGET // states.size // 2 * 2, 4, 32))
         found = minimise_free_energy(
-            candidates.weights[heavy],
+            weights[heavy],
             states,
             tuple(candidates.factors[i] for i in np.flatnonzero(heavy)),
             prior,
@@ -255,19 +221,14 @@ class MixtureSmoother:
         )
         if heavy.all():
             return found
-        weights, means = candidates.weights.copy(), candidates.states.copy()
-        inflation, factors = np.ones(len(weights)), list(candidates.factors)
+        inflation = np.ones(len(weights))
         weights[heavy] = weights[heavy].sum() * found.weights
         means[heavy], inflation[heavy] = found.states, found.inflation
-        for i, factor in zip(np.flatnonzero(heavy), found.factors):
-            factors[i] = factor
-        return replace(
-            found, weights=weights, states=means, inflation=inflation, factors=tuple(factors)
-        )
+        return replace(found, weights=weights, states=means, inflation=inflation)
 
     def _fitted(
         self,
-        candidates: Candidates,
+        candidates: TrajectoryGaussians,
         prior: TrajectoryPrior,
         likelihood: SequenceLikelihood,
         seed: int,
@@ -279,7 +240,7 @@ class MixtureSmoother:
         result = self._mixture(
             found.weights,
             found.states,
-            found.factors,
+            candidates.factors,
             found.inflation,
             prior,
             likelihood,
@@ -339,7 +300,7 @@ class PathSmoother(MixtureSmoother):
     descended to, which costs fifty times as much. Modes that overlap share their mass among many
     paths and should be merged before (`likelihood.merged_modes`).
 
-    `adapt`, `start` and `max_iterations` have no meaning here, nor has `seed`; the result has no
+    `adapt` and `max_iterations` have no meaning here, nor has `seed`; the result has no
     free energy. Means beyond the limits are moved onto them.
 
     Attributes:

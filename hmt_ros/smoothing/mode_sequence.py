@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
@@ -135,8 +136,8 @@ class ModeSequence:
 
 
 @dataclass(frozen=True, eq=False)
-class PathGaussians:
-    """Components of the posterior.
+class TrajectoryGaussians:
+    """Components of the posterior: of paths, or around optima.
 
     Attributes:
         states: (P, T, n) means.
@@ -148,10 +149,15 @@ class PathGaussians:
     factors: tuple[BlockCholesky, ...]
     log_weights: Array
 
+    @property
+    def weights(self) -> Array:
+        """Proportions (P,)."""
+        return np.asarray(np.exp(self.log_weights - logsumexp(self.log_weights)))
+
 
 def path_gaussians(
     nodes: Index, prior: TrajectoryPrior, likelihood: MixtureLikelihood | WindowLikelihood
-) -> PathGaussians:
+) -> TrajectoryGaussians:
     """The components of paths (P, T), indices of modes with weight."""
     count, times = nodes.shape
     n, d = prior.information.shape[1], prior.dimension
@@ -175,4 +181,4 @@ def path_gaussians(
             + 0.5 * times * n * np.log(2 * np.pi)
         )
         factors.append(factor)
-    return PathGaussians(states, tuple(factors), log_weights)
+    return TrajectoryGaussians(states, tuple(factors), log_weights)

@@ -101,11 +101,6 @@ class PathHypotheses:
         )
 
     @classmethod
-    def first(cls, mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> PathHypotheses:
-        """The paths through a first mixture alone, one for each of its modes."""
-        return cls.of_states(first_state(mixture, dynamics))
-
-    @classmethod
     def of_states(cls, states: GaussianMixture) -> PathHypotheses:
         """Paths that begin in states (H, n)."""
         nothing = np.empty(0, dtype=np.intp)
@@ -205,12 +200,12 @@ class FilteredPaths:
         self._gaps: list[Array | None] = []
         self._past: Array | None = None
         if first is not None:
-            self._begin(PathHypotheses.of_states(first))
+            self._begin(first)
 
     def add(self, mixture: GaussianMixture, interval: float) -> None:
         """Goes on to the likelihood of the next pose, `interval` s after the one before."""
         if not self.steps:
-            self._begin(PathHypotheses.first(mixture, self.dynamics))
+            self._begin(first_state(mixture, self.dynamics))
             return
         gaps = self._distances(mixture.means)
         step = self.steps[-1].followed(
@@ -248,9 +243,9 @@ class FilteredPaths:
         chosen = leaders(log, lambda i: past[i], SAME_MOTION)
         return np.asarray(chosen[np.argmin(past[chosen], axis=0)])
 
-    def _begin(self, first: PathHypotheses) -> None:
-        self.steps.append(first)
-        self._past = self._distances(first.states.means[:, : self.dynamics.dimension])
+    def _begin(self, states: GaussianMixture) -> None:
+        self.steps.append(PathHypotheses.of_states(states))
+        self._past = self._distances(states.means[:, : self.dynamics.dimension])
         self._gaps.append(self._past)
 
     def _distances(self, poses: Array) -> Array | None:
@@ -383,16 +378,14 @@ class SmoothedPath:
             apart[..., t, :] -= x[..., t + 1, :] @ gain.T
         return np.asarray(np.linalg.solve(self.roots, apart[..., None])[..., 0])
 
-    def inverse_blocks(self) -> tuple[Array, Array]:
-        """Blocks of P^-1: (T, n, n) on the diagonal and (T-1, n, n) below it."""
+    def inverse_blocks(self) -> Array:
+        """Blocks (T, n, n) on the diagonal of P^-1."""
         covariances = np.array(self.filtered)
-        neighbours = np.empty_like(covariances[1:])
         for t in range(self.times - 2, -1, -1):
             (passage, row), gain = self.passages[t], self.gains[t]
-            np.matmul(covariances[t + 1], gain.T, out=neighbours[t])
-            change = gain @ (neighbours[t] - passage.covariances[row] @ gain.T)
+            change = gain @ (covariances[t + 1] @ gain.T - passage.covariances[row] @ gain.T)
             covariances[t] += 0.5 * (change + change.T)
-        return covariances, neighbours
+        return covariances
 
     def matrix(self) -> BlockTridiagonal:
         """P."""

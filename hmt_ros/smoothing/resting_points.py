@@ -58,31 +58,6 @@ class RestingPoints:
             lambda poses: sole_points(body, poses), lambda poses: sole_jacobians(body, poses)
         )
 
-    def probabilities(self, poses: Array, covariances: Array, intervals: Array) -> Array:
-        """Probabilities (T-1, P) that a point rests from one pose of a trajectory to the next.
-
-        Args:
-            poses: (T, d).
-            covariances: (T, d, d); only the directions in which points are known least count.
-            intervals: (T-1,) s.
-        """
-        return self._probabilities(
-            self.points(poses), self.jacobians(poses), covariances, intervals
-        )
-
-    def _probabilities(
-        self, points: Array, jacobians: Array, covariances: Array, intervals: Array
-    ) -> Array:
-        """The same, of points (T, P, 3) and their derivatives (T, P, 3, d)."""
-        spread = jacobians @ covariances[:, None] @ jacobians.swapaxes(2, 3)
-        least_known = np.linalg.eigh(spread[1:])[1][..., -1]
-        velocities = np.diff(points, axis=0) / intervals[:, None, None]
-        away = np.einsum('tpi,tpi->tp', velocities, least_known)
-        across = np.linalg.norm(velocities - away[:, :, None] * least_known, axis=2)
-        log = np.stack([_log_density(across, away, sigmas) for sigmas in (RESTS, MOVES)])
-        changes = 0.5 * -np.expm1(-2.0 * CHANGES * intervals)
-        return np.asarray(_smoothed_chain(np.exp(log - log.max(0)), changes)[0])
-
     def held(
         self, prior: TrajectoryPrior, poses: Array, covariances: Array, intervals: Array
     ) -> TrajectoryPrior:
@@ -94,7 +69,7 @@ class RestingPoints:
         """
         count, d = poses.shape
         points, jacobians = self.points(poses), self.jacobians(poses)
-        rests = self._probabilities(points, jacobians, covariances, intervals)
+        rests = rest_probabilities(points, jacobians, covariances, intervals)
         diagonal, lower = prior.precision.diagonal.copy(), prior.precision.lower.copy()
         information = prior.information.copy()
         for t in range(count - 1):
@@ -111,6 +86,26 @@ class RestingPoints:
             information[t, :d] += before.T @ (weights * rest)
             information[t + 1, :d] -= after.T @ (weights * rest)
         return replace(prior, precision=BlockTridiagonal(diagonal, lower), information=information)
+
+
+def rest_probabilities(
+    points: Array, jacobians: Array, covariances: Array, intervals: Array
+) -> Array:
+    """Probabilities (T-1, P) that a point rests from one pose of a trajectory to the next.
+
+    Args:
+        points, jacobians: (T, P, 3), and their derivatives (T, P, 3, d) by the poses.
+        covariances: (T, d, d); only the directions in which points are known least count.
+        intervals: (T-1,) s.
+    """
+    spread = jacobians @ covariances[:, None] @ jacobians.swapaxes(2, 3)
+    least_known = np.linalg.eigh(spread[1:])[1][..., -1]
+    velocities = np.diff(points, axis=0) / intervals[:, None, None]
+    away = np.einsum('tpi,tpi->tp', velocities, least_known)
+    across = np.linalg.norm(velocities - away[:, :, None] * least_known, axis=2)
+    log = np.stack([_log_density(across, away, sigmas) for sigmas in (RESTS, MOVES)])
+    changes = 0.5 * -np.expm1(-2.0 * CHANGES * intervals)
+    return np.asarray(_smoothed_chain(np.exp(log - log.max(0)), changes)[0])
 
 
 def _log_density(across: Array, away: Array, sigmas: tuple[float, float]) -> Array:

@@ -105,7 +105,7 @@ class TrajectoryMixture:
         """Covariances (T, d, d) of the poses of component i, inflation included."""
         if i not in self._covariances:
             d = self.dimension
-            blocks = self.factors[i].inverse_blocks()[0]
+            blocks = self.factors[i].inverse_blocks()
             self._covariances[i] = self.inflation[i] ** 2 * blocks[:, :d, :d]
         return self._covariances[i]
 
@@ -185,16 +185,17 @@ class TrajectoryMixture:
             log -= 0.5 * hidden.log_determinant
         white = factor.whiten(offset)
         log -= self.times * d * (np.log(scale) + 0.5 * np.log(2 * np.pi))
-        result: Array = log - 0.5 * np.einsum('stn,stn->s', white, white)
-        return result
+        return np.asarray(log - 0.5 * np.einsum('stn,stn->s', white, white))
 
     def mean(self) -> Array:
         """Expected poses, (T, d)."""
-        result: Array = np.einsum('m,mtd->td', self.weights, self.means)
-        return result
+        return np.asarray(np.einsum('m,mtd->td', self.weights, self.means))
 
-    def message_content(self) -> dict[str, Any]:
+    def message_content(self, *, covariances: bool = True) -> dict[str, Any]:
         """Content of a message besides names and frame (`msg_tools.messages`).
+
+        Args:
+            covariances: whether they are part of it; else they are not computed.
 
         Raises:
             ValueError: the stamps are not known.
@@ -205,7 +206,7 @@ class TrajectoryMixture:
         return {
             'weights': self.weights,
             'means': self.means,
-            'marginal_covariances': self.marginal_covariances,
+            'marginal_covariances': self.marginal_covariances if covariances else None,
             'log_joint': self.log_joint,
             'inflation': self.inflation,
             'stamps_ns': self.stamps_ns,

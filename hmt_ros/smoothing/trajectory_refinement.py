@@ -30,7 +30,7 @@ from hmt_ros.inference.block_tridiagonal import (
     add_diagonal,
     factorise_band,
 )
-from hmt_ros.inference.bounded_newton import Status, TrustRegion
+from hmt_ros.inference.bounded_newton import Status, TrustRegion, resting
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
@@ -161,7 +161,6 @@ class _Problem:
         count, self.times, self.size = starts.shape
         self.prior, self.likelihood = prior, likelihood
         self.low, self.high = limits_of_states(lower, upper, prior.dimension, self.size)
-        self.bounded = bool(np.isfinite(self.low).any() or np.isfinite(self.high).any())
         self.width = prior.precision.bandwidth
         self.band = prior.precision.band()
         self.region = TrustRegion(
@@ -206,9 +205,9 @@ class _Problem:
     def result(self, offset: int) -> RefinedTrajectories:
         """The optima; `offset` is the index of the first start."""
         everyone = np.arange(len(self.states))
-        resting = self._resting(everyone)
+        held = resting(self.states, self.gradient, self.low, self.high)
         # The density beyond a limit is zero and falls off inside as exp(-g distance).
-        slope = np.where(resting, self.gradient, 0.0) ** 2
+        slope = np.where(held, self.gradient, 0.0) ** 2
         factors = [self._factor(self.hessian[i], slope[i]) for i in everyone]
         failed = np.array([i for i in everyone if factors[i] is None], dtype=np.intp)
         if len(failed):
@@ -219,7 +218,7 @@ class _Problem:
             self.states,
             self.energy,
             self.observed,
-            ~resting,
+            ~held,
             self.status,
             self.iterations,
             tuple(factor for factor in factors if factor is not None),
@@ -247,22 +246,14 @@ class _Problem:
         gradient[:, :, :d] += slope.reshape(m, self.times, d)
         return energy, observed, gradient, hessian.reshape(m, self.times, d, d)
 
-    def _resting(self, which: Index) -> NDArray[np.bool_]:
-        """Variables on a limit with a gradient that pushes them outwards."""
-        states, gradient = self.states[which], self.gradient[which]
-        result: NDArray[np.bool_] = ((states <= self.low) & (gradient > 0)) | (
-            (states >= self.high) & (gradient < 0)
-        )
-        return result
-
     def _steps(self, active: Index) -> tuple[Array, Array]:
         """Damped steps (M, T, n), projected onto the box, and the decrease that is predicted."""
         step = np.zeros((len(active), self.times, self.size))
         predicted = np.zeros(len(active))
-        resting = self._resting(active)
+        held = resting(self.states[active], self.gradient[active], self.low, self.high)
         failed = []
         for row, i in enumerate(active):
-            if not self.exact[i] or not self._step(i, self.hessian[i], resting[row], step[row]):
+            if not self.exact[i] or not self._step(i, self.hessian[i], held[row], step[row]):
                 failed.append(row)
         if failed:
             positive = self._evaluate(self.states[active[failed]], Derivatives.POSITIVE)[3]
@@ -273,14 +264,14 @@ class _Problem:
                     self._step(
                         i,
                         (1.0 - share) * self.hessian[i] + share * hessian,
-                        resting[row],
+                        held[row],
                         step[row],
                     )
                     for share in SHARES
                 ):
                     continue
                 self.exact[i] = False
-                while not self._step(i, hessian, resting[row], step[row]):
+                while not self._step(i, hessian, held[row], step[row]):
                     self.region.damping[i] *= 4.0
         for row, i in enumerate(active):
             move = np.clip(self.states[i] + step[row], self.low, self.high) - self.states[i]
@@ -292,16 +283,13 @@ class _Problem:
             step[row] = move
         return step, predicted
 
-    def _step(self, i: int, hessian: Array, resting: NDArray[np.bool_], step: Array) -> bool:
+    def _step(self, i: int, hessian: Array, held: NDArray[np.bool_], step: Array) -> bool:
         """Writes the step of a trajectory; False where the matrix is not positive definite."""
         extra = self.region.damping[i] * self._metric(hessian)
-        held = resting if self.bounded and resting.any() else None
         factor = self._factor(hessian, extra, held)
         if factor is None:
             return False
-        right = -self.gradient[i]
-        if held is not None:
-            right = np.where(held, 0.0, right)
+        right = np.where(held, 0.0, -self.gradient[i])
         solution, _ = dpbtrs(factor.band, right.reshape(-1, 1), lower=1, overwrite_b=1)
         step[:] = solution.reshape(step.shape)
         return True

@@ -6,8 +6,8 @@
 
          = sum_i a_i E_i[log q(X) - log p(X, R)]                                  (7)
 
-F is minimised over proportions a (softmax), means M, inflations s (log), or whole covariances
-through their block Cholesky factors, S_i^-1 = L_i L_i'. The expectation is over samples
+F is minimised over proportions a (softmax), means M and inflations s (log); S_i^-1 = L_i L_i'. The
+expectation is over samples
 
     X = M_i + s_i L_i'^-1 z
 
@@ -37,7 +37,7 @@ from hmt_ros.inference.threads import together
 from hmt_ros.smoothing.component_overlaps import NEGLIGIBLE, add_overlaps
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
-ADAPTABLE = ('weights', 'means', 'inflation', 'covariances')
+ADAPTABLE = ('weights', 'means', 'inflation')
 # Components are split into so many parts, whatever the machine: sums keep their order.
 PARTS = 4
 # Iterations in a row that may pass without a gain on samples that the descent does not see.
@@ -54,7 +54,6 @@ class VariationalMixture:
         weights: (M,) a_i.
         states: (M, T, n) M_i.
         inflation: (M,) s_i.
-        factors: M factors of the precisions S_i^-1, without inflation.
         free_energy: (I,) at the start and after each iteration, nats, on the samples of the
             descent.
         held_out: (J,) the same on the samples that choose the iterate, J >= I, as the descent goes
@@ -65,31 +64,16 @@ class VariationalMixture:
     weights: Array
     states: Array
     inflation: Array
-    factors: tuple[BlockCholesky, ...]
     free_energy: Array
     held_out: Array
     fresh: tuple[float, float]
-
-
-def laplace_weights(energies: Array, factors: Sequence[BlockCholesky]) -> Array:
-    """Proportions a_i from p(M_i, R) |S_i|^(1/2), the mass of each optimum."""
-    log = laplace_masses(energies, factors)
-    result: Array = np.exp(log - logsumexp(log))
-    return result
 
 
 def laplace_masses(energies: Array, factors: Sequence[BlockCholesky]) -> Array:
     """log (M,) of the integrals of p(X, R) around optima, as if it were Gaussian there."""
     size = factors[0].times * factors[0].size
     determinants = np.array([factor.log_determinant for factor in factors])
-    result: Array = -energies - 0.5 * determinants + 0.5 * size * np.log(2 * np.pi)
-    return result
-
-
-def peak_weights(energies: Array) -> Array:
-    """Proportions a_i from the height p(M_i, R) of each optimum, those of VMS."""
-    result: Array = np.exp(-energies - logsumexp(-energies))
-    return result
+    return np.asarray(-energies - 0.5 * determinants + 0.5 * size * np.log(2 * np.pi))
 
 
 def minimise_free_energy(
@@ -99,7 +83,7 @@ def minimise_free_energy(
     prior: TrajectoryPrior,
     likelihood: SequenceLikelihood,
     *,
-    adapt: Sequence[str] = ('weights', 'means', 'inflation'),
+    adapt: Sequence[str] = ADAPTABLE,
     low: Array | float = -np.inf,
     high: Array | float = np.inf,
     samples: int = 8,
@@ -112,18 +96,15 @@ def minimise_free_energy(
     Args:
         weights: (M,) proportions.
         states: (M, T, n) means.
-        adapt: some of 'weights', 'means', 'inflation', 'covariances'.
+        adapt: some of `ADAPTABLE`.
         low, high: (n,) limits of the means.
         samples: per component, an even number.
         max_iterations: of L-BFGS; 0 evaluates only.
         tolerance: ends when an iteration gains less, nats.
 
     Raises:
-        ValueError: something to adapt that does not exist, an odd number of samples.
+        ValueError: an odd number of samples.
     """
-    wrong = [name for name in adapt if name not in ADAPTABLE]
-    if wrong:
-        raise ValueError(f'adapt: no {wrong[0]!r}, wanted some of {ADAPTABLE}')
     if samples < 2 or samples % 2:
         raise ValueError(f'samples must be an even number from 2 up, saw {samples}')
     size = states.shape[1] * states.shape[2]
@@ -138,7 +119,7 @@ def minimise_free_energy(
         trace = np.array([_free_energy(objective, x, descent)])
         held_out = np.empty(0)
     mixture = objective.mixture(x)
-    a, means, inflation, found = mixture
+    a, means, inflation = mixture
     each = objective.sampled(mixture, fresh)
     # Antithetic pairs are one observation each.
     pairs = each.reshape(len(a), -1, 2).mean(2)
@@ -149,7 +130,6 @@ def minimise_free_energy(
         a,
         means.reshape(states.shape),
         inflation,
-        tuple(found),
         trace,
         held_out,
         (float(a @ each.mean(1)), error),
@@ -168,8 +148,7 @@ def matched(noise: Array) -> Array:
     The variance of the noise is known and need not be estimated: with few samples an inflation
     would follow their chance variance.
     """
-    result: Array = noise / np.sqrt((noise * noise).mean((1, 2), keepdims=True))
-    return result
+    return np.asarray(noise / np.sqrt((noise * noise).mean((1, 2), keepdims=True)))
 
 
 def _descend(
@@ -225,7 +204,8 @@ def _free_energy(objective: FreeEnergy, x: Array, noise: Array) -> float:
     return float(mixture[0] @ objective.sampled(mixture, noise).mean(1))
 
 
-Mixture = tuple[Array, Array, Array, Sequence[BlockCholesky]]
+# Proportions (M,), means (M, D) and inflations (M,).
+Mixture = tuple[Array, Array, Array]
 
 
 class FreeEnergy:
@@ -252,79 +232,53 @@ class FreeEnergy:
         self.factors = list(factors)
         self.low = np.tile(np.broadcast_to(low, (self.size,)), self.times)
         self.high = np.tile(np.broadcast_to(high, (self.size,)), self.times)
-        held = np.sqrt(np.maximum(weights, LEAST_WEIGHT))
-        self.scale = held
-        self.spread = held * np.sqrt(2.0 * self.total)
-        self.adapt = tuple(name for name in ADAPTABLE if name in adapt)
-        width = max(factor.width for factor in factors) + 1
+        self.scale = np.sqrt(np.maximum(weights, LEAST_WEIGHT))
+        self.spread = self.scale * np.sqrt(2.0 * self.total)
         sizes = {
             'weights': self.count,
             'means': self.count * self.total,
             'inflation': self.count,
-            'covariances': self.count * self.total * width,
         }
         self.slices: dict[str, slice] = {}
         at = 0
-        for name in self.adapt:
-            self.slices[name] = slice(at, at + sizes[name])
-            at += sizes[name]
+        for name, size in sizes.items():
+            if name in adapt:
+                self.slices[name] = slice(at, at + size)
+                at += size
         self.parameters = at
         self.bands = np.stack([factor.band.T for factor in factors])
-        self.inside = np.ones((self.total, width), dtype=bool)
-        for b in range(width):
-            self.inside[self.total - b :, b] = False
-        self.marginals = np.empty((self.count, self.times, self.size, self.size))
-        for i, factor in enumerate(factors):
-            self.marginals[i] = factor.inverse_blocks()[0]
-        self.roots = np.stack([factor.solve_transposed(z) for factor, z in zip(factors, noise)])
+        self.marginals = np.stack([factor.inverse_blocks() for factor in factors])
+        self.log_determinants = np.array([factor.log_determinant for factor in factors])
+        self.roots = self._coloured(noise)
+
+    def _coloured(self, noise: Array) -> Array:
+        """L_i'^-1 z, (M, ..., D), of vectors z (M, ..., D)."""
+        return np.stack([factor.solve_transposed(z) for factor, z in zip(self.factors, noise)])
 
     def mixture(self, x: Array) -> Mixture:
-        """Proportions (M,), means (M, D), inflations (M,) and factors."""
+        """The mixture at a point."""
         log = self.log_weights
         if 'weights' in self.slices:
             log = log + x[self.slices['weights']] / self.scale
         means = self.start
         if 'means' in self.slices:
             moves = x[self.slices['means']].reshape(self.count, -1) / self.scale[:, None]
-            moves = np.stack([f.solve_transposed(move) for f, move in zip(self.factors, moves)])
-            means = np.clip(means + moves, self.low, self.high)
+            means = np.clip(means + self._coloured(moves), self.low, self.high)
         inflation = np.ones(self.count)
         if 'inflation' in self.slices:
             inflation = np.exp(np.clip(x[self.slices['inflation']] / self.spread, -3.0, 3.0))
-        factors: Sequence[BlockCholesky] = self.factors
-        if 'covariances' in self.slices:
-            factors = self._factors(x[self.slices['covariances']])
-        return np.exp(log - logsumexp(log)), means, inflation, factors
-
-    def _factors(self, x: Array) -> list[BlockCholesky]:
-        """L with the diagonal times exp(.), and the rest moved in units of its row's diagonal."""
-        given = x.reshape(self.bands.shape) / self.scale[:, None, None]
-        result = []
-        for band, change in zip(self.bands, given):
-            new = band + np.where(self.inside, change * self._row_scale(band), 0.0)
-            new[:, 0] = band[:, 0] * np.exp(change[:, 0])
-            result.append(BlockCholesky(new.T, self.times, self.size))
-        return result
-
-    def _row_scale(self, band: Array) -> Array:
-        """L[r, r] at the place of L[r, c]."""
-        diagonal = np.concatenate([band[:, 0], np.ones(band.shape[1])])
-        return np.lib.stride_tricks.sliding_window_view(diagonal, band.shape[1])[: len(band)]
+        return np.exp(log - logsumexp(log)), means, inflation
 
     def sampled(self, mixture: Mixture, noise: Array) -> Array:
         """log q(X) - log p(X, R) at samples of each component, (M, S), with noise (M, S, D)."""
-        roots = np.stack([f.solve_transposed(z) for f, z in zip(mixture[3], noise)])
-        return self._evaluate(mixture, noise, roots, derivatives=False)[0]
+        return self._evaluate(mixture, noise, self._coloured(noise), derivatives=False)[0]
 
     def __call__(self, x: Array) -> tuple[float, Array]:
         """F and its gradient."""
         mixture = self.mixture(x)
-        weights, means, inflation, factors = mixture
-        roots = self.roots
-        if 'covariances' in self.slices:
-            roots = np.stack([f.solve_transposed(z) for f, z in zip(factors, self.noise)])
-        each, slope, parts = self._evaluate(mixture, self.noise, roots)
-        mean_gradient, inflation_gradient, weight_gradient, band_gradient = parts
+        weights, means, inflation = mixture
+        each, slope, parts = self._evaluate(mixture, self.noise, self.roots)
+        mean_gradient, inflation_gradient, weight_gradient = parts
         value = float(weights @ each.mean(1))
         gradient = np.empty(self.parameters)
         share = weights / each.shape[1]
@@ -337,44 +291,17 @@ class FreeEnergy:
             down = np.stack([f.solve_lower(g) for f, g in zip(self.factors, down)])
             gradient[self.slices['means']] = (down / self.scale[:, None]).reshape(-1)
         if 'inflation' in self.slices:
-            along = np.einsum('msd,msd->m', slope, roots) * inflation
+            along = np.einsum('msd,msd->m', slope, self.roots) * inflation
             gradient[self.slices['inflation']] = (inflation_gradient + share * along) / self.spread
-        if 'covariances' in self.slices:
-            gradient[self.slices['covariances']] = self._band_gradient(
-                mixture, roots, share[:, None, None] * slope, weight_gradient, band_gradient
-            ).reshape(-1)
         return value, gradient
-
-    def _band_gradient(
-        self, mixture: Mixture, roots: Array, slope: Array, mass: Array, direct: Array
-    ) -> Array:
-        """Gradient (M, D, width + 1) with regard to the variables that move the factors.
-
-        A sample X = M + s u, u = L'^-1 z, moves by -s L'^-1 dL' u.
-        """
-        result = direct
-        for i, (factor, u, g) in enumerate(zip(mixture[3], roots, slope)):
-            back = factor.solve_lower(g)
-            for b in range(result.shape[2]):
-                moved = u[:, b:] * back[:, : self.total - b]
-                result[i, : self.total - b, b] -= mixture[2][i] * moved.sum(0)
-            result[i, :, 0] += mass[i] / factor.band[0]
-            scale = self._row_scale(self.bands[i]).copy()
-            scale[:, 0] = factor.band[0]
-            result[i] *= np.where(self.inside, scale, 0.0)
-        return result / self.scale[:, None, None]
 
     def _evaluate(
         self, mixture: Mixture, noise: Array, roots: Array, *, derivatives: bool = True
     ) -> tuple[Array, Array, tuple[Array, ...]]:
         """log q - log p at samples (M, S), its gradient, and those of log q at fixed samples."""
-        weights, means, inflation, factors = mixture
+        weights, means, inflation = mixture
         count, samples, total = noise.shape
-        bands = self.bands
-        whole = 'covariances' in self.slices
-        if whole:
-            bands = np.stack([factor.band.T for factor in factors])
-        log_scales = 0.5 * np.array([factor.log_determinant for factor in factors]) - total * (
+        log_scales = 0.5 * self.log_determinants - total * (
             np.log(inflation) + 0.5 * np.log(2 * np.pi)
         )
         log_weights = np.log(np.maximum(weights, 1e-300))
@@ -382,15 +309,7 @@ class FreeEnergy:
         each = np.empty((count, samples))
         slope = np.empty((count, samples, total))
         edges = np.linspace(0, count, PARTS + 1).astype(int)
-        sums = [
-            (
-                np.zeros((count, total)),
-                np.zeros(count),
-                np.zeros(count),
-                np.zeros(bands.shape if whole else (0, 0, 0)),
-            )
-            for _ in range(PARTS)
-        ]
+        sums = [(np.zeros((count, total)), np.zeros(count), np.zeros(count)) for _ in range(PARTS)]
 
         def work(part: int) -> None:
             for i in range(edges[part], edges[part + 1]):
@@ -403,7 +322,7 @@ class FreeEnergy:
                     log_scales,
                     means,
                     inflation,
-                    bands,
+                    self.bands,
                     near[i],
                     self.size * farthest[i],
                     derivatives,
@@ -447,8 +366,6 @@ class FreeEnergy:
             square = (means - means[k]) ** 2 * metric
             farthest[k] = square.reshape(self.count, self.times, self.size).sum(2).argmax(1)
         i, j = np.triu_indices(self.count, 1)
-        if 'covariances' in self.slices or len(i) == 0:
-            return near, farthest
         at = farthest[i, j]
         poses = means.reshape(-1, self.size)
         pairs = np.stack([i, j], axis=1) * self.times + at[:, None]

@@ -16,7 +16,6 @@ from types import MappingProxyType
 import numpy as np
 
 from hmt_ros.body.ground_terms import GroundSettings
-from hmt_ros.experts.lifter import SHIPPED
 from hmt_ros.image.likelihood import LikelihoodSettings
 
 MOTIONS = ('learned', 'random_walk')
@@ -234,7 +233,7 @@ class TrackerSettings:
     flow_weight: float = 5.0
     least_log_weight: float = -14.0
     estimate_shape: bool = True
-    lifter: str = SHIPPED
+    lifter: str = 'keypoints'
     threads: int = 0
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     search: LimbSearchSettings = field(default_factory=LimbSearchSettings)

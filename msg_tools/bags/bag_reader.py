@@ -19,22 +19,24 @@ import os
 import stat
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import zstandard
 from rosbags.typesys.store import Typestore
 
 from msg_tools.bags.bag_metadata import BagError, read_file_names, reason
-from msg_tools.bags.storage import Channel, McapFile, SqliteFile, StorageFile, StoredMessage
+from msg_tools.bags.storage import Channel, McapFile, SqliteFile, StoredMessage
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.message_types import typestore, typestore_of_definition
 
 _log = logging.getLogger(__name__)
+
+Content = TypeVar('Content')
 
 _SQLITE_MAGIC = b'SQLite format 3\x00'
 _MCAP_MAGIC = b'\x89MCAP0\r\n'
@@ -66,12 +68,14 @@ class BagMessage:
     """A message of a bag, still as bytes until `message` is asked for.
 
     Attributes:
+        path: of the bag.
         topic: as written in the bag.
         msgtype: for example 'sensor_msgs/msg/Image'.
         log_time_ns: when it was recorded.
         data: CDR bytes, as stored.
     """
 
+    path: Path
     topic: str
     msgtype: str
     log_time_ns: int
@@ -87,10 +91,24 @@ class BagMessage:
         """
         return self._deserialise(self)
 
+    def content(self, read: Callable[[Any], Content]) -> Content:
+        """What a function reads in the message.
+
+        Raises:
+            ValueError: the bytes do not fit the type, or the function says so; one line, with the
+                place in the bag.
+        """
+        message = self.message
+        try:
+            return read(message)
+        except ValueError as error:
+            where = f'{self.path}: {self.topic} at {self.log_time_ns} ns'
+            raise ValueError(f'{where}: {error}') from error
+
     def with_message(self, message: Any) -> BagMessage:
         """Another message of `rosbags` in the place of this one; it has no bytes."""
         kind = message.__msgtype__
-        return BagMessage(self.topic, kind, self.log_time_ns, b'', lambda _: message)
+        return BagMessage(self.path, self.topic, kind, self.log_time_ns, b'', lambda _: message)
 
 
 class BagReader(AbstractContextManager['BagReader']):
@@ -111,7 +129,7 @@ class BagReader(AbstractContextManager['BagReader']):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self._typestores: dict[Channel, Typestore] = {}
-        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch = ExitStack()
         try:
             self._files = [self._open_file(file) for file in self._storage_paths()]
         except BaseException:
@@ -133,9 +151,7 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def close(self) -> None:
         """Removes the files that were decompressed into the folder for temporary files."""
-        if self._scratch is not None:
-            self._scratch.cleanup()
-            self._scratch = None
+        self._scratch.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -235,6 +251,7 @@ class BagReader(AbstractContextManager['BagReader']):
         for stored in heapq.merge(*found, key=attrgetter('log_time')):
             if stored.channel is not None:
                 yield BagMessage(
+                    self.path,
                     stored.channel.topic,
                     _full_name(stored.channel.msgtype),
                     stored.log_time,
@@ -295,7 +312,7 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
         return paths
 
-    def _open_file(self, path: Path) -> StorageFile:
+    def _open_file(self, path: Path) -> SqliteFile | McapFile:
         name = str(path)
         try:
             magic = _first_bytes(path)
@@ -320,9 +337,8 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def _decompressed(self, path: Path) -> Path:
         """The content of a zstd file, as a file that lives as long as the reader."""
-        if self._scratch is None:
-            self._scratch = tempfile.TemporaryDirectory(prefix='bag_reader.')
-        target = Path(self._scratch.name) / path.stem
+        folder = self._scratch.enter_context(tempfile.TemporaryDirectory(prefix='bag_reader.'))
+        target = Path(folder) / path.stem
         with path.open('rb') as compressed, target.open('wb') as plain:
             zstandard.ZstdDecompressor().copy_stream(compressed, plain)
         return target
@@ -343,7 +359,9 @@ def _first_bytes(path: Path) -> bytes:
         return file.read(len(_SQLITE_MAGIC))
 
 
-def _from_its_start(file: StorageFile, topics: Collection[str]) -> Iterator[StoredMessage]:
+def _from_its_start(
+    file: SqliteFile | McapFile, topics: Collection[str]
+) -> Iterator[StoredMessage]:
     """A mark without a channel, then the messages: no file is opened before its time has come."""
     yield StoredMessage(_NEVER if file.start is None else file.start, None, b'')
     yield from file.messages(topics)

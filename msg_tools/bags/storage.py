@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol, cast
+from typing import BinaryIO, NamedTuple, cast
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
@@ -61,29 +61,6 @@ class StoredMessage(NamedTuple):
     data: bytes
 
 
-class StorageFile(Protocol):
-    """A file of a bag.
-
-    Attributes:
-        name: for messages to the user.
-        counts: number of messages of each channel.
-        start: log time of the first message, ns; None: there is none.
-        cut_off: whether its end is missing.
-    """
-
-    name: str
-    counts: Counter[Channel]
-    start: int | None
-    cut_off: bool
-
-    def messages(self, topics: Collection[str]) -> Iterator[StoredMessage]:
-        """Messages of some topics by log time, then by place in the file.
-
-        Raises:
-            BagError: where the file is damaged, after the messages before the damage.
-        """
-
-
 @contextmanager
 def _faults_told(name: str) -> Iterator[None]:
     """Turns what the libraries raise, which do not say what that may be, into BagError."""
@@ -96,7 +73,14 @@ def _faults_told(name: str) -> Iterator[None]:
 
 
 class SqliteFile:
-    """A .db3 file, the default storage before ROS 2 Iron; see `StorageFile`."""
+    """A .db3 file of a bag, the default storage before ROS 2 Iron.
+
+    Attributes:
+        name: for messages to the user.
+        counts: number of messages of each channel.
+        start: log time of the first message, ns; None: there is none.
+        cut_off: whether its end is missing.
+    """
 
     cut_off = False
 
@@ -119,7 +103,11 @@ class SqliteFile:
             self.start = reader.start_time if reader.message_count else None
 
     def messages(self, topics: Collection[str]) -> Iterator[StoredMessage]:
-        """See `StorageFile.messages`."""
+        """Messages of some topics by log time, then by place in the file.
+
+        Raises:
+            BagError: where the file is damaged, after the messages before the damage.
+        """
         with _faults_told(self.name), Reader(self._path) as reader:
             wanted = [each for each in reader.connections if each.topic in topics]
             # No connection would mean all of them.
@@ -128,7 +116,7 @@ class SqliteFile:
 
 
 class McapFile:
-    """An MCAP file; see `StorageFile`."""
+    """An MCAP file of a bag; it has what `SqliteFile` has."""
 
     def __init__(self, path: Path, name: str) -> None:
         self._path, self.name = path, name
@@ -146,7 +134,7 @@ class McapFile:
             self.counts[channel] += index.counts[key]
 
     def messages(self, topics: Collection[str]) -> Iterator[StoredMessage]:
-        """See `StorageFile.messages`."""
+        """See `SqliteFile.messages`."""
         with _faults_told(self.name), _ExactFile(self._path) as file:
             found = heapq.merge(
                 self._bare(file), self._chunked(file, topics), key=attrgetter('log_time')

@@ -45,10 +45,8 @@ def resized(model: Body, segment_lengths: Mapping[str, float]) -> Body:
     """
     try:
         return model.with_segment_lengths(segment_lengths)
-    except KeyError as error:
+    except (KeyError, ValueError) as error:
         raise MessageError(f'body {model.name}: {error.args[0]}', 'body') from error
-    except ValueError as error:
-        raise MessageError(f'body {model.name}: {error}', 'body') from error
 
 
 def body_of(

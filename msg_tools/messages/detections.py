@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.image.keypoint_schemes import Scheme, schemes
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -25,10 +24,8 @@ from msg_tools.messages.keypoints import (
     keypoints_message,
     keypoints_of,
 )
-from msg_tools.messages.message_error import MessageError
+from msg_tools.messages.message_error import Array, MessageError
 from msg_tools.messages.message_types import MessageFactory
-
-Array = NDArray[np.float64]
 
 SKELETON_2D, YOLO = 'hri_msgs/msg/Skeleton2D', 'yolo_msgs/msg/DetectionArray'
 FLOATS = 'std_msgs/msg/Float32MultiArray'

@@ -8,15 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msg_tools.messages.headers import header_message, time_ns
-from msg_tools.messages.message_error import MessageError, check_finite, names_of, numbers
+from msg_tools.messages.message_error import Array, MessageError, check_finite, names_of, numbers
 from msg_tools.messages.message_types import MessageFactory
 
 GROUND = 'hmt_msgs/msg/Ground'
 
-Array = NDArray[np.float64]
 
 # Largest error of the length of up, and of the plane.
 _TOLERANCE = 1e-6

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import ReferenceHuman
@@ -19,11 +18,10 @@ from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools.messages.detections import SKELETON_2D
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import decode_image, image_message
+from msg_tools.messages.message_error import Array
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.states import joint_state_message, transforms_message
 from msg_tools.messages.urdf import add_limit, add_rod, xml_numbers
-
-Array = NDArray[np.float64]
 
 IDS = 'hri_msgs/msg/IdsList'
 REGION = 'hri_msgs/msg/NormalizedRegionOfInterest2D'

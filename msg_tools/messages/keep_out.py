@@ -8,16 +8,21 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msg_tools.messages.headers import header_message, time_ns
-from msg_tools.messages.message_error import MessageError, check_finite, freeze_arrays, numbers
+from msg_tools.messages.message_error import (
+    Array,
+    MessageError,
+    check_finite,
+    constant_of,
+    freeze_arrays,
+    numbers,
+)
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.states import pose_message
 
 KEEP_OUT = 'hmt_msgs/msg/KeepOut'
 
-Array = NDArray[np.float64]
 
 _ADD, _DELETE_ALL = 0, 3
 _SPHERE, _CYLINDER = 2, 3
@@ -107,10 +112,6 @@ def keep_out_of(message: Any) -> KeepOut:
         MessageError: values that contradict each other or are out of range.
     """
     n = len(message.radii)
-    try:
-        state = KeepOutState(int(message.state))
-    except ValueError as error:
-        raise MessageError(f'keep out: state {message.state} is unknown') from error
     flat = {
         name: numbers(getattr(message, name), (3 * n,), f'keep out: {name}')
         for name in ('starts', 'ends')
@@ -118,7 +119,7 @@ def keep_out_of(message: Any) -> KeepOut:
     return KeepOut(
         time_ns(message.header.stamp),
         str(message.header.frame_id),
-        state,
+        constant_of(KeepOutState, message.state, f'keep out: state {message.state} is unknown'),
         flat['starts'].reshape(n, 3),
         flat['ends'].reshape(n, 3),
         np.asarray(message.radii, dtype=np.float64),

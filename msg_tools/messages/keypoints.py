@@ -7,19 +7,21 @@ A message without names says that nobody was seen; it has no keypoints.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_error import MessageError, check_covariances, names_of, numbers
+from msg_tools.messages.message_error import (
+    Array,
+    MessageError,
+    check_covariances,
+    names_of,
+    numbers,
+)
 from msg_tools.messages.message_types import MessageFactory
-
-Array = NDArray[np.float64]
 
 KEYPOINTS_2D, KEYPOINTS_3D = 'hmt_msgs/msg/Keypoints2D', 'hmt_msgs/msg/Keypoints3D'
 # Of one person; detectors find up to a few hundred.
@@ -66,13 +68,11 @@ def keypoints_of(message: Any, sigma_px: float = 0.0) -> Keypoints:
             one half is missing, or that is beyond all images, a covariance that is not positive
             definite, a confidence beyond 0 to 1.
     """
-    names = _names(message.names, 'keypoints')
+    names, pixels, confidences = _points_of(message, 'uv', 'keypoints')
     n = len(names)
-    pixels = _columns([message.u, message.v], 'uv', n, 'keypoints')
     covariances = None
     if len(message.covariance):
         covariances = numbers(message.covariance, (n, 2, 2), 'keypoints: covariance').copy()
-    confidences = _confidences(message.confidence, n, 'keypoints')
     found = checked_keypoints(names, pixels, confidences, covariances)
     if covariances is not None or not sigma_px:
         return found
@@ -95,11 +95,9 @@ def checked_keypoints(
     """
     seen = (confidences != 0) & ~np.isnan(pixels).all(1) & (pixels != 0).any(1)
     for i in np.flatnonzero(seen):
-        name = names[i]
-        _check_place(pixels[i], FARTHEST_PIXEL, 'px', name)
+        _check_point(names[i], pixels[i], confidences[i], FARTHEST_PIXEL, 'px')
         if covariances is not None:
-            check_covariances(covariances[i], f'keypoint {name}')
-        _check_confidence(confidences[i], name)
+            check_covariances(covariances[i], f'keypoint {names[i]}')
     pixels[~seen], confidences[~seen] = np.nan, 0.0
     if covariances is None:
         covariances = np.full((len(names), 2, 2), np.nan)
@@ -117,14 +115,10 @@ def positions_of(message: Any) -> Positions:
     Raises:
         MessageError: as `keypoints_of`.
     """
-    names = _names(message.names, 'keypoints_3d')
-    n = len(names)
-    positions = _columns([message.x, message.y, message.z], 'xyz', n, 'keypoints_3d')
-    confidences = _confidences(message.confidence, n, 'keypoints_3d')
+    names, positions, confidences = _points_of(message, 'xyz', 'keypoints_3d')
     seen = (confidences != 0) & ~np.isnan(positions).all(1)
     for i in np.flatnonzero(seen):
-        _check_place(positions[i], FARTHEST_POSITION, 'm', names[i])
-        _check_confidence(confidences[i], names[i])
+        _check_point(names[i], positions[i], confidences[i], FARTHEST_POSITION, 'm')
     positions[~seen] = np.nan
     return Positions(names, positions)
 
@@ -169,25 +163,20 @@ def positions_message(
     )
 
 
-def _names(values: Sequence[str], what: str) -> tuple[str, ...]:
-    if len(values) > MAX_KEYPOINTS:
-        raise MessageError(f'{what} has {len(values)} names, the limit is {MAX_KEYPOINTS}')
-    return names_of(values, what)
+def _points_of(message: Any, symbols: str, what: str) -> tuple[tuple[str, ...], Array, Array]:
+    """Names (n,), places (n, d) in the fields of so many symbols, and confidences (n,)."""
+    n = len(message.names)
+    if n > MAX_KEYPOINTS:
+        raise MessageError(f'{what} has {n} names, the limit is {MAX_KEYPOINTS}')
+    names = names_of(message.names, what)
+    columns = [numbers(getattr(message, x), (n,), f'{what}: {x}') for x in symbols]
+    confidences = np.ones(n)
+    if len(message.confidence):
+        confidences = numbers(message.confidence, (n,), f'{what}: confidence')
+    return names, np.stack(columns, axis=1), confidences
 
 
-def _columns(fields: Sequence[Any], symbols: str, n: int, what: str) -> Array:
-    columns = [
-        numbers(values, (n,), f'{what}: {symbol}')
-        for values, symbol in zip(fields, symbols, strict=True)
-    ]
-    return np.stack(columns, axis=1)
-
-
-def _confidences(values: Any, n: int, what: str) -> Array:
-    return numbers(values, (n,), f'{what}: confidence') if len(values) else np.ones(n)
-
-
-def _check_place(place: Array, farthest: float, unit: str, name: str) -> None:
+def _check_point(name: str, place: Array, confidence: float, farthest: float, unit: str) -> None:
     if not np.isfinite(place).all():
         raise MessageError(
             f'keypoint {name} lies at {tuple(place.tolist())}, wanted numbers, or NaN for all of '
@@ -198,8 +187,5 @@ def _check_place(place: Array, farthest: float, unit: str, name: str) -> None:
             f'keypoint {name} lies at {tuple(place.tolist())}, wanted numbers within {farthest:g} '
             f'{unit}'
         )
-
-
-def _check_confidence(confidence: float, name: str) -> None:
     if not 0 <= confidence <= 1:
         raise MessageError(f'keypoint {name} has confidence {confidence}, wanted 0 to 1')

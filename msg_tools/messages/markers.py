@@ -16,11 +16,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from msg_tools.messages.ground import GroundState
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_error import MessageError
+from msg_tools.messages.message_error import Array, MessageError
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.states import pose_message, quaternions
 
@@ -36,15 +36,13 @@ _FAINTEST = 0.12
 FLOOR, CONTACTS = 'floor', 'contacts'
 # Side and thickness of the square, m; its top is the floor.
 _SIDE, _THICK = 3.0, 0.005
-_FLOOR_COLOUR = (0.55, 0.55, 0.50, 0.30)
+_FLOOR_COLOUR = (0.55, 0.55, 0.50), 0.30
 _CONTACT_COLOUR = (0.00, 0.62, 0.45)
 _SPHERE = 0.09  # diameter, m
 # A foot that stands with a lower probability is not shown.
 _LEAST = 0.05
 # Joints of a foot, by the end of its name.
 _OF_FOOT = ('ankle', 'toe')
-
-Array = NDArray[np.float64]
 
 
 def skeleton_markers(
@@ -81,44 +79,18 @@ def skeleton_markers(
             f'({len(heavy)}, {len(joint_names)}, 3)'
         )
     ends = _ends(joint_names, edges)
-    order = np.argsort(-heavy, kind='stable')[:ranks]
-    header = header_message(messages, stamp_ns, frame_id)
+    width = messages.create('geometry_msgs/msg/Vector3', x=bone_width)
+    size = _size(messages, joint_diameter)
 
-    marker = _markers(messages, header, namespace)
-    markers = []
-    for rank, mode in enumerate(order):
+    def shown(mode: int) -> list[dict[str, Any]]:
         points = messages.points(positions[mode])
-        color = _color(messages, rank, heavy[mode], heavy[order[0]])
-        markers.append(
-            marker(
-                rank,
-                _BONES,
-                type=_LINE_LIST,
-                action=_ADD,
-                scale=messages.create('geometry_msgs/msg/Vector3', x=bone_width),
-                color=color,
-                points=[points[i] for i in ends],
-            )
-        )
-        markers.append(
-            marker(
-                rank,
-                _JOINTS,
-                type=_SPHERE_LIST,
-                action=_ADD,
-                scale=messages.create(
-                    'geometry_msgs/msg/Vector3',
-                    x=joint_diameter,
-                    y=joint_diameter,
-                    z=joint_diameter,
-                ),
-                color=color,
-                points=points,
-            )
-        )
-    for rank in range(len(order), ranks):
-        markers.extend(marker(rank, key, action=_DELETE) for key in (_BONES, _JOINTS))
-    return messages.create('visualization_msgs/msg/MarkerArray', markers=markers)
+        return [
+            {'type': _LINE_LIST, 'scale': width, 'points': [points[i] for i in ends]},
+            {'type': _SPHERE_LIST, 'scale': size, 'points': points},
+        ]
+
+    header = header_message(messages, stamp_ns, frame_id)
+    return _ranked_markers(messages, header, namespace, heavy, ranks, shown)
 
 
 def trajectory_markers(
@@ -163,52 +135,69 @@ def trajectory_markers(
             f'({len(heavy)}, T, {len(joint_names)}, 3)'
         )
     ends = _ends(joint_names, edges)
-    shown = [index for index, name in enumerate(joint_names) if name in traced]
-    header = header_message(messages, stamp_ns, frame_id)
-    marker = _markers(messages, header, namespace)
+    drawn = [index for index, name in enumerate(joint_names) if name in traced]
     scale = messages.create('geometry_msgs/msg/Vector3', x=line_width)
-    order = np.argsort(-heavy, kind='stable')[:ranks]
-    markers = []
-    for rank, at in enumerate(order):
-        places = [messages.points(positions[at, :, joint]) for joint in shown]
+
+    def shown(at: int) -> list[dict[str, Any]]:
+        places = [messages.points(positions[at, :, joint]) for joint in drawn]
         # Pairs of neighbouring positions, joint by joint.
         pieces = [place for path in places for pair in pairwise(path) for place in pair]
         newest = messages.points(positions[at, -1])
-        color = _color(messages, rank, heavy[at], heavy[order[0]])
-        for key, points in ((0, pieces), (1, [newest[i] for i in ends])):
-            markers.append(
-                marker(
-                    rank,
-                    key,
-                    # One point alone is no line.
-                    action=_ADD if points else _DELETE,
-                    type=_LINE_LIST,
-                    scale=scale,
-                    color=color,
-                    points=points,
-                )
-            )
-    for rank in range(len(order), ranks):
-        markers.extend(marker(rank, key, action=_DELETE) for key in (0, 1))
+        return [
+            {'type': _LINE_LIST, 'scale': scale, 'points': points}
+            for points in (pieces, [newest[i] for i in ends])
+        ]
+
+    header = header_message(messages, stamp_ns, frame_id)
+    return _ranked_markers(messages, header, namespace, heavy, ranks, shown)
+
+
+def _ranked_markers(
+    messages: MessageFactory,
+    header: Any,
+    namespace: str,
+    weights: Array,
+    ranks: int,
+    shown: Callable[[int], list[dict[str, Any]]],
+) -> Any:
+    """visualization_msgs/MarkerArray of the heaviest modes, two markers each.
+
+    Args:
+        weights: (K,) of the modes.
+        shown: fields of the two markers of a mode; those without points are deleted, as one point
+            alone is no line.
+    """
+    blank = _marker(messages, header, action=_DELETE)
+    order = np.argsort(-weights, kind='stable')[:ranks].tolist()
+    markers = []
+    for rank in range(ranks):
+        pair: list[dict[str, Any]] = [{}, {}]
+        if rank < len(order):
+            pair = shown(order[rank])
+            heaviest = float(weights[order[0]])
+            share = float(weights[order[rank]]) / heaviest if heaviest > 0 else 1.0
+            # The lighter the fainter.
+            alpha = _FAINTEST + (1 - _FAINTEST) * share
+            colour = _colour(messages, _OTHERS if rank else _FIRST, alpha)
+            pair = [
+                {'action': _ADD if x['points'] else _DELETE, 'color': colour, **x} for x in pair
+            ]
+        for key, fields in enumerate(pair):
+            made = copy(blank)
+            for name, value in {'ns': f'{namespace}_{rank}', 'id': key, **fields}.items():
+                setattr(made, name, value)
+            markers.append(made)
     return messages.create('visualization_msgs/msg/MarkerArray', markers=markers)
 
 
-def _markers(messages: MessageFactory, header: Any, namespace: str) -> Callable[..., Any]:
-    """Maker of the markers of one array, which share their common fields."""
-    blank = messages.create(
-        'visualization_msgs/msg/Marker',
-        header=header,
-        # Viewers complain about an orientation of zero length.
-        pose=messages.create('geometry_msgs/msg/Pose'),
-    )
+def _marker(messages: MessageFactory, header: Any, **fields: Any) -> Any:
+    """visualization_msgs/Marker; viewers complain about an orientation of zero length."""
+    fields.setdefault('pose', messages.create('geometry_msgs/msg/Pose'))
+    return messages.create('visualization_msgs/msg/Marker', header=header, **fields)
 
-    def marker(rank: int, key: int, **fields: Any) -> Any:
-        made = copy(blank)
-        for name, value in {'ns': f'{namespace}_{rank}', 'id': key, **fields}.items():
-            setattr(made, name, value)
-        return made
 
-    return marker
+def _size(messages: MessageFactory, diameter: float) -> Any:
+    return messages.create('geometry_msgs/msg/Vector3', x=diameter, y=diameter, z=diameter)
 
 
 def _ends(joint_names: Sequence[str], edges: Sequence[tuple[str, str]]) -> list[int]:
@@ -219,15 +208,6 @@ def _ends(joint_names: Sequence[str], edges: Sequence[tuple[str, str]]) -> list[
             if name not in index:
                 raise MessageError(f'markers: edge {edge} has the unknown joint {name!r}')
     return [index[name] for edge in edges for name in edge]
-
-
-def _color(messages: MessageFactory, rank: int, weight: float, heaviest: float) -> Any:
-    """std_msgs/ColorRGBA of a rank, the lighter the fainter."""
-    red, green, blue = _OTHERS if rank else _FIRST
-    share = float(weight / heaviest) if heaviest > 0 else 1.0
-    return messages.create(
-        'std_msgs/msg/ColorRGBA', r=red, g=green, b=blue, a=_FAINTEST + (1 - _FAINTEST) * share
-    )
 
 
 def ground_markers(
@@ -245,25 +225,21 @@ def ground_markers(
     """
     positions = np.asarray(joint_positions, dtype=np.float64)
     header = header_message(messages, content.stamp_ns, content.frame_id)
-    plane = content.plane
-    floor = _deleted(messages, header, FLOOR)
-    if plane is not None:
-        floor = _floor(messages, header, plane, positions.mean(0))
-    contacts = _deleted(messages, header, CONTACTS)
+    floor, contacts = removed_ground(messages, content.stamp_ns, content.frame_id)
+    if content.plane is not None:
+        floor = _floor(messages, header, content.plane, positions.mean(0))
     points, shares = _standing(content, positions, joint_names)
     if points:
-        size = messages.create('geometry_msgs/msg/Vector3', x=_SPHERE, y=_SPHERE, z=_SPHERE)
-        contacts = messages.create(
-            'visualization_msgs/msg/Marker',
-            header=header,
+        contacts = _marker(
+            messages,
+            header,
             ns=CONTACTS,
             type=_SPHERE_LIST,
             action=_ADD,
-            pose=messages.create('geometry_msgs/msg/Pose'),
-            scale=size,
-            color=_colour(messages, *_CONTACT_COLOUR, 1.0),
+            scale=_size(messages, _SPHERE),
+            color=_colour(messages, _CONTACT_COLOUR, 1.0),
             points=messages.points(np.array(points)),
-            colors=[_colour(messages, *_CONTACT_COLOUR, share) for share in shares],
+            colors=[_colour(messages, _CONTACT_COLOUR, share) for share in shares],
         )
     return [floor, contacts]
 
@@ -271,7 +247,7 @@ def ground_markers(
 def removed_ground(messages: MessageFactory, stamp_ns: int, frame_id: str) -> list[Any]:
     """visualization_msgs/Marker that delete those of `ground_markers`."""
     header = header_message(messages, stamp_ns, frame_id)
-    return [_deleted(messages, header, name) for name in (FLOOR, CONTACTS)]
+    return [_marker(messages, header, ns=name, action=_DELETE) for name in (FLOOR, CONTACTS)]
 
 
 def _standing(
@@ -298,9 +274,9 @@ def _floor(messages: MessageFactory, header: Any, plane: Array, over: Array) -> 
     x /= np.linalg.norm(x)
     rotation = np.stack([x, np.cross(up, x), up], axis=1)
     place = over - (over @ up + height + _THICK / 2) * up
-    return messages.create(
-        'visualization_msgs/msg/Marker',
-        header=header,
+    return _marker(
+        messages,
+        header,
         ns=FLOOR,
         type=_CUBE,
         action=_ADD,
@@ -310,15 +286,6 @@ def _floor(messages: MessageFactory, header: Any, plane: Array, over: Array) -> 
     )
 
 
-def _deleted(messages: MessageFactory, header: Any, namespace: str) -> Any:
-    return messages.create(
-        'visualization_msgs/msg/Marker',
-        header=header,
-        ns=namespace,
-        action=_DELETE,
-        pose=messages.create('geometry_msgs/msg/Pose'),
-    )
-
-
-def _colour(messages: MessageFactory, r: float, g: float, b: float, a: float) -> Any:
-    return messages.create('std_msgs/msg/ColorRGBA', r=r, g=g, b=b, a=a)
+def _colour(messages: MessageFactory, colour: tuple[float, float, float], alpha: float) -> Any:
+    r, g, b = colour
+    return messages.create('std_msgs/msg/ColorRGBA', r=r, g=g, b=b, a=alpha)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from enum import IntEnum
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Constant = TypeVar('Constant', bound=IntEnum)
 
 # Weights sum to 1 up to this.
 WEIGHT_TOLERANCE = 1e-6
@@ -42,6 +44,20 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
     return array.reshape(shape)
 
 
+def complete_mixture(record: Any, what: str) -> None:
+    """Makes names tuples, and identities numbers, in a frozen dataclass about a mixture.
+
+    Raises:
+        MessageError: a name that is there twice, a segment length that is not finite, another
+            number of identities than of weights.
+    """
+    for name in ('dof_names', 'joint_names'):
+        object.__setattr__(record, name, names_of(getattr(record, name), f'{what}: {name}'))
+    check_lengths(record.segment_lengths, what)
+    identities = identities_of(record.identities, len(record.weights), what)
+    object.__setattr__(record, 'identities', identities)
+
+
 def freeze_arrays(
     record: Any, shapes: Mapping[str, tuple[int, ...]], what: str, optional: Sequence[str] = ()
 ) -> None:
@@ -70,17 +86,32 @@ def check_finite(values: Array, what: str) -> None:
         raise MessageError(f'{what} has values that are not finite', 'not finite')
 
 
-def identities_of(values: NDArray[Any], count: int, what: str) -> NDArray[np.uint32]:
-    """Identities (count,) of components, read-only.
+def identities_of(values: NDArray[Any] | None, count: int, what: str) -> NDArray[np.uint32]:
+    """Identities (count,) of components, read-only; None: all 0.
 
     Raises:
         MessageError: another number of them.
     """
-    result = np.array(values, dtype=np.uint32)
+    result = np.array(np.zeros(count) if values is None else values, dtype=np.uint32)
     if result.shape != (count,):
         raise MessageError(f'{what}: identities has shape {result.shape}, wanted {(count,)}')
     result.setflags(write=False)
     return result
+
+
+def constant_of(kind: type[Constant], value: Any, fault: str) -> Constant:
+    """The constant of a message that a value is.
+
+    Args:
+        fault: text of the error.
+
+    Raises:
+        MessageError: none has the value.
+    """
+    try:
+        return kind(int(value))
+    except ValueError:
+        raise MessageError(fault) from None
 
 
 def check_weights(weights: Array, what: str) -> None:

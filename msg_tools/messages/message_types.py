@@ -14,7 +14,7 @@ from __future__ import annotations
 import array
 import re
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -39,14 +39,17 @@ _NO_FIELDS = 'uint8 structure_needs_at_least_one_member'
 def typestore() -> Typestore:
     """All types that the project reads and writes; the same object every time."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    types: Typesdict = {}
-    folder = resources.files('msg_tools') / 'hmt_msgs' / 'msg'
-    for file in sorted(folder.iterdir(), key=lambda file: file.name):
-        if file.name.endswith('.msg'):
-            name = f'hmt_msgs/msg/{file.name.removesuffix(".msg")}'
-            types.update(get_types_from_msg(file.read_text('utf-8'), name))
-    store.register(types)
+    with resources.as_file(resources.files('msg_tools') / 'hmt_msgs' / 'msg') as folder:
+        store.register(_types_in('hmt_msgs', folder))
     return store
+
+
+def _types_in(package: str, folder: Path) -> Typesdict:
+    """The types of the .msg files in a folder."""
+    types: Typesdict = {}
+    for file in sorted(folder.glob('*.msg')):
+        types.update(get_types_from_msg(file.read_text('utf-8'), f'{package}/msg/{file.stem}'))
+    return types
 
 
 def register_definitions(package: str, folder: Path) -> None:
@@ -55,11 +58,8 @@ def register_definitions(package: str, folder: Path) -> None:
     Raises:
         ValueError: a file that can not be understood.
     """
-    types: Typesdict = {}
     try:
-        for file in sorted(folder.glob('*.msg')):
-            types.update(get_types_from_msg(file.read_text('utf-8'), f'{package}/msg/{file.stem}'))
-        store = typestore()
+        types, store = _types_in(package, folder), typestore()
         store.register({name: x for name, x in types.items() if name not in store.fielddefs})
     except Exception as error:
         # The parser meets any text here, and does not say what it may raise.
@@ -254,22 +254,23 @@ _ZEROS: dict[str, Callable[[], Any]] = {
 def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
     """For each field the maker of its default, and the dtype where it is an array of numbers."""
     result: dict[str, tuple[Callable[[], Any], str | None]] = {}
-    for name, description in typestore().fielddefs[msgtype][1]:
-        kind, detail = description
+    fields: Any = typestore().fielddefs[msgtype][1]
+    for name, (kind, detail) in fields:
         if kind == Nodetype.NAME:
-            result[name] = _message_default(str(detail)), None
+            result[name] = partial(RosbagsMessages().create, str(detail)), None
         elif kind == Nodetype.BASE:
             result[name] = _ZEROS.get(str(detail[0]), int), None
         else:
-            element_kind, element, length = _element(detail)
-            count = length if kind == Nodetype.ARRAY else 0
+            (element_kind, element), length = detail
+            count = int(length) if kind == Nodetype.ARRAY else 0
             if element_kind == Nodetype.NAME:
-                result[name] = _list_default(_message_default(str(element)), count), None
+                make = partial(RosbagsMessages().create, str(element))
+                result[name] = _list_default(make, count), None
             elif element[0] == 'string':
                 result[name] = _list_default(str, count), None
             else:
                 dtype = {'char': 'uint8', 'byte': 'uint8'}.get(element[0], element[0])
-                result[name] = _array_default(count, dtype), dtype
+                result[name] = partial(np.zeros, count, dtype), dtype
     if msgtype == 'geometry_msgs/msg/Quaternion':
         result['w'] = (lambda: 1.0), None
     return result
@@ -284,19 +285,5 @@ def _plain_class(msgtype: str) -> tuple[type, int] | None:
     return typestore().types[msgtype], len(defaults)
 
 
-def _element(detail: Any) -> tuple[Any, Any, int]:
-    """Kind and type of the elements of an array, and its length."""
-    (kind, element), length = detail
-    return kind, element, int(length)
-
-
-def _message_default(msgtype: str) -> Callable[[], Any]:
-    return lambda: RosbagsMessages().create(msgtype)
-
-
 def _list_default(element: Callable[[], Any], count: int) -> Callable[[], list[Any]]:
     return lambda: [element() for _ in range(count)]
-
-
-def _array_default(count: int, dtype: str) -> Callable[[], NDArray[Any]]:
-    return lambda: np.zeros(count, dtype=dtype)

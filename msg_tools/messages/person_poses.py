@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hmt_ros.body import Body
@@ -23,11 +22,9 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_rotation_dofs
 from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_error import MessageError, check_finite
+from msg_tools.messages.message_error import Array, MessageError, check_finite
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.states import pose_message, quaternions
-
-Array = NDArray[np.float64]
 
 PERSON_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 

@@ -20,24 +20,23 @@ from hmt_ros.body.mirror import relevelled
 from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import (
+    Array,
     MessageError,
     array_of_all,
     check_covariances,
     check_finite,
-    check_lengths,
     check_names,
     check_weights,
+    complete_mixture,
+    constant_of,
     flat,
     freeze_arrays,
-    identities_of,
     lengths_of,
     named_numbers,
     names_of,
     numbers,
 )
 from msg_tools.messages.message_types import MessageFactory
-
-Array = NDArray[np.float64]
 
 POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 # No node publishes more components; a message with millions would block its reader.
@@ -137,9 +136,7 @@ class PoseMixture:
     reason: str = ''
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
-        object.__setattr__(self, 'joint_names', names_of(self.joint_names, 'mixture: joint_names'))
-        check_lengths(self.segment_lengths, 'mixture')
+        complete_mixture(self, 'mixture')
         components, d, joints = len(self.weights), len(self.dof_names), len(self.joint_names)
         shapes = {
             'weights': (components,),
@@ -157,8 +154,6 @@ class PoseMixture:
             object.__setattr__(self, 'log_likelihoods', np.full(components, np.nan))
         if self.degrees_of_freedom is None:
             object.__setattr__(self, 'degrees_of_freedom', np.zeros(components))
-        identities = np.zeros(components) if self.identities is None else self.identities
-        object.__setattr__(self, 'identities', identities_of(identities, components, 'mixture'))
         freeze_arrays(
             self, shapes, 'mixture', optional=('covariances', 'shape_covariance', *OF_JOINTS)
         )
@@ -168,24 +163,19 @@ class PoseMixture:
                 check_finite(values, f'mixture: {name}')
         if components:
             check_weights(self.weights, 'mixture')
-        existence = self.existence_probability
-        if not (math.isnan(existence) or 0.0 <= existence <= 1.0):
-            raise MessageError(
-                f'mixture: existence_probability must lie in [0, 1] or be NaN, saw {existence}'
-            )
         for cue, probability in self.cue_probabilities.items():
             if not 0.0 <= probability <= 1.0:
                 raise MessageError(
                     f'mixture: cue_probabilities of {cue!r} must lie in [0, 1], saw {probability}'
                 )
-        if not (math.isnan(self.error_share) or 0.0 < self.error_share <= 1.0):
-            raise MessageError(
-                f'mixture: error_share must lie in (0, 1] or be NaN, saw {self.error_share}'
-            )
-        if not (math.isnan(self.error_time) or 0.0 <= self.error_time < math.inf):
-            raise MessageError(
-                f'mixture: error_time must be 0 s or more, or NaN, saw {self.error_time}'
-            )
+        for name, known, wanted in (
+            ('existence_probability', 0.0 <= self.existence_probability <= 1.0, 'lie in [0, 1] or'),
+            ('error_share', 0.0 < self.error_share <= 1.0, 'lie in (0, 1] or'),
+            ('error_time', 0.0 <= self.error_time < math.inf, 'be 0 s or more, or'),
+        ):
+            if not (known or math.isnan(getattr(self, name))):
+                value = getattr(self, name)
+                raise MessageError(f'mixture: {name} must {wanted} be NaN, saw {value}')
         if self.covariances is not None:
             check_covariances(self.covariances, 'mixture')
         if self.shape_covariance is not None:
@@ -384,14 +374,9 @@ def pose_mixture_of(
         if len(points) != len(joints):
             raise MessageError(f'{what} has {len(points)} joint_positions, wanted {len(joints)}')
         positions.append([(point.x, point.y, point.z) for point in points])
-    try:
-        kind = MixtureKind(int(message.kind))
-    except ValueError:
-        raise MessageError(f'mixture has the kind {message.kind}, which is not known') from None
-    try:
-        state = TrackState(int(message.state))
-    except ValueError:
-        raise MessageError(f'mixture has the state {message.state}, which is not known') from None
+    state = constant_of(
+        TrackState, message.state, f'mixture has the state {message.state}, which is not known'
+    )
     return PoseMixture(
         weights=np.array([component.weight for component in components]),
         means=np.reshape(means, (n, d)),
@@ -400,7 +385,9 @@ def pose_mixture_of(
         dof_names=names,
         joint_names=joints,
         joint_positions=np.reshape(positions, (n, len(joints), 3)),
-        kind=kind,
+        kind=constant_of(
+            MixtureKind, message.kind, f'mixture has the kind {message.kind}, which is not known'
+        ),
         stamp_ns=time_ns(message.header.stamp),
         frame_id=str(message.header.frame_id),
         segment_lengths=lengths_of(message, 'mixture'),

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from msg_tools.messages.headers import SECOND_NS, header_message
-from msg_tools.messages.message_error import MessageError
+from msg_tools.messages.message_error import Array, MessageError
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.pose_mixtures import PoseMixture
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
@@ -95,9 +95,6 @@ def joint_trajectory(
         joint_names=list(content.dof_names),
         points=points,
     )
-
-
-Array = NDArray[np.float64]
 
 
 def quaternions(rotations: ArrayLike) -> Array:

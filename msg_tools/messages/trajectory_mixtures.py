@@ -11,23 +11,21 @@ from numpy.typing import NDArray
 
 from msg_tools.messages.headers import EARLIEST_NS, header_message, time_message, time_ns
 from msg_tools.messages.message_error import (
+    Array,
     MessageError,
     array_of_all,
     check_covariances,
     check_finite,
-    check_lengths,
     check_names,
     check_weights,
+    complete_mixture,
     flat,
     freeze_arrays,
-    identities_of,
     lengths_of,
     names_of,
     numbers,
 )
 from msg_tools.messages.message_types import MessageFactory
-
-Array = NDArray[np.float64]
 
 TRAJECTORY_MIXTURE = 'hmt_msgs/msg/TrajectoryMixture'
 
@@ -76,15 +74,10 @@ class TrajectoryMixture:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'stamps_ns', tuple(int(stamp) for stamp in self.stamps_ns))
-        object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'trajectories: dof_names'))
-        joints = names_of(self.joint_names, 'trajectories: joint_names')
-        object.__setattr__(self, 'joint_names', joints)
-        check_lengths(self.segment_lengths, 'trajectories')
+        complete_mixture(self, 'trajectories')
         m, t, d = len(self.weights), len(self.stamps_ns), len(self.dof_names)
         if m == 0 or t == 0:
             raise MessageError(f'trajectories: {m} components of {t} poses, wanted one at least')
-        identities = np.zeros(m) if self.identities is None else self.identities
-        object.__setattr__(self, 'identities', identities_of(identities, m, 'trajectories'))
         shapes: dict[str, tuple[int, ...]] = {
             'weights': (m,),
             'means': (m, t, d),
@@ -92,7 +85,7 @@ class TrajectoryMixture:
             'log_joint': (m,),
             'inflation': (m,),
             'free_energy': (len(self.free_energy),),
-            'joint_positions': (m, t, len(joints), 3),
+            'joint_positions': (m, t, len(self.joint_names), 3),
         }
         optional = ('marginal_covariances', 'joint_positions')
         freeze_arrays(self, shapes, 'trajectories', optional=optional)

@@ -14,16 +14,15 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
+from collections import Counter
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.skeleton import Skeleton
-from msg_tools.messages.message_error import MessageError
-
-Array = NDArray[np.float64]
+from msg_tools.messages.message_error import Array, MessageError
 
 # URDF wants limits with every joint that has a range; these stand for none.
 _UNLIMITED = 1000.0
@@ -52,11 +51,10 @@ def body_urdf(
         _add_segment(robot, joints, skeleton, index, above, rod_radius, link_prefix)
     robot.extend(joints)
     for kind in ('link', 'joint'):
-        seen: set[str] = set()
-        for element in robot.iter(kind):
-            if element.attrib['name'] in seen:
-                raise MessageError(f'urdf: the {kind} {element.attrib["name"]!r} is there twice')
-            seen.add(element.attrib['name'])
+        names = Counter(element.attrib['name'] for element in robot.iter(kind))
+        ((name, count),) = names.most_common(1)
+        if count > 1:
+            raise MessageError(f'urdf: the {kind} {name!r} is there twice')
     ET.indent(robot)
     return ET.tostring(robot, encoding='unicode', xml_declaration=False) + '\n'
 

@@ -101,7 +101,7 @@ def test_commands_end_quietly_when_nobody_reads_on():
 
 @pytest.mark.parametrize(
     'command',
-    [('hmt_ros', '--help'), ('hmt_ros.app.demo', '--help'), ('benchmarks', '--help')],
+    [('hmt_ros', '--help'), ('tools.demonstration.demo', '--help'), ('benchmarks', '--help')],
 )
 def test_help_ends_quietly_when_nobody_reads_it(command):
     """What is printed waits in a buffer until the command ends."""

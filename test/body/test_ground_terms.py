@@ -26,6 +26,7 @@ from hmt_ros.body.ground_terms import (
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_angles, root_rotations
 from hmt_ros.inference.energy import Derivatives
+from test.oracles.single_terms import energy_of
 
 TERMS = ('upright', 'floor')
 UP = np.array([0.1, -0.95, -0.25]) / np.linalg.norm([0.1, -0.95, -0.25])
@@ -71,14 +72,14 @@ def level_plane(body, pose: np.ndarray) -> FloorPlane:
 
 @pytest.mark.parametrize('name', TERMS)
 def test_derivatives_are_those_of_finite_differences(name, body, poses):
-    term, rows = GroundTerm(body, only(name), PLANE), np.arange(len(poses))
+    term = GroundTerm(body, only(name), PLANE)
 
     def value(x: np.ndarray) -> np.ndarray:
-        found = term.energy(forward(body.skeleton, x), rows, derivatives=Derivatives.NONE)
+        found = energy_of(term, body, x, derivatives=Derivatives.NONE)
         assert found.gradient is None
         return found.value
 
-    energy = term.energy(forward(body.skeleton, poses), rows)
+    energy = energy_of(term, body, poses)
     assert energy.value == pytest.approx(value(poses))
     assert (energy.value > 0.1).sum() >= len(poses) // 2
     step, numeric = 1e-6, np.empty_like(poses)
@@ -97,20 +98,20 @@ def test_a_camera_that_turns_with_the_vertical_changes_nothing(name, body, poses
     turned[:, :3] = poses[:, :3] @ turn.T
     which = body.skeleton.dof_index(('root_z', 'root_y', 'root_x'))
     turned[:, which] = root_angles(body, turn @ root_rotations(body, poses))
-    rows = np.arange(len(poses))
     before = GroundTerm(body, only(name), PLANE)
     after = GroundTerm(body, only(name), replace(PLANE, up=turn @ UP))
-    assert after.energy(forward(body.skeleton, turned), rows).value == pytest.approx(
-        before.energy(forward(body.skeleton, poses), rows).value
+    assert energy_of(after, body, turned).value == pytest.approx(
+        energy_of(before, body, poses).value
     )
 
 
 def test_who_stands_on_both_feet_costs_nothing_but_the_lean(body, standing):
-    term = GroundTerm(body, GroundSettings(), level_plane(body, standing))
-    parts = term.parts(forward(body.skeleton, standing))
-    assert list(parts) == list(TERMS)
-    assert parts['upright'] > 0
-    assert parts['floor'] == pytest.approx(0.0, abs=1e-9)
+    plane = level_plane(body, standing)
+    upright, floor = (energy_of(GroundTerm(body, only(x), plane), body, standing) for x in TERMS)
+    both = energy_of(GroundTerm(body, GroundSettings(), plane), body, standing)
+    assert upright.value > 0
+    assert floor.value == pytest.approx(0.0, abs=1e-9)
+    assert both.value == pytest.approx(upright.value + floor.value)
 
 
 @pytest.mark.parametrize('name', ['human32', 'human34', 'human37'])
@@ -132,7 +133,7 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
         frames = forward(skeleton, poses)
         axis = frames.joints()[neck] - frames.origins[trunk]
         # The person at rest faces the camera: forwards is -z.
-        cost = term.energy(frames, np.zeros(len(poses), dtype=np.intp)).value
+        cost = energy_of(term, body, poses).value
         return cost, np.arctan2(-axis[2], -axis[1])
 
     # Two degrees apart over all leans, then ever closer around the best.
@@ -153,13 +154,13 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
 
 
 def test_feet_below_the_floor_cost_and_feet_above_it_do_not(body, standing):
-    plane, rows = level_plane(body, standing), np.zeros(1, dtype=np.intp)
-    frames = forward(body.skeleton, standing)
+    plane = level_plane(body, standing)
+
+    def cost(plane: FloorPlane) -> float:
+        return energy_of(GroundTerm(body, only('floor'), plane), body, standing).value[0]
+
     costs = [
-        GroundTerm(body, only('floor'), replace(plane, height=plane.height - sunk))
-        .energy(frames, rows)
-        .value[0]
-        for sunk in (-0.5, 0.0, 0.02, 0.04, 0.4)
+        cost(replace(plane, height=plane.height - sunk)) for sunk in (-0.5, 0.0, 0.02, 0.04, 0.4)
     ]
     assert costs[0] == 0.0
     assert costs[1] == pytest.approx(0.0, abs=1e-6)
@@ -167,7 +168,7 @@ def test_feet_below_the_floor_cost_and_feet_above_it_do_not(body, standing):
     # Without a known floor nothing is below it, nor where only the feet of the track tell of it.
     sunk = replace(plane, height=plane.height - 0.1)
     for other in (replace(sunk, height=None), replace(sunk, measured=False)):
-        assert GroundTerm(body, only('floor'), other).energy(frames, rows).value[0] == 0.0
+        assert cost(other) == 0.0
 
 
 def test_masses_are_those_of_the_table(body):
@@ -192,7 +193,7 @@ def test_soles_are_the_lowest_points_of_the_feet(body):
     assert feet.local[:2, 1] == pytest.approx(foot[:, 1].min(), abs=0.01)  # y up, flat foot
     heel, toe = feet.local[:2, 2]
     assert heel > 0 > toe  # along -z from ankle to toe
-    wide = body.with_widths([2.0] * len(body.shapes))
+    wide = body.with_growth(np.tile(np.log([2.0, 2.0, 1.0, 1.0, 1.0]), (len(body.shapes), 1)))
     assert (soles(wide).local[:, 1] < feet.local[:, 1] - 0.02).all()
 
 

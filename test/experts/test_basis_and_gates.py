@@ -73,7 +73,8 @@ def test_common_scale_keeps_the_ratio_of_distances(rng):
 def softmax_problem(rng, samples=80, experts=3, count=4):
     features = rng.normal(size=(samples, count))
     h = rng.dirichlet(np.ones(experts), samples)
-    return _Softmax(features, h, rng.uniform(0.5, 2.0, samples)), (experts, count)
+    weights = rng.uniform(0.5, 2.0, samples)
+    return _Softmax(features, h * weights[:, None], weights), (experts, count)
 
 
 def test_softmax_curvature_is_the_hessian(rng):
@@ -129,7 +130,8 @@ def test_softmax_gates_climb_and_prune(scaling, rng):
     inputs = rng.normal(size=(300, P)) * scaling.scale + scaling.centre
     z = (inputs - scaling.centre) / scaling.scale
     h = np.exp(log_softmax(np.c_[4.0 * z[:, 0], -4.0 * z[:, 0]]))
-    gates = SoftmaxGates.flat(RadialBasis(scaling, rng.normal(size=(30, P)), 2.0), 2)
+    basis = RadialBasis(scaling, rng.normal(size=(30, P)), 2.0)
+    gates = SoftmaxGates(basis, np.zeros((2, 31)), np.full(31, 0.1), -np.inf)
     features = gates.features(inputs)
     values = []
     for _ in range(30):

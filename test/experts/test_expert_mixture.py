@@ -1,15 +1,11 @@
 """The mixtures of experts as models: likelihood, bound, oracles, files, bad input."""
 
-import warnings
-
 import numpy as np
 import pytest
-from scipy.special import logsumexp
-from scipy.stats import chi2, multivariate_normal
+from scipy.stats import chi2
 
 from hmt_ros.experts import ConditionalExperts, JointExperts, RelevanceVectorRegression
-from hmt_ros.inference import GaussianMixture
-from test.oracles.branching import styles, true_log_density
+from test.oracles.branching import true_log_density
 
 MODELS = [
     ConditionalExperts(3, n_starts=2),
@@ -126,75 +122,6 @@ def test_support_vanishes_far_from_the_data(learned, branch_pairs):
         assert far < 1e-6
 
 
-# ---- the joint model with linear experts is the conditional of a Gaussian mixture
-
-
-def conditional_of(mixture, inputs, targets):
-    """log p(x | r) of a Gaussian mixture over (r, x), by Schur complements."""
-    p = inputs.shape[1]
-    joint, marginal = [], []
-    for w, m, s in zip(mixture.weights, mixture.means, mixture.covariances, strict=True):
-        gain = s[p:, :p] @ np.linalg.inv(s[:p, :p])
-        noise = s[p:, p:] - gain @ s[:p, p:]
-        log = np.log(w) + multivariate_normal(m[:p], s[:p, :p]).logpdf(inputs)
-        residual = targets - m[p:] - (inputs - m[:p]) @ gain.T
-        joint.append(log + multivariate_normal(np.zeros(len(noise)), noise).logpdf(residual))
-        marginal.append(log)
-    return logsumexp(joint, axis=0) - logsumexp(marginal, axis=0)
-
-
-def gaussian_mixture_step(points, responsibilities):
-    """One M-step of a Gaussian mixture with full covariances."""
-    total = responsibilities.sum(0)
-    means = responsibilities.T @ points / total[:, None]
-    covariances = [
-        (points - m).T @ (h[:, None] * (points - m)) / t
-        for m, h, t in zip(means, responsibilities.T, total, strict=True)
-    ]
-    return GaussianMixture(total / total.sum(), means, covariances)
-
-
-def test_linear_joint_experts_are_the_conditional_of_a_gaussian_mixture(branch_pairs):
-    inputs, targets = branch_pairs
-    points = np.hstack(branch_pairs)
-    h = np.random.default_rng(0).dirichlet(np.ones(3), len(points))
-    model = JointExperts(
-        3, 'linear', learning='maximum_likelihood', tolerance=0.0, max_iterations=20
-    ).fit(inputs, targets, responsibilities=h)
-    mixture = gaussian_mixture_step(points, h)
-    for _ in range(len(model.bound_) - 1):
-        log = mixture.component_log_densities(points) + np.log(mixture.weights)
-        mixture = gaussian_mixture_step(points, np.exp(log - logsumexp(log, 1, keepdims=True)))
-    np.testing.assert_allclose(
-        model.log_density(inputs, targets), conditional_of(mixture, inputs, targets), atol=1e-8
-    )
-
-
-def test_linear_joint_experts_are_those_of_scikit_learn():
-    """Both go on from the first iteration of scikit-learn, equally many iterations."""
-    mixture = pytest.importorskip('sklearn.mixture', reason='scikit-learn is not installed')
-    for seed in range(2):
-        inputs, targets = styles(400, seed, inputs=4, outputs=3)
-        points = np.hstack([inputs, targets])
-        peer = mixture.GaussianMixture(
-            3, reg_covar=0.0, tol=0.0, max_iter=1, random_state=seed, warm_start=True
-        )
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore')
-            peer.fit(points)
-            start = peer.predict_proba(points)
-            peer.set_params(max_iter=31).fit(points)
-        model = JointExperts(
-            3, 'linear', learning='maximum_likelihood', tolerance=-1.0, max_iterations=30
-        ).fit(inputs, targets, responsibilities=start)
-        joint = GaussianMixture(peer.weights_, peer.means_, peer.covariances_)
-        marginal = GaussianMixture(
-            peer.weights_, peer.means_[:, :4], np.ascontiguousarray(peer.covariances_[:, :4, :4])
-        )
-        expected = joint.log_density(points) - marginal.log_density(inputs)
-        assert np.abs(model.log_density(inputs, targets) - expected).max() < 1e-8
-
-
 # ---- hard cases
 
 
@@ -260,7 +187,6 @@ def test_fewer_samples_than_experts_are_named():
         ({'scaling': 'no'}, "scaling is 'no'"),
         ({'n_experts': 0}, 'n_experts is 0'),
         ({'width': 0.0}, 'width is 0.0'),
-        ({'learning': 'maximum_likelihood'}, "wanted basis='linear'"),
     ],
 )
 def test_bad_parameters_are_named(parameters, message, branch_pairs):

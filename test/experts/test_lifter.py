@@ -229,10 +229,10 @@ def test_history_follows_a_camera_that_turns(lifter):
     turn = ray_rotations(np.array([[0.1, 0.05, 1.0]]))[0]
     history = KeypointHistory(CAMERA)
     history.add(detected(poses)[0], 0.0)
-    before = history._rays[0].copy()
+    before = history._seen[0][1].copy()
     history.carry(turn)
     ray = np.append(before[5], 1.0) @ turn.T
-    np.testing.assert_allclose(history._rays[0][5], ray[:2] / ray[2])
+    np.testing.assert_allclose(history._seen[0][1][5], ray[:2] / ray[2])
 
 
 def test_too_few_keypoints_are_nobody(lifter):

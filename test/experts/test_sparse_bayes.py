@@ -10,7 +10,6 @@ from hmt_ros.experts.sparse_bayes import (
     WeightedSums,
     _GreedyState,
     maximise_evidence,
-    maximum_likelihood,
     posterior,
     with_best_noise,
 )
@@ -182,23 +181,6 @@ def test_climbs_monotonously_from_any_start(problem, prior):
         found = maximise_evidence(sums, prior, found, rounds=1, steps=1)
         values.append(found.evidence)
     assert np.diff(values).min() > -1e-9
-
-
-def test_maximum_likelihood_is_least_squares(problem):
-    features, targets, weights = problem
-    found = maximum_likelihood(WeightedSums.of(features[:, :4], targets, weights))
-    root = np.sqrt(weights)[:, None]
-    expected = np.linalg.lstsq(root * features[:, :4], root * targets, rcond=None)[0]
-    np.testing.assert_allclose(found.weights, expected, atol=1e-10)
-    residual = root * (targets - features[:, :4] @ expected)
-    np.testing.assert_allclose(found.noise, residual.T @ residual / weights.sum(), atol=1e-10)
-    assert (found.spread(features) == 0).all()
-
-
-def test_maximum_likelihood_names_what_it_cannot_solve(problem):
-    features, targets, weights = problem
-    with pytest.raises(ValueError, match='use fewer experts'):
-        maximum_likelihood(WeightedSums.of(features[:3], targets[:3], weights[:3]))
 
 
 def test_prediction_covers_what_it_should():

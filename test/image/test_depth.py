@@ -17,7 +17,6 @@ from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
 from hmt_ros.image.terms.depth import (
     ASIDE,
     DEPTH,
-    FEWEST,
     FURTHEST,
     JUMP,
     LEAST_COSINE,
@@ -25,7 +24,9 @@ from hmt_ros.image.terms.depth import (
     usable_depths,
 )
 from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.residuals import FEWEST
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
+from test.oracles.single_terms import image_energy
 
 ALONE = LikelihoodSettings.of_terms(depth=DEPTH.settings)
 
@@ -49,10 +50,6 @@ def likelihood(shot):
 
 def seen(shot, depth, **more):
     return observe(shot.images[1], shot.masks[1], depth=depth, **more)
-
-
-def energies(likelihood, poses, observation, **more):
-    return likelihood.energies(forward(likelihood.body.skeleton, poses), observation, **more)
 
 
 # A plain numpy twin, one pose and one point at a time.
@@ -142,10 +139,10 @@ def test_the_kernel_equals_numpy(shot, sensed, distortion):
     camera = Camera(c.fx, c.fy, c.cx, c.cy, c.width, c.height, distortion)
     likelihood = ImageLikelihood(shot.body, camera, ALONE)
     poses = np.concatenate([shot.near(5, 1), shot.near(3, 2, spread=0.5)])
-    found = energies(likelihood, poses, seen(shot, sensed)).value
+    found = image_energy(likelihood, poses, seen(shot, sensed)).value
     # Beyond the window that evidence is taken from nothing is known.
     whole = observe(shot.images[1], depth=sensed)
-    found = energies(likelihood, poses, whole).value
+    found = image_energy(likelihood, poses, whole).value
     depth = usable_depths(sensed)
     wanted = [oracle_energy(shot.body, camera, DEPTH.settings, depth, pose) for pose in poses]
     assert np.allclose(found, wanted, rtol=1e-9)
@@ -156,7 +153,7 @@ def test_gradient_at_material_points(shot, sensed, likelihood):
     """The gradient is that of points which stay on the skin, with their deviations."""
     poses, step = shot.near(2, 7), 1e-6
     depth = usable_depths(sensed)
-    found = energies(likelihood, poses, observe(shot.images[1], depth=sensed)).gradient
+    found = image_energy(likelihood, poses, observe(shot.images[1], depth=sensed)).gradient
     for pose, gradient in zip(poses, found):
         held = oracle_points(shot.body, shot.camera, DEPTH.settings, depth, pose)
         wanted = np.empty(len(pose))
@@ -173,11 +170,11 @@ def test_gradient_at_material_points(shot, sensed, likelihood):
 def test_sliding_of_the_points_hardly_changes_the_gradient(shot, true_depth, likelihood):
     observation = observe(shot.images[1], depth=np.where(np.isfinite(true_depth), true_depth, 0))
     poses, step = shot.near(6, 9, spread=0.05), 1e-5
-    found = energies(likelihood, poses, observation).gradient
+    found = image_energy(likelihood, poses, observation).gradient
     wanted = np.empty_like(poses)
     for j in range(poses.shape[1]):
         shift = step * (np.arange(poses.shape[1]) == j)
-        up, down = (energies(likelihood, poses + s, observation).value for s in (shift, -shift))
+        up, down = (image_energy(likelihood, poses + s, observation).value for s in (shift, -shift))
         wanted[:, j] = (up - down) / (2 * step)
     cosine = (
         (found * wanted).sum(1) / np.linalg.norm(found, axis=1) / np.linalg.norm(wanted, axis=1)
@@ -186,7 +183,7 @@ def test_sliding_of_the_points_hardly_changes_the_gradient(shot, true_depth, lik
 
 
 def test_the_hessian_is_positive_semidefinite(shot, sensed, likelihood):
-    found = energies(likelihood, shot.near(6, 5, spread=0.3), seen(shot, sensed)).hessian
+    found = image_energy(likelihood, shot.near(6, 5, spread=0.3), seen(shot, sensed)).hessian
     assert np.allclose(found, found.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(found).min() > -1e-8 * np.abs(found).max()
 
@@ -198,7 +195,7 @@ def test_depth_tells_the_distance(shot, sensed, likelihood):
     shifts = np.linspace(-0.3, 0.3, 61)
     poses = shot.poses[1] * np.ones((61, 1))
     poses[:, :3] *= 1.0 + shifts[:, None] / poses[:, 2:3]
-    value = energies(likelihood, poses, seen(shot, sensed)).value
+    value = image_energy(likelihood, poses, seen(shot, sensed)).value
     assert abs(shifts[value.argmin()]) <= 0.01
     assert value[0] - value.min() > 20.0
     assert value[-1] - value.min() > 20.0
@@ -211,7 +208,7 @@ def test_the_noise_grows_with_the_square_of_the_distance(shot, true_depth):
         settings = replace(ALONE, depth=replace(DEPTH.settings, growth=growth))
         likelihood = ImageLikelihood(shot.body, shot.camera, settings)
         depth = np.where(np.isfinite(true_depth), true_depth + 0.05, 0.0)
-        costs.append(energies(likelihood, shot.poses[1:], seen(shot, depth)).value[0])
+        costs.append(image_energy(likelihood, shot.poses[1:], seen(shot, depth)).value[0])
     z = shot.poses[1, 2]
     assert costs[0] > costs[1] > costs[2]
     # At growth 0.02 the deviation is 0.2 m, which is all that counts; the rest is what is cut off.
@@ -222,7 +219,7 @@ def test_nothing_measured_says_nothing(shot, likelihood):
     for empty in (0.0, np.nan, -1.0, np.inf, 0.5 * NEAREST, 2 * FURTHEST):
         observation = seen(shot, np.full(shot.images[1].shape[:2], empty))
         assert 'depth' not in observation.evidence
-        assert list(energies(likelihood, shot.poses[1:], observation).terms) == ['nothing']
+        assert image_energy(likelihood, shot.poses[1:], observation).value == 0.0
 
 
 def test_holes_pull_nowhere(shot, sensed, likelihood):
@@ -231,10 +228,10 @@ def test_holes_pull_nowhere(shot, sensed, likelihood):
     column = int(shot.camera.project(shot.body.joint_positions(shot.poses[1:]))[0, :, 0].mean())
     half[:, :column] = np.nan
     with_holes = seen(shot, half)
-    assert np.isfinite(energies(likelihood, shot.near(8, 3), with_holes).gradient).all()
+    assert np.isfinite(image_energy(likelihood, shot.near(8, 3), with_holes).gradient).all()
     far = shot.poses[1:].copy()
     far[:, 0] -= 0.8
-    gradient = energies(likelihood, far, with_holes).gradient
+    gradient = image_energy(likelihood, far, with_holes).gradient
     assert np.abs(gradient).max() < 1e-9
 
 
@@ -242,10 +239,12 @@ def test_holes_pull_nowhere(shot, sensed, likelihood):
 def test_other_surfaces_cost_at_most_what_the_kernel_allows(shot, sensed, likelihood, other):
     """A pose that is hidden, or before an empty place, is not pulled there."""
     depth = np.full_like(sensed, other)
-    found = energies(likelihood, shot.poses[1:], seen(shot, depth))
+    found = image_energy(likelihood, shot.poses[1:], seen(shot, depth))
     most = 0.5 * DEPTH.settings.weight * DEPTH.settings.scale**2
     assert 0.9 * most < found.value[0] <= most
-    right = energies(likelihood, shot.poses[1:] + 0.05 * (np.arange(37) == 2), seen(shot, sensed))
+    right = image_energy(
+        likelihood, shot.poses[1:] + 0.05 * (np.arange(37) == 2), seen(shot, sensed)
+    )
     assert np.abs(found.gradient).max() < 0.05 * np.abs(right.gradient).max()
 
 
@@ -255,7 +254,7 @@ def test_an_occluder_before_the_legs_leaves_the_distance(shot, sensed, likelihoo
     shifts = np.linspace(-0.3, 0.3, 61)
     poses = shot.poses[1] * np.ones((61, 1))
     poses[:, :3] *= 1.0 + shifts[:, None] / poses[:, 2:3]
-    value = energies(likelihood, poses, seen(shot, depth)).value
+    value = image_energy(likelihood, poses, seen(shot, depth)).value
     assert abs(shifts[value.argmin()]) <= 0.02
 
 
@@ -270,7 +269,7 @@ def test_depth_tells_which_way_a_forearm_points(shot, true_depth, likelihood):
     away[names.index('left_shoulder_x')] = -0.6
     seen_depth = render(body, towards, camera, Scene(seed=1)).depth
     observation = observe(shot.images[1], depth=np.where(np.isfinite(seen_depth), seen_depth, 5.0))
-    value = energies(likelihood, np.stack([towards, away]), observation).value
+    value = image_energy(likelihood, np.stack([towards, away]), observation).value
     assert value[1] - value[0] > 5.0
 
 
@@ -281,8 +280,8 @@ def test_depth_tells_the_size(shot, true_depth):
     poses[:, :3] *= 0.92
     likelihood = ImageLikelihood(smaller, shot.camera, ALONE)
     observation = seen(shot, np.where(np.isfinite(true_depth), true_depth, 0.0))
-    same = energies(ImageLikelihood(shot.body, shot.camera, ALONE), shot.poses[1:], observation)
-    assert energies(likelihood, poses, observation).value[0] > same.value[0] + 50.0
+    same = image_energy(ImageLikelihood(shot.body, shot.camera, ALONE), shot.poses[1:], observation)
+    assert image_energy(likelihood, poses, observation).value[0] > same.value[0] + 50.0
     # The residuals reach the estimate of the shape, too.
     linear = ShapeEstimate(smaller).linearised(likelihood, observation, poses[:1])
     assert np.linalg.matrix_rank(linear.curvature[0]) > 10
@@ -292,7 +291,7 @@ def test_without_depth_nothing_changes(shot):
     poses = shot.near(6, 2)
     usual = ImageLikelihood(shot.body, shot.camera)
     off = replace(usual, settings=replace(usual.settings, depth=TermSettings(0.0, 1.0, 1.0)))
-    one, other = (energies(x, poses, seen(shot, None)) for x in (usual, off))
+    one, other = (image_energy(x, poses, seen(shot, None)) for x in (usual, off))
     assert np.array_equal(one.value, other.value)
     assert np.array_equal(one.hessian, other.hessian)
 

@@ -7,7 +7,6 @@ import pytest
 from scipy.special import logsumexp
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.kinematics import forward
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths, carrier_of
 from hmt_ros.image.terms.keypoints import (
@@ -17,6 +16,8 @@ from hmt_ros.image.terms.keypoints import (
     Keypoints,
     KeypointTerm,
 )
+from hmt_ros.inference.energy import Energy
+from test.oracles.single_terms import energy_of
 
 JOINTS = (
     'neck', 'head', 'left_shoulder', 'right_shoulder', 'left_elbow', 'right_elbow', 'left_wrist',
@@ -53,8 +54,11 @@ def term(poses: LiftedPoses, exchanges: np.ndarray | None) -> KeypointTerm:
 
 
 def energy(poses: LiftedPoses, x: np.ndarray, exchanges: np.ndarray | None) -> float:
-    frames = forward(BODY.skeleton, x[None])
-    return float(term(poses, exchanges).energy(frames, np.zeros(1, np.intp)).value[0])
+    return float(energies(poses, x, exchanges).value[0])
+
+
+def energies(poses: LiftedPoses, x: np.ndarray, exchanges: np.ndarray | None) -> Energy:
+    return energy_of(term(poses, exchanges), BODY, x, camera=CAMERA)
 
 
 def density(poses: LiftedPoses, x: np.ndarray) -> float:
@@ -99,8 +103,7 @@ def test_exchanged_sides_read_the_poses_the_other_way_round() -> None:
 @pytest.mark.parametrize('exchanges', [NOT_EXCHANGED, usual_exchanges()])
 def test_gradient(exchanges: np.ndarray) -> None:
     poses, x = lifted(), pose()
-    found = term(poses, exchanges).energy(forward(BODY.skeleton, x[None]), np.zeros(1, np.intp))
-    gradient, hessian = found.derivatives()
+    gradient, hessian = energies(poses, x, exchanges).derivatives()
     numeric = np.array(
         [
             (energy(poses, x + d, exchanges) - energy(poses, x - d, exchanges)) / (2 * STEP)
@@ -126,16 +129,10 @@ def test_hessian_of_one_component_is_that_of_squares() -> None:
         JOINTS, one.log_weights, relative[None], sure.deviations, one.axes,
         bone_lengths(BODY.skeleton, JOINTS),
     )  # fmt: skip
-    rows = np.zeros(1, np.intp)
-    hessian = (
-        term(at, NOT_EXCHANGED).energy(forward(BODY.skeleton, x[None]), rows).derivatives()[1][0]
-    )
+    hessian = energies(at, x, NOT_EXCHANGED).derivatives()[1][0]
     step, numeric = 1e-5, []
     for d in step * np.eye(len(x)):
-        up, down = (
-            term(at, NOT_EXCHANGED).energy(forward(BODY.skeleton, (x + s * d)[None]), rows)
-            for s in (1, -1)
-        )
+        up, down = (energies(at, x + s * d, NOT_EXCHANGED) for s in (1, -1))
         numeric.append((up.derivatives()[0][0] - down.derivatives()[0][0]) / (2 * step))
     assert np.allclose(hessian, numeric, atol=2e-3 * np.abs(hessian).max())
 

@@ -7,10 +7,11 @@ import pytest
 
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import directed_derivatives, forward
-from hmt_ros.body.pose_terms import AnglePrior
-from hmt_ros.body.self_intersection import self_intersection_energy
-from hmt_ros.image.likelihood import OFF, ImageLikelihood, LikelihoodSettings
+from hmt_ros.body.pose_prior import AnglePrior
+from hmt_ros.body.self_intersection import SelfIntersection
+from hmt_ros.image.likelihood import OFF, ImageLikelihood, LikelihoodSettings, ObservedImage
 from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
 from hmt_ros.image.terms.image_term import TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
@@ -18,6 +19,7 @@ from hmt_ros.image.terms.residuals import contour_sigma
 from hmt_ros.inference.energy import Derivatives
 from test.oracles import numpy_likelihood as oracle
 from test.oracles.numpy_contour import occluding_contour
+from test.oracles.single_terms import OneByOne, energy_of, image_energy
 
 IMAGE_TERMS = ('coverage', 'edges')
 MAGNIFICATION = 100.0  # px/m
@@ -53,11 +55,6 @@ def only(likelihood, *names):
     return replace(likelihood, settings=replace(likelihood.settings, **terms))
 
 
-def evaluate(likelihood, poses, observation, **more):
-    frames = forward(likelihood.body.skeleton, poses)
-    return likelihood.energies(frames, observation, **more)
-
-
 def relative_difference(found, wanted):
     """The largest, relative to the largest entry of each pose."""
     axes = tuple(range(1, found.ndim))
@@ -72,14 +69,13 @@ def largest_difference(body, camera, poses, observation):
     assert tuple(wanted) == IMAGE_TERMS
     differences = []
     for name, energy in wanted.items():
-        found = evaluate(only(likelihood, name), poses, observation)
-        assert list(found.terms) == [name]
+        found = image_energy(only(likelihood, name), poses, observation)
         differences += [
             relative_difference(found.value, energy.value),
             relative_difference(found.gradient, energy.gradient),
             relative_difference(found.hessian, energy.hessian),
         ]
-    together = evaluate(only(likelihood, *IMAGE_TERMS), poses, observation)
+    together = image_energy(only(likelihood, *IMAGE_TERMS), poses, observation)
     differences += [
         relative_difference(together.value, sum(e.value for e in wanted.values())),
         relative_difference(together.hessian, sum(e.hessian for e in wanted.values())),
@@ -163,7 +159,7 @@ def test_gradients_of_contour_terms_at_material_points(shot, observation, name):
             return oracle.coverage(held, observation.outline, term, sigma).value
         return oracle.edges(held, observation.evidence[name], term, sigma).value
 
-    found = likelihood.energies(frames, observation).gradient
+    found = image_energy(likelihood, poses, observation).gradient
     errors = relative_errors(found, numerical_gradient(value, poses))
     assert np.quantile(errors, 0.99) < 1e-6
     assert errors.max() < 1e-3
@@ -176,9 +172,9 @@ def test_sliding_of_the_contour_hardly_changes_the_gradient(shot, observation, n
     poses = shot.near(8, 8)
 
     def value(x):
-        return evaluate(likelihood, x, observation, derivatives=False).value
+        return image_energy(likelihood, x, observation, Derivatives.NONE).value
 
-    found = evaluate(likelihood, poses, observation).gradient
+    found = image_energy(likelihood, poses, observation).gradient
     wanted = numerical_gradient(value, poses)
     assert np.median(relative_errors(found, wanted)) < 2e-3
     cosine = (
@@ -189,10 +185,10 @@ def test_sliding_of_the_contour_hardly_changes_the_gradient(shot, observation, n
 
 
 def test_gradient_and_hessian_of_the_soft_prior(shot):
-    prior, rows = AnglePrior(shot.body).quadratic, np.arange(5)
+    prior = AnglePrior(shot.body)
     poses = shot.near(5, 10, spread=0.4)
-    value, gradient, hessian = prior.energy(poses, rows)
-    wanted = numerical_gradient(lambda x: prior.energy(x, rows).value, poses)
+    value, gradient, hessian = energy_of(prior, shot.body, poses)
+    wanted = numerical_gradient(lambda x: energy_of(prior, shot.body, x).value, poses)
     assert np.allclose(gradient, wanted, atol=1e-6)
     known = np.isfinite(shot.body.prior_sigma)
     offset = (poses - shot.body.prior_mean)[:, known] / shot.body.prior_sigma[known]
@@ -208,7 +204,7 @@ def test_self_intersection_falls_against_its_gradient(shot):
     poses = np.clip(poses, body.lower, body.upper)
 
     def energy(x):
-        return self_intersection_energy(body, forward(body.skeleton, x), sigma=0.03)
+        return energy_of(SelfIntersection(body, 0.03), body, x)
 
     value, gradient, hessian = energy(poses)
     touching = value > 0.01
@@ -254,7 +250,7 @@ def test_listed_residuals_sum_to_gradient_and_hessian(shot, observation, names):
             frames, listed[:, 0].astype(int), listed[:, 1:4], listed[:, 4:7],
             listed[:, 7], listed[:, 8],
         )  # fmt: skip
-        wanted = likelihood.energies(frames, observation)
+        wanted = image_energy(likelihood, frames.poses, observation)
         assert np.allclose(gradient, wanted.gradient[0], rtol=1e-9, atol=1e-9)
         assert np.allclose(hessian, wanted.hessian[0], rtol=1e-9, atol=1e-9)
 
@@ -285,7 +281,7 @@ def test_listed_residuals_of_keypoints_sum_to_gradient_and_hessian(shot):
         assert np.array_equal(recorded[1 : 1 + len(rows)], rows)
         segments = shot.body.skeleton.joint_segments[joints]
         gradient, hessian = summed(frames, segments, *found)
-        wanted = term.energy(frames, np.arange(1))
+        wanted = energy_of(term, shot.body, frames.poses, camera=shot.camera)
         assert np.allclose(gradient, wanted.gradient[0], rtol=1e-9, atol=1e-7)
         assert np.allclose(hessian, wanted.hessian[0], rtol=1e-9, atol=1e-7)
 
@@ -367,8 +363,7 @@ def test_the_number_of_threads_does_not_matter(shot, observation):
     results = []
     for count in (1, 2, 3):
         likelihood = ImageLikelihood(shot.body, shot.camera, threads=count)
-        found = evaluate(likelihood, poses, observation)
-        results.append((found.value, found.gradient, found.hessian, found.costs))
+        results.append(image_energy(likelihood, poses, observation))
     for other in results[1:]:
         assert all(np.array_equal(a, b) for a, b in zip(results[0], other))
 
@@ -376,9 +371,10 @@ def test_the_number_of_threads_does_not_matter(shot, observation):
 def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(shot, observation):
     poses = shot.near(9, 14)
     likelihood = ImageLikelihood(shot.body, shot.camera)
-    together = likelihood.given(observation).energy(poses)
+    terms = OneByOne(likelihood, (*likelihood.seen(observation), *likelihood.priors))
+    together = terms.energy(poses)
     for n in (0, 4, 8):
-        alone = likelihood.given(observation).energy(poses[n : n + 1])
+        alone = terms.energy(poses[n : n + 1])
         for a, b in zip(together, alone):
             assert relative_difference(a[n : n + 1], b) <= 1e-12
 
@@ -386,8 +382,8 @@ def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(shot, observation
 def test_values_without_derivatives_are_the_same(shot, observation):
     likelihood = ImageLikelihood(shot.body, shot.camera)
     poses = shot.near(5, 15)
-    full = evaluate(likelihood, poses, observation)
-    bare = evaluate(likelihood, poses, observation, derivatives=False)
+    full = image_energy(likelihood, poses, observation)
+    bare = image_energy(likelihood, poses, observation, Derivatives.NONE)
     assert bare.gradient is None
     assert np.array_equal(full.value, bare.value)
 
@@ -396,24 +392,21 @@ def test_terms_without_evidence_are_off(shot):
     likelihood = ImageLikelihood(shot.body, shot.camera)
     poses = shot.near(2, 16)
     image = shot.images[1]
-    assert set(evaluate(likelihood, poses, observe(image)).terms) == {'edges'}
     empty = observe(image, np.zeros(image.shape[:2], dtype=bool))
-    assert set(evaluate(likelihood, poses, empty).terms) == {'edges'}
     full = observe(image, shot.masks[1])
-    assert set(evaluate(likelihood, poses, full).terms) == set(IMAGE_TERMS)
-    frames = forward(shot.body.skeleton, poses)
-    nothing = likelihood.energies(frames, Observation())
+    for seen, on in ((observe(image), {'edges'}), (empty, {'edges'}), (full, set(IMAGE_TERMS))):
+        values = {x: image_energy(only(likelihood, x), poses, seen).value for x in IMAGE_TERMS}
+        assert {name for name, value in values.items() if value.any()} == on
+    nothing = image_energy(likelihood, poses, Observation())
     assert np.array_equal(nothing.value, np.zeros(2))
     assert not nothing.hessian.any()
 
 
 def test_the_truth_is_better_than_its_neighbours(shot, observation):
     likelihood = ImageLikelihood(shot.body, shot.camera)
-    near, truth = shot.near(40, 17, spread=0.15), shot.poses[1:]
-    frames = forward(shot.body.skeleton, np.concatenate([truth, near]))
-    found = likelihood.energies(frames, observation, derivatives=False)
-    terms = {name: found.terms[name] for name in IMAGE_TERMS}
-    terms['keypoints'] = keypoint_energy(shot, observation.keypoints, frames.poses).value
+    poses = np.concatenate([shot.poses[1:], shot.near(40, 17, spread=0.15)])
+    terms = {x: image_energy(only(likelihood, x), poses, observation).value for x in IMAGE_TERMS}
+    terms['keypoints'] = keypoint_energy(shot, observation.keypoints, poses).value
     for name, value in terms.items():
         assert np.mean(value[1:] > value[0]) > 0.95, name
 
@@ -421,14 +414,20 @@ def test_the_truth_is_better_than_its_neighbours(shot, observation):
 def test_what_others_explain_costs_no_more_than_that(shot, observation):
     likelihood = only(ImageLikelihood(shot.body, shot.camera), 'coverage')
     poses = shot.near(4, 18)
-    free = evaluate(likelihood, poses, observation)
-    assert np.allclose(free.costs.sum(1), free.value)
-    limit = np.random.default_rng(0).uniform(0, 2 * free.costs.mean(), free.costs.shape)
+
+    def found(explained):
+        image = ObservedImage(likelihood, observation, explained)
+        return PoseEnergy(likelihood, (image,)).by_cue(poses)
+
+    free = found(None)
+    costs = free.outline_costs
+    assert np.allclose(costs.sum(1), free.energy.value)
+    limit = np.random.default_rng(0).uniform(0, 2 * costs.mean(), costs.shape)
     for explained in (limit, limit[:1]):
-        found = evaluate(likelihood, poses, observation, explained=explained)
-        assert np.allclose(found.costs, np.minimum(free.costs, explained))
-        assert np.allclose(found.value, found.costs.sum(1))
-    nothing = evaluate(likelihood, poses, observation, explained=np.zeros_like(limit))
+        some = found(explained)
+        assert np.allclose(some.outline_costs, np.minimum(costs, explained))
+        assert np.allclose(some.energy.value, some.outline_costs.sum(1))
+    nothing = found(np.zeros_like(limit)).energy
     assert not nothing.value.any()
     assert not nothing.hessian.any()
 
@@ -437,11 +436,11 @@ def test_parts_share_the_weight_of_the_whole_contour(shot, observation):
     """Edges of all parts are the sum over groups of parts: each point has its own share."""
     likelihood = only(ImageLikelihood(shot.body, shot.camera), 'edges')
     poses = shot.near(5, 19, spread=0.2)
-    frames = forward(shot.body.skeleton, poses)
-    count = len(shot.body.flesh.parts)
-    whole = replace(likelihood, parts=tuple(range(count))).energies(frames, observation)
-    groups = [tuple(range(0, count, 2)), tuple(range(1, count, 2))]
-    parts = [replace(likelihood, parts=group).energies(frames, observation) for group in groups]
+    every = tuple(range(len(shot.body.flesh.parts)))
+    whole, *parts = (
+        image_energy(replace(likelihood, parts=group), poses, observation)
+        for group in (every, every[::2], every[1::2])
+    )
     assert whole.value.min() > 0
     assert np.allclose(whole.value, sum(part.value for part in parts))
     assert np.allclose(whole.hessian, sum(part.hessian for part in parts))
@@ -451,8 +450,7 @@ def keypoint_energy(shot, keypoints, poses, settings=None, derivatives=Derivativ
     term = KeypointTerm(
         shot.body.skeleton, shot.camera, keypoints, settings or TermSettings(1.0, 1.0, 5.0)
     )
-    frames = forward(shot.body.skeleton, poses)
-    return term.energy(frames, np.arange(len(poses)), derivatives=derivatives)
+    return energy_of(term, shot.body, poses, camera=shot.camera, derivatives=derivatives)
 
 
 def test_keypoints_are_least_squares_with_their_covariances(shot):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -9,11 +11,20 @@ from scipy.stats import multivariate_normal
 
 from hmt_ros.smoothing import LinearGaussianDynamics
 
-WALK = LinearGaussianDynamics.random_walk(
-    [1.0, 2.0], initial_mean=[0.5, 0.0], initial_covariance=[[1.0, 0.2], [0.2, 2.0]]
+FIRST = np.array([[1.0, 0.2], [0.2, 2.0]])
+WALK = replace(
+    LinearGaussianDynamics.random_walk([1.0, 2.0]),
+    initial_mean=[0.5, 0.0],
+    initial_precision=np.linalg.inv(FIRST),
 )
 FAST = LinearGaussianDynamics.constant_velocity([1.0, 2.0], [0.5, 0.4])
-TURN = LinearGaussianDynamics.discrete([[0.9, 0.1], [-0.1, 0.8]], [[1.0, 0.1], [0.1, 0.5]])
+TURN = LinearGaussianDynamics(
+    drift=np.array([[-0.1, 0.12], [-0.12, -0.22]]),
+    diffusion=np.array([[1.1, 0.1], [0.1, 0.6]]),
+    dimension=2,
+    initial_mean=np.zeros(2),
+    initial_precision=np.zeros((2, 2)),
+)
 
 
 @pytest.mark.parametrize('dynamics', [WALK, FAST, TURN])
@@ -33,18 +44,12 @@ def test_two_intervals_are_one(dynamics):
     np.testing.assert_allclose(b @ q @ b.T + r, s, atol=1e-12)
 
 
-def test_discrete_dynamics_are_met_after_one_step():
-    a, q = TURN.transition(1.0)
-    np.testing.assert_allclose(a, [[0.9, 0.1], [-0.1, 0.8]], atol=1e-12)
-    np.testing.assert_allclose(q, [[1.0, 0.1], [0.1, 0.5]], atol=1e-12)
-
-
 def test_the_prior_is_the_sum_of_log_densities():
     intervals = np.array([0.3, 0.1, 0.3])
     x = np.random.default_rng(0).normal(size=(4, 2))
     prior = WALK.prior(intervals)
     energy, gradient = prior.energy(x[None])
-    expected = multivariate_normal([0.5, 0.0], [[1.0, 0.2], [0.2, 2.0]]).logpdf(x[0])
+    expected = multivariate_normal([0.5, 0.0], FIRST).logpdf(x[0])
     for before, after, interval in zip(x, x[1:], intervals):
         a, q = WALK.transition(interval)
         expected += multivariate_normal(a @ before, q).logpdf(after)
@@ -66,9 +71,7 @@ def test_velocities_couple_the_band_no_more_than_they_must():
         (lambda: LinearGaussianDynamics.random_walk([1.0, -1.0]), 'positive semi-definite'),
         (lambda: LinearGaussianDynamics.random_walk([np.nan]), 'not finite'),
         (lambda: LinearGaussianDynamics.random_walk([1.0], step=0.0), 'step must be positive'),
-        (lambda: LinearGaussianDynamics.random_walk([1.0], initial_mean=[0.0]), 'give both'),
         (lambda: LinearGaussianDynamics.constant_velocity([1.0], 0.0), 'velocity_sigma'),
-        (lambda: LinearGaussianDynamics.discrete([[-1.0]], [[1.0]]), 'no real logarithm'),
         (lambda: LinearGaussianDynamics.random_walk([1.0, 0.0]).prior(np.ones(2)), 'positive rate'),
     ],
 )

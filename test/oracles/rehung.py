@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body.kinematics import forward
-from hmt_ros.flips.interpretation_tree import _ends, _grown
-from hmt_ros.flips.tree_growth import chain_links
+from hmt_ros.flips.tree_growth import chain_links, grow_leaves
 
 
 def rehang_chain(body, poses, new_poses, chain, *, image_of=None, slack=0.1):
@@ -31,7 +30,14 @@ def rehang_chain(body, poses, new_poses, chain, *, image_of=None, slack=0.1):
     ends = links if image_of is None else chain_links(skeleton, image_of)
     new = np.array(new_poses, dtype=np.float64, ndmin=2, order='C')
     seen = forward(skeleton, np.array(poses, dtype=np.float64, ndmin=2))
-    angles, valid = _grown(forward(skeleton, new), new, links, _ends(seen, ends), slack)
+    targets = seen.origins[ends.segments]
+    targets = targets - ends.lengths[:, None, None] * seen.columns[ends.segments, 2]
+    frames, leaves = forward(skeleton, new), 2 ** len(links.lengths)
+    angles = np.empty((len(new), leaves, len(links.dofs)))
+    valid = np.zeros((len(new), leaves), dtype=np.bool_)
+    grow_leaves(
+        links, frames.columns, frames.origins, new, targets, float(slack), False, angles, valid
+    )
     parents, choice = np.nonzero(valid)
     result = new[parents]
     result[:, links.dofs] = angles[parents, choice]

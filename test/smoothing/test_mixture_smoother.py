@@ -140,14 +140,10 @@ def test_the_same_seed_gives_the_same_numbers(modes, walk):
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
 
 
-def test_adapting_nothing_and_weights_by_height(modes, walk):
+def test_adapting_nothing(modes, walk):
     plain = MixtureSmoother(walk, adapt=(), max_trajectories=4).smooth(modes(4.0))
     np.testing.assert_array_equal(plain.inflation, 1.0)
     assert len(plain.free_energy) == 1
-    peaks = MixtureSmoother(walk, adapt=(), start='peak', max_trajectories=4).smooth(modes(4.0))
-    np.testing.assert_allclose(
-        peaks.weights / peaks.weights[0], np.exp(peaks.log_joint - peaks.log_joint[0])
-    )
 
 
 def test_one_time_one_mode_and_modes_without_weight(walk):
@@ -190,7 +186,6 @@ def test_bad_input_is_refused_in_one_line(modes, walk, given, stamps, message):
     [
         ({'max_trajectories': 0}, 'max_trajectories'),
         ({'adapt': ('mean',)}, "no 'mean'"),
-        ({'start': 'here'}, "saw 'here'"),
         ({'lower': [0.0, 1.0, 2.0]}, r'wanted \(2,\)'),
         ({'lower': [0.0, 1.0], 'upper': [1.0, 0.0]}, 'variable 1: lower 1.0 is above upper 0.0'),
     ],

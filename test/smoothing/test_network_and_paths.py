@@ -44,7 +44,8 @@ def every_path(network):
 @pytest.mark.parametrize('d', [1, 2, 5])
 def test_values_in_closed_form(modes, d):
     mixtures = modes(2.0, d=d, times=3, k=4)
-    dynamics = LinearGaussianDynamics.discrete(0.9 * np.eye(d) + 0.02, np.eye(d))
+    drift, diffusion = 0.02 - 0.1 * np.eye(d), 0.3 + np.eye(d)
+    dynamics = LinearGaussianDynamics(drift, diffusion, d, np.zeros(d), np.zeros((d, d)))
     network = embedded_network(mixtures, dynamics, np.ones(2))
     for mixture, values in zip(mixtures, network.nodes):
         for i, value in enumerate(values):

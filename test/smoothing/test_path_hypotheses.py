@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,12 +48,12 @@ def test_weights_and_states_are_those_of_the_posterior(modes, dynamics):
     offset = found.log_values - exact.log_weights
     np.testing.assert_allclose(offset, offset[0], atol=1e-6)
     assert (np.diff(found.log_values) <= 0).all()
-    step = PathHypotheses.first(mixtures[0], dynamics)
+    step = PathHypotheses.of_states(first_state(mixtures[0], dynamics))
     for mixture in mixtures[1:]:
         step = step.followed(mixture, dynamics, 1.0, 81)
     np.testing.assert_allclose(step.log_weights, found.log_values)
     np.testing.assert_allclose(step.states.means, exact.states[:, -1], atol=1e-6)
-    last = [factor.inverse_blocks()[0][-1] for factor in exact.factors]
+    last = [factor.inverse_blocks()[-1] for factor in exact.factors]
     np.testing.assert_allclose(step.states.covariances, last, atol=1e-6)
 
 
@@ -95,7 +96,7 @@ def test_paths_are_traced_to_their_beginning(modes, walk):
         steps.append(
             steps[-1].followed(mixture, walk, 1.0, 5)
             if steps
-            else PathHypotheses.first(mixture, walk)
+            else PathHypotheses.of_states(first_state(mixture, walk))
         )
     nodes = traced(steps)
     whole = probable_paths(mixtures, walk, np.ones(3), 5)
@@ -128,9 +129,7 @@ def test_two_thousand_images_and_one(modes):
 
 def test_the_first_state_knows_what_the_dynamics_know():
     one = GaussianMixture([1.0], [[1.0]], [[[2.0]]])
-    dynamics = LinearGaussianDynamics.random_walk(
-        [1.0], initial_mean=[0.0], initial_covariance=[[2.0]]
-    )
+    dynamics = replace(LinearGaussianDynamics.random_walk([1.0]), initial_precision=[[0.5]])
     state = first_state(one, dynamics)
     np.testing.assert_allclose(state.means, [[0.5]])
     np.testing.assert_allclose(state.covariances, [[[1.0]]])

@@ -12,7 +12,12 @@ from hmt_ros.body.ground_terms import sole_jacobians, sole_points
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, resting_points
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
-from hmt_ros.smoothing.resting_points import SLIP, RestingPoints, _smoothed_chain
+from hmt_ros.smoothing.resting_points import (
+    SLIP,
+    RestingPoints,
+    _smoothed_chain,
+    rest_probabilities,
+)
 
 DT = 1 / 30
 
@@ -53,12 +58,16 @@ def test_the_chain_agrees_with_enumeration(rng):
     np.testing.assert_allclose(_smoothed_chain(likelihoods, changes), wanted, atol=1e-12)
 
 
+def probabilities(which, poses, covariances, intervals):
+    return rest_probabilities(which.points(poses), which.jacobians(poses), covariances, intervals)
+
+
 def test_what_stands_rests_and_what_steps_does_not():
     """A foot stands for a second, moves 0.7 m in 0.4 s, and stands again."""
     way = np.concatenate([np.zeros(30), np.linspace(0.0, 0.7, 12), np.full(30, 0.7)])
     poses = np.stack([way + 0.002 * (-1.0) ** np.arange(72), np.zeros(72)], axis=1)
     covariances = np.tile(np.eye(2), (72, 1, 1))
-    rests = POINT.probabilities(poses, covariances, np.full(71, DT))[:, 0]
+    rests = probabilities(POINT, poses, covariances, np.full(71, DT))[:, 0]
     assert rests.shape == (71,)
     assert rests[:28].min() > 0.9
     assert rests[32:40].max() < 0.1
@@ -67,7 +76,7 @@ def test_what_stands_rests_and_what_steps_does_not():
 
 def test_a_direction_that_is_known_badly_may_seem_to_move_more():
     poses = np.cumsum(np.full((31, 2), 0.1 * DT), axis=0)
-    known = POINT.probabilities(poses, np.tile(np.eye(2), (31, 1, 1)), np.full(30, DT))
+    known = probabilities(POINT, poses, np.tile(np.eye(2), (31, 1, 1)), np.full(30, DT))
 
     def across(poses):
         return line(poses)[..., [1, 0, 2]]
@@ -79,7 +88,7 @@ def test_a_direction_that_is_known_badly_may_seem_to_move_more():
         return result
 
     other = RestingPoints(across, of_across)
-    least = other.probabilities(poses, np.tile(np.eye(2), (31, 1, 1)), np.full(30, DT))
+    least = probabilities(other, poses, np.tile(np.eye(2), (31, 1, 1)), np.full(30, DT))
     assert least[15, 0] < known[15, 0]
 
 
@@ -90,7 +99,7 @@ def test_the_prior_costs_what_resting_points_slip(rng):
     along = 1e-3 * rng.normal(size=(5, 2))
     covariances = np.tile(np.eye(2), (5, 1, 1))
     held = POINT.held(prior, along, covariances, intervals)
-    rests = POINT.probabilities(along, covariances, intervals)
+    rests = probabilities(POINT, along, covariances, intervals)
     states = rng.normal(size=(3, 5, 4))
     slips = np.diff(line(states[:, :, :2].reshape(-1, 2)).reshape(3, 5, 3), axis=1)
     wanted = (rests[:, 0] * np.square(slips).sum(2) / (2.0 * SLIP * intervals)).sum(1)

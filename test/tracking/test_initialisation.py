@@ -7,7 +7,6 @@ import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_learning.motion.viewpoint import Viewpoint
-from hmt_ros.body.kinematics import forward
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.image.likelihood import LikelihoodSettings
@@ -88,9 +87,8 @@ def test_starts_have_the_least_energies_of_joints_and_prior_first(camera, known)
     pixels = camera.project(body.joint_positions(poses))
     value = 0.5 * ((pixels - keypoints.pixels) ** 2).sum((1, 2))
     value += 0.5 * (((poses - body.prior_mean) / body.prior_sigma) ** 2).sum(1)
-    value += self_intersection_energy(
-        body, forward(body.skeleton, poses), sigma=LikelihoodSettings().self_intersection_sigma
-    )[0]
+    sigma = LikelihoodSettings().self_intersection_sigma
+    value += self_intersection_energy(body, poses, sigma=sigma)
     assert (np.diff(value) > -1e-9 * value[1:]).all()
     assert (poses >= body.lower).all()
     assert (poses <= body.upper).all()

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Body, load_body
-from hmt_ros.body.kinematics import forward
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.bounded_newton import resting
@@ -177,8 +177,9 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     keypoints = keypoints_of(human32, motion[3], 1.0, 3)
     posterior, likelihood = tracker.step(black, 3 * FRAME, keypoints)
     seen = Observation(keypoints=keypoints, beliefs=validity.beliefs)
-    likelihood_of = ImageLikelihood(tracker.estimate.body, camera, ONLY_KEYPOINTS).given(seen)
-    energy = likelihood_of.energy(posterior.means)
+    of_keypoints = ImageLikelihood(tracker.estimate.body, camera, ONLY_KEYPOINTS)
+    terms = (*of_keypoints.seen(seen), *of_keypoints.priors)
+    energy = PoseEnergy(of_keypoints, terms).energy(posterior.means)
     gradient, hessian = energy.derivatives()
     free = ~resting(posterior.means, gradient, human32.lower, human32.upper)
     volumes = np.sqrt(np.linalg.det(1e3 * free_covariances(hessian, free)))
@@ -200,9 +201,8 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     assert np.linalg.eigvalsh(unknown).min() > -1e-9
     assert np.diagonal(unknown)[:3].argmax() == 2
     # Its log at the means is that of the image, without the prior of the body.
-    frames = forward(tracker.estimate.body.skeleton, likelihood.means)
-    term = ImageLikelihood(tracker.estimate.body, camera, ONLY_KEYPOINTS).keypoint_term(seen, None)
-    values = term.energy(frames, np.arange(len(likelihood))).value
+    term = of_keypoints.keypoint_term(seen, None)
+    values = PoseEnergy(of_keypoints, (term,)).energy(likelihood.means).value
     assert len(likelihood) > 1
     assert np.allclose(tracker.estimate.likelihood.values, -values, rtol=1e-9)
 

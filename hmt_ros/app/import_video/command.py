@@ -32,7 +32,7 @@ from hmt_ros.app.import_video.keypoint_files.reading import (
     keypoints_of_person,
     read_keypoints,
 )
-from hmt_ros.app.progress import tell_user, with_progress
+from hmt_ros.app.progress import Tell, tell_user, with_progress
 from hmt_ros.body import Camera
 from hmt_ros.detectors.detector import Detector
 from hmt_ros.detectors.registry import DETECTORS
@@ -78,8 +78,6 @@ examples:
 
 exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 """
-
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)

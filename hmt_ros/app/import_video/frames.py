@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,8 +86,8 @@ class Selection:
             yield number, time_ns, first is not None and (number - first) % self.every == 0
 
 
-class FrameSource(ABC):
-    """Frames of a file or a folder.
+class FrameSource:
+    """Frames of a file or a folder; one of neither kind has none, and numbers those of others.
 
     Args:
         names: of the files of its frames in their order; empty for a video file.
@@ -115,13 +114,13 @@ class FrameSource(ABC):
         self._by_name = {Path(x).stem: i for i, x in reversed([*enumerate(names)])}
         self._by_name |= {x: i for i, x in enumerate(names)}
 
-    @abstractmethod
     def frames(self, selection: Selection) -> Iterator[Frame]:
         """The frames that are wanted; once only.
 
         Raises:
             ValueError: a frame can not be read.
         """
+        return iter(())
 
     def number_of(self, label: str | int) -> int:
         """Number, from 0, of the frame that a label means.
@@ -224,7 +223,7 @@ class VideoFile(FrameSource):
 
     def _times(self) -> Iterator[int]:
         """Times of the frames, each of which is the present frame until the next is asked for."""
-        step = self._step()
+        fps = self._capture.get(cv2.CAP_PROP_FPS)
         first, last = 0.0, -1
         while self._capture.grab():
             time = self._capture.get(cv2.CAP_PROP_POS_MSEC)
@@ -235,19 +234,15 @@ class VideoFile(FrameSource):
                 time_ns = round(self.count * SECOND_NS / self._fps)
             elif time_ns <= last:
                 # Containers without times give zero, damaged ones jump back.
-                if step is None:
+                if not 0 < fps <= FASTEST:
                     raise ValueError(
                         f'{self.path} has neither times nor a rate of frames; give --fps'
                     )
-                time_ns = last + step
+                time_ns = last + round(SECOND_NS / fps)
             last = time_ns
             self.count += 1
             yield time_ns
         self.ended = True
-
-    def _step(self) -> int | None:
-        fps = self._capture.get(cv2.CAP_PROP_FPS)
-        return round(SECOND_NS / fps) if 0 < fps <= FASTEST else None
 
 
 class ImageFolder(FrameSource):

@@ -58,6 +58,15 @@ exit code: 0 done, 1 bad input (one line on stderr explains it) or some of sever
 line for each), 130 interrupted
 """
 
+# What the topics of options are of, and where it is looked for without them.
+_TOPICS = {
+    'image': 'the images (default: image/compressed, else image, else the only topic of images)',
+    'camera-info': 'the calibration (default: camera_info beside the images, else the only one)',
+    'mask': 'the masks (default: mask, else mask/compressed)',
+    'depth': 'depth images that are registered to the images (default: depth)',
+    'keypoints': 'the 2D keypoints (default: keypoints)',
+}
+
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; 0: the bag is there, 1: bad input, which one line on stderr explains."""
@@ -154,32 +163,8 @@ def _parser() -> CommandParser:
     )
 
     topics = parser.add_argument_group('topics')
-    topics.add_argument(
-        '--image-topic',
-        metavar='NAME',
-        help='topic of the images (default: image/compressed, else image, else the only topic of '
-        'images)',
-    )
-    topics.add_argument(
-        '--camera-info-topic',
-        metavar='NAME',
-        help='topic of the calibration (default: camera_info beside the images, else the only one)',
-    )
-    topics.add_argument(
-        '--mask-topic',
-        metavar='NAME',
-        help='topic of the masks (default: mask, else mask/compressed)',
-    )
-    topics.add_argument(
-        '--depth-topic',
-        metavar='NAME',
-        help='topic of depth images that are registered to the images (default: depth)',
-    )
-    topics.add_argument(
-        '--keypoints-topic',
-        metavar='NAME',
-        help='topic of the 2D keypoints (default: keypoints)',
-    )
+    for name, what in _TOPICS.items():
+        topics.add_argument(f'--{name}-topic', metavar='NAME', help=f'topic of {what}')
     topics.add_argument(
         '--times',
         choices=(STAMPS, LOG_TIMES),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
@@ -223,7 +224,7 @@ def upright_frame(bag: BagReader, recorded: RecordedInput) -> str:
         return ''
     parents: dict[str, str] = {}
     camera = ''
-    try:
+    with suppress(BagError):  # the replay itself reports the damage and the remedy
         for stored in islice(bag.messages({*names, recorded.camera_info.name}), _SEARCHED):
             if stored.topic in names:
                 for each in stored.message.transforms:
@@ -234,9 +235,6 @@ def upright_frame(bag: BagReader, recorded: RecordedInput) -> str:
             found = _upright_above(camera, parents)
             if found:
                 return found
-    except BagError:
-        # The replay itself reports the damage and the remedy.
-        return ''
     return ''
 
 
@@ -299,10 +297,8 @@ def _in_namespace(
 
 def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
     """The topic with a name and with messages of one of the types."""
-    for topic in _with_messages(bag, kinds):
-        if topic.name.lstrip('/') == name:
-            return topic
-    return None
+    found = (topic for topic in _with_messages(bag, kinds) if topic.name.lstrip('/') == name)
+    return next(found, None)
 
 
 def _the_only(

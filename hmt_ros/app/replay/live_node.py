@@ -121,7 +121,6 @@ class LiveNode:
         inputs: topic and type of the messages for the node, by source.
         sensors: topics with the QoS of sensor data, which may lose messages; here they are
             reliable.
-        namespace: namespace of the node and of all its topics, '/humans/bodies/7' for example.
         module: module that runs the node; empty: the one in `hmt_ros.nodes` with its name.
         within: a process of several nodes, which the caller starts; None: one of its own.
         write: takes topic, stamp and bytes of each message of the node, in its order.
@@ -140,20 +139,17 @@ class LiveNode:
         inputs: Mapping[str, tuple[str, str]],
         topics: Mapping[str, PublishedTopic],
         sensors: tuple[str, ...] = (),
-        namespace: str = '',
         module: str = '',
         within: NodeProcess | None = None,
         write: Callable[[str, int, bytes], None],
     ) -> None:
         self.name = name
-        self.full_name = f'{namespace}/{name}'.strip('/')
-        self._namespace = namespace
         self._player, self._topics, self._write = player, topics, write
         self._arrived: dict[str, deque[bytes]] = {topic: deque() for topic in topics}
         self._answers: deque[bytes] = deque()
         self._open_topics(inputs)
         self._process = within or NodeProcess(
-            player, opened, self._file_name, module or f'hmt_ros.nodes.{name}'
+            player, opened, name, module or f'hmt_ros.nodes.{name}'
         )
         self._process.add(*self._options(parameters, sensors))
         if within is None:
@@ -211,7 +207,7 @@ class LiveNode:
         Raises:
             LiveNodeError: there is no answer.
         """
-        client = self._player.node.create_client(kind, f'/{self.full_name}/{service}')
+        client = self._player.node.create_client(kind, f'/{self.name}/{service}')
         try:
             self._wait(client.service_is_ready, START_SECONDS, f'its service {service}')
             future = client.call_async(kind.Request(**fields))
@@ -284,7 +280,7 @@ class LiveNode:
         """
 
         def connected() -> bool:
-            values = self._player.diagnostics.get(self.full_name, {})
+            values = self._player.diagnostics.get(self.name, {})
             return all(int(values.get(f'{SUBSCRIBERS}{x}', '0')) >= count for x in topics)
 
         self._wait(connected, START_SECONDS, f'subscribers of {", ".join(topics)}')
@@ -312,26 +308,20 @@ class LiveNode:
         for topic in sensors:
             values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
         lines = [f'    {name}: {text}' for name, text in values.items()]
-        file = self._player.folder / f'{self._file_name}.yaml'
+        file = self._player.folder / f'{self.name}.yaml'
         head = [f'/**/{self.name}:', '  ros__parameters:']
         file.write_text('\n'.join([*head, *lines, '']), encoding='utf-8')
         options = ['--params-file', str(file)]
-        if self._namespace:
-            options += ['-r', f'__ns:={self._namespace}']
         for topic in self._topics:
             if topic.startswith('/'):
                 options += ['-r', f'{self.name}:{topic}:={self._topic(topic)}']
         return options
 
-    @property
-    def _file_name(self) -> str:
-        return self.full_name.replace('/', '.')
-
     def _topic(self, name: str) -> str:
         """The topic of a name; shared topics that a node publishes on are its own here."""
         if not name.startswith('/'):
-            return f'{self._namespace}/{name}'
-        return f'/{self.full_name}{name}' if name in self._topics else name
+            return f'/{name}'
+        return f'/{self.name}{name}' if name in self._topics else name
 
     def _open_topics(self, inputs: Mapping[str, tuple[str, str]]) -> None:
         from lifecycle_msgs.srv import GetState
@@ -359,13 +349,13 @@ class LiveNode:
             )
         node.create_subscription(
             player.classes[HANDLED],
-            f'/{self.full_name}/handled',
+            f'/{self.name}/handled',
             _into(self._answers),
             player.reliable,
             raw=True,
         )
         # Created last: discovery announces the topics above to the node before this client.
-        self._state = node.create_client(GetState, f'/{self.full_name}/get_state')
+        self._state = node.create_client(GetState, f'/{self.name}/get_state')
         self._state_request = GetState.Request()
 
     def _next(self, queue: deque[bytes], seconds: float, what: str) -> bytes:

@@ -26,8 +26,8 @@ from tqdm import tqdm
 
 import hmt_ros
 from hmt_ros.app.command_line import INTERRUPTED
-from hmt_ros.app.progress import show_progress
-from hmt_ros.app.replay.one_bag import Tell, replay_bag
+from hmt_ros.app.progress import Tell, show_progress
+from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions, parameters_of_bag
 from hmt_ros.inference.threads import limit_threads
 from msg_tools import BagError

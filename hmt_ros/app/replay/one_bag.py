@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from hmt_ros.app.progress import Progress, show_progress
+from hmt_ros.app.progress import Progress, Tell, show_progress
 from hmt_ros.app.replay.inputs import GROUND_TRUTH, RECORDED, RecordedInput, fitted
 from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_parameters
 from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PlayedTrack
@@ -30,7 +30,6 @@ from msg_tools.bags.bag_metadata import absolute_name
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import ImageError, decode_image, image_message
 
-Tell = Callable[[str], None]
 Item = TypeVar('Item')
 
 # Maximum number of calls that wait, each with a message or an image.

@@ -8,10 +8,12 @@ the bag they finish, in the same order: no message announces the end, so nodes a
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections import defaultdict, deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE
 from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
@@ -30,89 +32,109 @@ from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 
 PERSON = 'person_node'
-# Topics of the filter that the smoother takes, as sources of the same names.
-HANDED_ON = (MIXTURE,)
 
 Write = Callable[[str, int, bytes], None]
 
 
-class PlayedTrack(AbstractContextManager['PlayedTrack'], Protocol):
-    """Takes the messages of a bag one after the other; a context manager."""
+class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
+    """Takes the messages of a bag one after the other; a context manager.
+
+    Args:
+        write: takes topic, stamp and bytes of each published message.
+    """
+
+    def __init__(self, parameters: NodeParameters, write: Write) -> None:
+        self._write = write
+        self._bme: Any = None
+        self._filter: Any = None
+        self._smoother: Any = None
+        # Sources in the bag that the BME takes.
+        self._seen: tuple[str, ...] = ()
+        # Topics of the filter that BME and smoother take, as sources of the same names.
+        self._heard: tuple[str, ...] = ()
+        self._smoothed = () if parameters.smoother is None else (MIXTURE,)
+        if (bme := parameters.bme) is not None:
+            images = () if bme.predict_from == FROM_KEYPOINTS else (IMAGE,)
+            given = (source for row in BmeSession.inputs_of(bme) for source in row.types)
+            self._seen = (CAMERA_INFO, *images, *given)
+            self._heard = (TRACK,) if bme.tracked_interval > 0 else ()
+
+    @abstractmethod
+    def _handled(self, node: Any, source: str, message: Any = None) -> Handled:
+        """How a node handles a message; None: the newest on the topic of another node."""
+
+    @abstractmethod
+    def _finished(self, node: Any) -> Handled:
+        """How a node handles the messages that wait for others, at the end of the bag."""
 
     def take(self, source: str, message: Any) -> Handled:
         """Hands a message over and returns when all its results are written."""
+        result = None
+        if source in self._seen:
+            result = self._predicted(self._handled(self._bme, source, message))
+        return self._handed_on(_together(result, self._handled(self._filter, source, message)))
 
     def finish(self) -> Handled:
         """Returns when the results that waited for more messages are written."""
+        result = None
+        if self._bme is not None:
+            result = self._predicted(self._finished(self._bme))
+            self._heard = ()
+        result = self._handed_on(_together(result, self._finished(self._filter)))
+        if self._smoother is not None:
+            result = _together(result, self._finished(self._smoother))
+        return result
+
+    def _predicted(self, result: Handled) -> Handled:
+        """The filter gets the predictions as well."""
+        for topic, _ in result.published:
+            result = _together(result, self._handled(self._filter, topic))
+        return result
+
+    def _handed_on(self, result: Handled) -> Handled:
+        """Smoother and BME get the messages of the filter."""
+        for topic, _ in result.published:
+            if topic in self._smoothed:
+                result = _together(result, self._handled(self._smoother, topic))
+            if topic in self._heard:
+                predicted = self._predicted(self._handled(self._bme, topic))
+                result = _together(result, self._handed_on(predicted))
+        return result
 
 
 class OfflineTrack(PlayedTrack):
     """Without ROS.
-
-    Args:
-        write: takes topic, stamp and bytes of each published message.
 
     Raises:
         ValueError: the parameters name a file that can not be used.
     """
 
     def __init__(self, parameters: NodeParameters, write: Write) -> None:
-        self._write = write
-        self._predicted: list[Output] = []
-        self._handed: list[Output] = []
-        self._bme = self._smoother = None
+        super().__init__(parameters, write)
+        # Messages of a node for another one, by topic.
+        self._messages: defaultdict[str, deque[Any]] = defaultdict(deque)
         if parameters.bme is not None:
-            self._bme = BmeSession(parameters.bme, self._predict, bme_session.TOPICS.__contains__)
-        self._seen, self._heard = _seen_by_bme(parameters), _heard_by_bme(parameters)
+            self._bme = BmeSession(parameters.bme, self._publish, bme_session.TOPICS.__contains__)
         kind = session_of(parameters.filter)
-        self._filter = kind(parameters.filter, self._filtered, _is_recorded)
+        self._filter = kind(parameters.filter, self._publish, _is_recorded)
         if parameters.smoother is not None:
-            self._smoother = SmootherSession(parameters.smoother, lambda output: write(*output))
+            self._smoother = SmootherSession(parameters.smoother, self._publish)
 
     def __exit__(self, *_: object) -> None:
         """See `PlayedTrack`; nothing is open."""
 
-    def take(self, source: str, message: Any) -> Handled:
-        """See `PlayedTrack`."""
-        result = None
-        if self._bme is not None and source in self._seen:
-            result = self._hand_to_filter(self._bme.take(source, message))
-        return self._hand_on(_together(result, self._filter.take(source, message)))
-
-    def finish(self) -> Handled:
-        """See `PlayedTrack`."""
-        result = None
-        if self._bme is not None:
-            result = self._hand_to_filter(self._bme.finish())
-        result = self._hand_on(_together(result, self._filter.finish()))
-        return result if self._smoother is None else _together(result, self._smoother.finish())
-
-    def _hand_to_filter(self, result: Handled) -> Handled:
-        """Hands the predictions to the filter."""
-        predicted, self._predicted = self._predicted, []
-        for output in predicted:
-            result = _together(result, self._filter.take(PREDICTION, output.message))
-        return result
-
-    def _hand_on(self, result: Handled) -> Handled:
-        """Hands the messages of the filter to smoother and BME."""
-        handed, self._handed = self._handed, []
-        for output in handed:
-            topic, message = output.topic, output.message
-            if self._smoother is not None and topic in HANDED_ON:
-                result = _together(result, self._smoother.take(topic, message))
-            if self._bme is not None and topic in self._heard:
-                result = _together(result, self._hand_to_filter(self._bme.take(topic, message)))
-        return result
-
-    def _predict(self, output: Output) -> None:
+    def _publish(self, output: Output) -> None:
         self._write(*output)
-        self._predicted.append(output)
+        if output.topic in (PREDICTION, *self._smoothed, *self._heard):
+            self._messages[output.topic].append(output.message)
 
-    def _filtered(self, output: Output) -> None:
-        self._write(*output)
-        if output.topic in HANDED_ON or output.topic in self._heard:
-            self._handed.append(output)
+    def _handled(self, node: Any, source: str, message: Any = None) -> Handled:
+        """See `PlayedTrack`."""
+        return node.take(source, self._messages[source].popleft() if message is None else message)
+
+    def _finished(self, node: Any) -> Handled:
+        """See `PlayedTrack`."""
+        return node.finish()
 
 
 class LiveTrack(PlayedTrack):
@@ -126,10 +148,8 @@ class LiveTrack(PlayedTrack):
     """
 
     def __init__(self, parameters: NodeParameters, write: Write, *, together: bool = False) -> None:
-        self._parameters, self._write, self._together = parameters, write, together
-        self._seen, self._heard = _seen_by_bme(parameters), _heard_by_bme(parameters)
-        self._bme: LiveNode | None = None
-        self._smoother: LiveNode | None = None
+        super().__init__(parameters, write)
+        self._parameters, self._together = parameters, together
 
     def __enter__(self) -> LiveTrack:
         with ExitStack() as opened:
@@ -180,7 +200,7 @@ class LiveTrack(PlayedTrack):
                 self._filter.wait_for_subscribers(self._heard, 2)
             if self._smoother is not None:
                 self._smoother.wait_until_active()
-                self._filter.wait_for_subscribers(HANDED_ON, 2)
+                self._filter.wait_for_subscribers(self._smoothed, 2)
             self._opened = opened.pop_all()
         return self
 
@@ -198,41 +218,16 @@ class LiveTrack(PlayedTrack):
             LiveNodeError: a node has ended, or does not answer.
         """
         self._filter.publish(source, message)
-        result = None
-        if self._bme is not None and source in self._seen:
-            result = self._answers_to_predictions(self._bme.answer(source))
-        return self._answers_to_mixtures(_together(result, self._filter.answer(source)))
+        return super().take(source, message)
 
-    def finish(self) -> Handled:
+    def _handled(self, node: LiveNode, source: str, message: Any = None) -> Handled:
+        """See `PlayedTrack`: a node has the messages by itself."""
+        return node.answer(source)
+
+    def _finished(self, node: LiveNode) -> Handled:
         """See `PlayedTrack`."""
-        result = None
-        if self._bme is not None:
-            self._bme.deactivate()
-            result = self._answers_to_predictions(self._bme.answer(FINISH))
-        self._filter.deactivate()
-        result = _together(result, self._filter.answer(FINISH))
-        if self._smoother is None:
-            return result
-        for topic, _ in result.published:
-            if topic in HANDED_ON:
-                result = _together(result, self._smoother.answer(topic))
-        self._smoother.deactivate()
-        return _together(result, self._smoother.answer(FINISH))
-
-    def _answers_to_predictions(self, result: Handled) -> Handled:
-        """The filter gets the prediction as well, before or after its image."""
-        for topic, _ in result.published:
-            result = _together(result, self._filter.answer(topic))
-        return result
-
-    def _answers_to_mixtures(self, result: Handled) -> Handled:
-        for topic, _ in result.published:
-            if self._smoother is not None and topic in HANDED_ON:
-                result = _together(result, self._smoother.answer(topic))
-            if self._bme is not None and topic in self._heard:
-                predicted = self._answers_to_predictions(self._bme.answer(topic))
-                result = _together(result, predicted)
-        return result
+        node.deactivate()
+        return node.answer(FINISH)
 
 
 def _is_recorded(topic: str) -> bool:
@@ -240,21 +235,6 @@ def _is_recorded(topic: str) -> bool:
     return topic.rpartition('/')[2] not in track_messages.TOPICS_OF_NODE.keys() - (
         track_messages.TOPICS.keys()
     )
-
-
-def _seen_by_bme(parameters: NodeParameters) -> tuple[str, ...]:
-    """Sources in the bag that the BME takes."""
-    if parameters.bme is None:
-        return ()
-    images = () if parameters.bme.predict_from == FROM_KEYPOINTS else (IMAGE,)
-    given = (source for row in BmeSession.inputs_of(parameters.bme) for source in row.types)
-    return (CAMERA_INFO, *images, *given)
-
-
-def _heard_by_bme(parameters: NodeParameters) -> tuple[str, ...]:
-    """Topics of the filter that the BME takes, as sources of the same names."""
-    hears = parameters.bme is not None and parameters.bme.tracked_interval > 0
-    return (TRACK,) if hears else ()
 
 
 def _together(one: Handled | None, other: Handled) -> Handled:

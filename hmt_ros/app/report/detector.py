@@ -58,12 +58,7 @@ def read_detector(path: Path, layer: Layer[Moment]) -> Detector | None:
             stamp = time_ns(stored.message.header.stamp)
             if stamp not in layer.mixtures:
                 continue
-            try:
-                positions = positions_of(stored.message)
-            except ValueError as error:
-                where = f'{path}: {topic} at {stored.log_time_ns} ns'
-                raise ValueError(f'{where}: {error}') from error
-            joints = _with_middles(_at_joints(positions, names))
+            joints = _with_middles(_at_joints(stored.content(positions_of), names))
             ours = _with_middles(dict(zip(names, layer.mixtures[stamp].joints[0], strict=True)))
             if ORIGIN in joints and ORIGIN in ours:
                 shift = ours[ORIGIN] - joints[ORIGIN]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -132,18 +133,13 @@ def film_strip(
     with BagReader(source.bag) as bag:
         for stored in with_pictures(bag.messages([source.topic]), source.topic):
             progress(1)
-            message = stored.message
-            stamp = time_ns(message.header.stamp)
+            stamp = time_ns(stored.message.header.stamp)
             if stamp not in wanted and stored.log_time_ns in wanted:
                 stamp = stored.log_time_ns  # tracked with --times log
             seen.append(stamp)
             if stamp not in wanted or stamp in result.jpegs:
                 continue
-            try:
-                image = decode_image(message)
-            except ValueError as error:
-                where = f'{source.bag}: {source.topic} at {stored.log_time_ns} ns'
-                raise ValueError(f'{where}: {error}') from error
+            image = stored.content(decode_image)
             size = image.shape[1], image.shape[0]
             if result.size not in ((0, 0), size):
                 raise ValueError(
@@ -164,11 +160,8 @@ def film_strip(
                 f'{min(wanted)} to {max(wanted)} ns: is this the bag that was tracked?'
             )
         if source.camera_info is not None:
-            info = next(bag.messages([source.camera_info])).message
-            try:
-                result.camera = camera_from_info(info, result.size)
-            except ValueError as error:
-                raise ValueError(f'{source.bag}: {source.camera_info}: {error}') from error
+            info = next(bag.messages([source.camera_info]))
+            result.camera = info.content(partial(camera_from_info, image_size=result.size))
     return result
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -13,14 +14,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from hmt_ros.app.evaluate import chosen_topics
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics, topic_beside
+from hmt_ros.app.recorded_bodies import RecordedBodies, topic_beside
 from hmt_ros.body import Body
 from hmt_ros.inference.arrays import Array
 from msg_tools import BagMessage, BagReader
 from msg_tools.messages.ground import GroundState
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.keep_out import KEEP_OUT, KeepOutState
-from msg_tools.messages.message_error import MessageError
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, PoseMixture, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 
@@ -61,10 +61,15 @@ def ground_at(grounds: Mapping[int, GroundState], stamp_ns: int) -> GroundState 
     return grounds.get(stamp_ns) or next(iter(grounds.values()), None)
 
 
+def _plane_of(ground: GroundState | None) -> Array:
+    """The floor (4,), or else the plane of a level camera."""
+    plane = None if ground is None else ground.plane
+    return _LEVEL if plane is None else plane
+
+
 def heights_of(joints: Array, ground: GroundState | None) -> Array:
     """Heights (...,) of positions (..., 3): above the floor, or above a level camera, m."""
-    plane = None if ground is None else ground.plane
-    plane = _LEVEL if plane is None else plane
+    plane = _plane_of(ground)
     return np.asarray(joints @ plane[:3] + plane[3], dtype=np.float64)
 
 
@@ -77,8 +82,7 @@ def marginals_of(content: PoseMixture, body: Body | None, ground: GroundState | 
     covariances, spread = content.covariances, content.joint_covariances
     if covariances is None or spread is None:
         return np.empty((2, len(content.weights), 0))
-    plane = None if ground is None else ground.plane
-    up = (_LEVEL if plane is None else plane)[:3]
+    up = _plane_of(ground)[:3]
     sigmas = np.sqrt(np.einsum('i,kjil,l->kj', up, spread, up))
     result = [np.stack([heights_of(content.joint_positions, ground), sigmas])]
     if body is not None:
@@ -277,14 +281,10 @@ def read_mixtures(
         told = (x.message for x in every if x.message.state != KeepOutState.STALE)
         answered = {time_ns(x.header.stamp): str(x.reason) for x in told}
         bodies = RecordedBodies(body_model)
-        for stored in bag.messages([*body_topics(bag), *names]):
-            if stored.msgtype == BODY:
-                bodies.learn(stored)
-            else:
-                _take(found, stored, bodies, grounds or {})
-                if stored.msgtype == POSE_MIXTURE:
-                    answered.setdefault(time_ns(stored.message.header.stamp), '')
-            progress(1)
+        for stored in bodies.messages(bag, names, progress):
+            _take(found, stored, bodies, grounds or {})
+            if stored.msgtype == POSE_MIXTURE:
+                answered.setdefault(time_ns(stored.message.header.stamp), '')
     for name, layer in found.items():
         found[name] = replace(layer, mixtures=dict(sorted(layer.mixtures.items())))
     layers = [found[name] for name in names if name in found]
@@ -309,30 +309,30 @@ def _take(
     grounds: Mapping[int, GroundState],
 ) -> None:
     """Adds a message to the layer of its topic."""
-    try:
-        if stored.msgtype == POSE_MIXTURE:
-            new: Layer[Any] | None = _pose_layer(stored.topic, stored.message, bodies, grounds)
-        else:
-            new = _trajectory_layer(stored.topic, stored.message, bodies)
-        if new is None:
-            return
-        known = found.setdefault(stored.topic, new)
-        pairs: tuple[tuple[str, object, object], ...] = (
-            ('kind', known.kind, new.kind),
-            ('frame', known.frame_id, new.frame_id),
-            ('joints', known.joint_names, new.joint_names),
-        )
-        for what, was, seen in pairs:
-            if was != seen:
-                raise MessageError(f'mixture has the {what} {seen!r}, before it was {was!r}')
-    except ValueError as error:
-        raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
+    read: Callable[[Any], Layer[Any] | None] = partial(_trajectory_layer, stored.topic, bodies)
+    if stored.msgtype == POSE_MIXTURE:
+        read = partial(_pose_layer, stored.topic, bodies, grounds)
+    new = stored.content(read)
+    if new is None:
+        return
+    known = found.setdefault(stored.topic, new)
+    pairs: tuple[tuple[str, object, object], ...] = (
+        ('kind', known.kind, new.kind),
+        ('frame', known.frame_id, new.frame_id),
+        ('joints', known.joint_names, new.joint_names),
+    )
+    for what, was, seen in pairs:
+        if was != seen:
+            raise ValueError(
+                f'{stored.topic} at {stored.log_time_ns} ns: mixture has the {what} {seen!r}, '
+                f'before it was {was!r}'
+            )
     for stamp, mixture in new.mixtures.items():
         known.mixtures.setdefault(stamp, mixture)
 
 
 def _pose_layer(
-    topic: str, message: Any, bodies: RecordedBodies, grounds: Mapping[int, GroundState]
+    topic: str, bodies: RecordedBodies, grounds: Mapping[int, GroundState], message: Any
 ) -> Layer[Moment] | None:
     """A layer of one mixture; None: nobody was seen."""
     content = pose_mixture_of(message)
@@ -361,7 +361,7 @@ def _pose_layer(
     return Layer(topic, kind, content.frame_id, names, {stamp: moment}, angles_of(body))
 
 
-def _trajectory_layer(topic: str, message: Any, bodies: RecordedBodies) -> Layer[Window]:
+def _trajectory_layer(topic: str, bodies: RecordedBodies, message: Any) -> Layer[Window]:
     """A layer of one window."""
     content = trajectory_mixture_of(message)
     body = bodies.of(topic, content)

@@ -8,16 +8,14 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
 from hmt_ros.app.report.images import FilmStrip
 from hmt_ros.app.report.mixtures import Layer, Moment, RecordedMixtures, Window
 from hmt_ros.app.report.skeletons import (
-    STYLE,
     draw_overlays,
     draw_overview,
     draw_side_views,
-    save_picture,
+    new_picture,
 )
 from hmt_ros.evaluation.pose_scores import LOST
 from hmt_ros.evaluation.track_scores import TrackScores, Truth, mode_errors
@@ -62,23 +60,18 @@ def draw_pictures(
     Returns:
         Names of the files, keys of `PICTURES`.
     """
-    drawn = []
     if mixtures.layers:
         track = mixtures.layers[0]
         few, many = track.spread(IN_OVERVIEW), track.spread(ON_SHEETS)
         chosen = [{t: images.kept[t] for t in own if t in images.kept} for own in (few, many)]
         if images.camera is not None and chosen[0]:
             draw_overview(folder / 'overview.png', track, images.camera, chosen[0], truth)
-            drawn.append('overview.png')
         if images.camera is not None and chosen[1]:
             draw_overlays(folder / 'overlays.png', track, images.camera, chosen[1])
-            drawn.append('overlays.png')
         draw_side_views(folder / 'side_views.png', track, many, truth)
         _draw_weights(folder / 'weights.png', track, truth)
-        drawn += ['side_views.png', 'weights.png']
     if any(topic.scores.levels is not None for topic in scores.values()):
         _draw_calibration(folder / 'calibration.png', scores)
-        drawn.append('calibration.png')
     recorded = [
         layer
         for layer in mixtures.trajectories
@@ -86,8 +79,7 @@ def draw_pictures(
     ]
     if recorded:
         _draw_free_energy(folder / 'free_energy.png', recorded)
-        drawn.append('free_energy.png')
-    return drawn
+    return [name for name in PICTURES if (folder / name).exists()]
 
 
 def _draw_weights(path: Path, track: Layer[Moment], truth: Truth | None) -> None:
@@ -98,9 +90,8 @@ def _draw_weights(path: Path, track: Layer[Moment], truth: Truth | None) -> None
     weights = np.zeros((most, len(seconds)))
     for t, moment in enumerate(moments):
         weights[: len(moment.weights), t] = moment.weights
-    with mpl.rc_context(STYLE):
-        known = truth is not None
-        figure = Figure((9.0, 5.0 if known else 2.8), dpi=110, layout='constrained')
+    known = truth is not None
+    with new_picture(path, (9.0, 5.0 if known else 2.8), 'constrained') as figure:
         axes = figure.subplots(2 if known else 1, 1, squeeze=False, sharex=True)[:, 0]
         colours = mpl.colormaps['cividis'](np.linspace(0.95, 0.1, most))
         axes[0].stackplot(seconds, weights, colors=colours, linewidth=0.4, edgecolor='white')
@@ -111,7 +102,6 @@ def _draw_weights(path: Path, track: Layer[Moment], truth: Truth | None) -> None
         if truth is not None:
             _draw_errors(axes[1], track, truth, seconds)
         axes[-1].set_xlabel('time, s')
-        save_picture(figure, path)
 
 
 def _draw_errors(axes: Any, track: Layer[Moment], truth: Truth, seconds: Array) -> None:
@@ -137,8 +127,7 @@ def _draw_errors(axes: Any, track: Layer[Moment], truth: Truth, seconds: Array) 
 
 def _draw_calibration(path: Path, scores: dict[str, TrackScores]) -> None:
     """Coverage of the highest-density regions over their probability."""
-    with mpl.rc_context(STYLE):
-        figure = Figure((10.4, 4.8), dpi=110, layout='constrained')
+    with new_picture(path, (10.4, 4.8), 'constrained') as figure:
         axes: Any = figure.subplots(1, 3, sharey=True)
         for number, (name, topic) in enumerate(scores.items()):
             found = topic.scores
@@ -156,14 +145,12 @@ def _draw_calibration(path: Path, scores: dict[str, TrackScores]) -> None:
         axes[0].set_ylabel('fraction of true positions in it')
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, frameon=False, loc='outside lower center', ncols=2)
-        save_picture(figure, path)
 
 
 def _draw_free_energy(path: Path, layers: Sequence[Layer[Window]]) -> None:
     """Free energy of each window in the first and in the last iteration."""
     start = min(min(layer.mixtures) for layer in layers)
-    with mpl.rc_context(STYLE):
-        figure = Figure((9.0, 2.8), dpi=110, layout='constrained')
+    with new_picture(path, (9.0, 2.8), 'constrained') as figure:
         axes: Any = figure.subplots()
         for number, layer in enumerate(layers):
             windows = [one for one in layer.mixtures.values() if len(one.free_energy)]
@@ -182,4 +169,3 @@ def _draw_free_energy(path: Path, layers: Sequence[Layer[Window]]) -> None:
                 )
         axes.set(xlabel='end of the window, s', ylabel='free energy, nats')
         axes.legend(frameon=False, fontsize=8)
-        save_picture(figure, path)

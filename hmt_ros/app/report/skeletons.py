@@ -6,7 +6,8 @@ mode, the smaller its weight.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -70,9 +71,6 @@ def draw_overview(
     camera: Camera,
     images: dict[int, Image],
     truth: Truth | None,
-    *,
-    width: float = 9.0,
-    dpi: int = 110,
 ) -> None:
     """Images with the heaviest modes, and under each the same person from the side, all modes.
 
@@ -82,16 +80,14 @@ def draw_overview(
         camera: camera of the images.
         images: images by stamp.
         truth: true joint positions, which are drawn from the side; None if unknown.
-        width: width of the picture, inches.
-        dpi: pixels per inch.
     """
     moments = _with_images(track, images)
     box = _crop(moments, camera)
     view = _SideView(track, moments, truth)
     ratios = ((box[3] - box[1]) / (box[2] - box[0]), view.ratio)
+    width = 9.0
     cell = width / len(moments)
-    with mpl.rc_context(STYLE):
-        figure = Figure((width, cell * sum(ratios) + 1.0), dpi=dpi)
+    with new_picture(path, (width, cell * sum(ratios) + 1.0)) as figure:
         axes = figure.subplots(
             2, len(moments), squeeze=False, gridspec_kw={'height_ratios': list(ratios)}
         )
@@ -115,7 +111,6 @@ def draw_overview(
             wspace=0.06,
             hspace=0.06,
         )
-        save_picture(figure, path)
 
 
 def draw_overlays(path: Path, track: Track, camera: Camera, images: dict[int, Image]) -> None:
@@ -137,6 +132,19 @@ def draw_side_views(path: Path, track: Track, stamps: Sequence[int], truth: Trut
     view = _SideView(track, moments, truth)
     title = 'all modes from the side; horizontal axis: towards the camera, m'
     _draw_sheet(path, track, moments, view.ratio, view.draw, title, truth=truth is not None)
+
+
+@contextmanager
+def new_picture(path: Path, size: tuple[float, float], layout: Any = None) -> Iterator[Figure]:
+    """A figure in the style of the report, which `save_picture` writes at the end.
+
+    Args:
+        size: width and height, inches.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(size, dpi=110, layout=layout)
+        yield figure
+        save_picture(figure, path)
 
 
 def save_picture(figure: Figure, path: Path) -> None:
@@ -162,8 +170,7 @@ def _draw_sheet(
     rows = -(-len(moments) // columns)
     cell = 2.4
     width, height = columns * cell + 0.5, rows * (cell * ratio + 0.25) + 0.7
-    with mpl.rc_context(STYLE):
-        figure = Figure((width, height), dpi=110)
+    with new_picture(path, (width, height)) as figure:
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes in grid.flat:
             axes.set_axis_off()
@@ -185,7 +192,6 @@ def _draw_sheet(
             wspace=0.08,
             hspace=0.25 / (cell * ratio),
         )
-        save_picture(figure, path)
 
 
 def _draw_on_image(

@@ -195,8 +195,7 @@ def _smooth(outline: Array) -> Array:
     for k in range(1, SMOOTHING // 2 + 1):
         total += np.roll(outline, k, axis=0)
         total += np.roll(outline, -k, axis=0)
-    result: Array = total / (2 * (SMOOTHING // 2) + 1)
-    return result
+    return total / (2 * (SMOOTHING // 2) + 1)
 
 
 def centred_view(blob: PersonBlob, camera: Camera, level: Array = UPRIGHT) -> Bytes:

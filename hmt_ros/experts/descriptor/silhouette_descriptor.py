@@ -27,7 +27,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.experts.descriptor.contour import person_blob, sample_contour
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.clustering import k_means, squared_distances
+from hmt_ros.inference.clustering import squared_distances
 
 Bytes = NDArray[np.uint8]
 
@@ -91,19 +91,6 @@ class ShapeContextCodebook:
                 f'centres of shape contexts must be finite and (C, {RADIAL * ANGULAR}), saw {shape}'
             )
 
-    @classmethod
-    def of(cls, contexts: Array, count: int = 50, seed: int = 0) -> ShapeContextCodebook:
-        """The codebook of contexts (N, 60); the same contexts and seed give the same centres.
-
-        Raises:
-            ValueError: there are fewer contexts than centres, or some are not finite.
-        """
-        if len(contexts) < count:
-            raise ValueError(f'{len(contexts)} shape contexts for {count} centres: give more masks')
-        if not np.isfinite(contexts).all():
-            raise ValueError('shape contexts must be finite')
-        return cls(k_means(np.sqrt(contexts), count, np.random.default_rng(seed))[0])
-
     def histogram(self, contexts: Array) -> Array:
         """Votes (C,) of contexts (N, 60): a histogram that sums to 1."""
         squared = squared_distances(np.sqrt(contexts), self.centres)
@@ -153,22 +140,12 @@ def _pairs(count: int) -> tuple[Index, Index]:
     return first, second
 
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
-
 SIZE = 128  # longer side of the person before anything is measured, px
 MAP = 16  # cells of a side of the map of distances
 EXTENT = 4.4  # width of the map in radii of gyration; stretched arms and legs are inside
 DEEPEST, FURTHEST = 0.25, 0.60  # limits of the distances inside and outside, radii of gyration
 MOMENTS = 12
 FIXED = PAIR_BINS + MAP * MAP + MOMENTS  # features besides those of the codebook
-FOR_CODEBOOK = 20_000  # maximum number of shape contexts that are clustered
-# Share of each part in the distance between two silhouettes.
-WEIGHTS = {'shape_contexts': 1.0, 'edge_pairs': 0.5, 'distances': 1.0, 'moments': 0.5}
-# Components are divided by their standard deviation to this power: 0 keeps the metric of the parts,
-# 1 would make noise as important as everything else.
-WHITENING = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,137 +182,78 @@ def silhouette_parts(mask: ArrayLike, points: int = 100) -> SilhouetteParts:
     )
 
 
+@dataclass(frozen=True, eq=False)
 class SilhouetteDescriptor:
-    """Vectors of silhouettes; learns its codebook and its components from silhouettes.
-
-    Args:
-        codebook_size: Number of centres of the codebook.
-        components: Maximum number of components of the vector.
+    """Vectors of silhouettes, as `hmt_learning.training.descriptor_learning` has learned them.
 
     Attributes:
-        codebook_: Codebook of shape contexts.
-        centre_: (q,) mean of the weighted parts.
-        scale_: (q,) weights of the parts.
-        basis_: (q, p) principal directions, scaled.
+        codebook: Codebook of shape contexts.
+        scale: (q,) weights of the parts.
+        centre: (q,) mean of the weighted parts.
+        basis: (q, p) principal directions, scaled.
+        points: Number of points on the outline.
+
+    Raises:
+        ValueError: arrays that do not fit, or are not finite.
     """
 
-    def __init__(
-        self, codebook_size: int = 50, points: int = 100, components: int = 64, seed: int = 0
-    ) -> None:
-        self.codebook_size = codebook_size
-        self.points = points
-        self.components = components
-        self.seed = seed
+    codebook: ShapeContextCodebook
+    scale: Array
+    centre: Array
+    basis: Array
+    points: int = 100
 
-    def fit(self, parts: list[SilhouetteParts]) -> Self:
-        """Learns from silhouettes.
-
-        Raises:
-            ValueError: there are too few silhouettes.
-        """
-        if len(parts) < 2:
-            raise ValueError(f'a descriptor needs 2 silhouettes at least, saw {len(parts)}')
-        step = max(len(parts) * self.points // FOR_CODEBOOK, 1)
-        rng = np.random.default_rng(self.seed)
-        chosen = rng.permutation(len(parts) * self.points)[: FOR_CODEBOOK * step : step]
-        contexts = np.concatenate([part.contexts for part in parts])[np.sort(chosen)]
-        self.codebook_ = ShapeContextCodebook.of(contexts, self.codebook_size, self.seed)
-        rows = [self._features(part) for part in parts]
-        names = list(rows[0])
-        columns = {name: np.array([row[name] for row in rows]) for name in names}
-        self.scale_ = np.concatenate([_weights(name, columns[name]) for name in names])
-        features = np.concatenate([columns[name] for name in names], axis=1) * self.scale_
-        self.centre_ = features.mean(0)
-        _, deviations, directions = np.linalg.svd(features - self.centre_, full_matrices=False)
-        count = min(self.components, int((deviations > 1e-6 * deviations[0]).sum()))
-        # The sign of a direction is arbitrary: make its largest entry positive.
-        signs = np.sign(directions[np.arange(count), np.abs(directions[:count]).argmax(1)])
-        stretch = (deviations[:count] / deviations[0]) ** -WHITENING
-        self.basis_ = directions[:count].T * (signs * stretch)
-        return self
-
-    def with_components(self, count: int) -> SilhouetteDescriptor:
-        """The descriptor with the first components alone, those of the largest variance.
-
-        Raises:
-            ValueError: the number is not between 1 and the number of components.
-        """
-        if not 1 <= count <= self.size:
-            raise ValueError(f'{count} components of a descriptor that has {self.size}')
-        result = SilhouetteDescriptor(self.codebook_size, self.points, count, self.seed)
-        result.codebook_, result.centre_, result.scale_ = self.codebook_, self.centre_, self.scale_
-        result.basis_ = self.basis_[:, :count]
-        return result
+    def __post_init__(self) -> None:
+        for name in ('scale', 'centre', 'basis'):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f'{name} of the descriptor must be finite')
+        length = len(self.codebook.centres) + FIXED
+        shapes = (self.scale.shape, self.centre.shape, self.basis.shape[:1])
+        if shapes != ((length,),) * 3 or self.basis.ndim != 2:
+            raise ValueError(f'arrays of the descriptor have shapes {shapes}, wanted ({length},)')
 
     @property
     def size(self) -> int:
         """Length of the vector, p."""
-        return int(self.basis_.shape[1])
+        return int(self.basis.shape[1])
 
     def describe(self, parts: Iterable[SilhouetteParts]) -> Array:
         """Vectors (n, p) of silhouettes."""
-        features = np.array([np.concatenate(list(self._features(x).values())) for x in parts])
-        result: Array = (features * self.scale_ - self.centre_) @ self.basis_
-        return result
-
-    def _features(self, parts: SilhouetteParts) -> dict[str, Array]:
-        # Square roots of shares, as in the codebook.
-        return {
-            'shape_contexts': np.sqrt(self.codebook_.histogram(parts.contexts)),
-            'edge_pairs': np.sqrt(parts.edge_pairs),
-            'distances': parts.distances,
-            'moments': parts.moments,
-        }
-
-    def parameters(self) -> dict[str, Any]:
-        """The constructor's arguments."""
-        return {
-            'codebook_size': self.codebook_size,
-            'points': self.points,
-            'components': self.components,
-            'seed': self.seed,
-        }
+        features = [np.concatenate([*features_of(self.codebook, x).values()]) for x in parts]
+        return np.asarray((np.array(features) * self.scale - self.centre) @ self.basis)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The learned arrays in single precision, for a file."""
         return {
-            'codebook': self.codebook_.centres.astype(np.float32),
-            'scale': self.scale_.astype(np.float32),
-            'centre': self.centre_.astype(np.float32),
-            'basis': self.basis_.astype(np.float32),
+            'codebook': self.codebook.centres.astype(np.float32),
+            'scale': self.scale.astype(np.float32),
+            'centre': self.centre.astype(np.float32),
+            'basis': self.basis.astype(np.float32),
         }
 
     @classmethod
-    def from_arrays(
-        cls, parameters: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
-    ) -> SilhouetteDescriptor:
-        """The descriptor that `parameters` and `to_arrays` stored.
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], points: int) -> SilhouetteDescriptor:
+        """The descriptor that `to_arrays` stored.
 
         Raises:
-            ValueError, KeyError, TypeError: arrays are missing or do not fit.
+            ValueError, KeyError: arrays are missing or do not fit.
         """
-        result = cls(**parameters)
-        result.codebook_ = ShapeContextCodebook(np.asarray(arrays['codebook'], dtype=np.float64))
-        for name in ('scale', 'centre', 'basis'):
-            value = np.asarray(arrays[name], dtype=np.float64)
-            if not np.isfinite(value).all():
-                raise ValueError(f'{name} of the descriptor must be finite')
-            setattr(result, f'{name}_', value)
-        length = len(result.codebook_.centres) + FIXED
-        shapes = (result.scale_.shape, result.centre_.shape, result.basis_.shape[:1])
-        if shapes != ((length,),) * 3 or result.basis_.ndim != 2:
-            raise ValueError(f'arrays of the descriptor have shapes {shapes}, wanted ({length},)')
-        return result
+        codebook, scale, centre, basis = (
+            np.asarray(arrays[name], dtype=np.float64)
+            for name in ('codebook', 'scale', 'centre', 'basis')
+        )
+        return cls(ShapeContextCodebook(codebook), scale, centre, basis, points)
 
 
-def _weights(name: str, columns: Array) -> Array:
-    """Weights (k,) of the features (N, k) of a part; moments are weighted one by one."""
-    if name == 'moments':
-        spread = np.sqrt(columns.shape[1]) * np.maximum(columns.std(0), 1e-6)
-    else:
-        spread = np.full(columns.shape[1], max(float(np.sqrt(columns.var(0).sum())), 1e-9))
-    result: Array = WEIGHTS[name] / spread
-    return result
+def features_of(codebook: ShapeContextCodebook, parts: SilhouetteParts) -> dict[str, Array]:
+    """The features of a silhouette, by part, before they are weighted."""
+    # Square roots of shares, as in the codebook.
+    return {
+        'shape_contexts': np.sqrt(codebook.histogram(parts.contexts)),
+        'edge_pairs': np.sqrt(parts.edge_pairs),
+        'distances': parts.distances,
+        'moments': parts.moments,
+    }
 
 
 def _at_one_size(mask: Bytes) -> Bytes:
@@ -344,8 +262,7 @@ def _at_one_size(mask: Bytes) -> Bytes:
     height, width = (max(round(side * factor), 3) for side in mask.shape)
     how = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
     resized = cv2.resize(mask * np.uint8(255), (width, height), interpolation=how)
-    result: Bytes = (resized > 127).astype(np.uint8)
-    return result
+    return (resized > 127).astype(np.uint8)
 
 
 def _map_and_moments(mask: Bytes) -> tuple[Array, Array]:

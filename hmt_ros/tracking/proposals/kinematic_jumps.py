@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import forward
 from hmt_ros.flips.limb_products import LimbProducts
+from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.keypoints import group_of
@@ -66,11 +66,12 @@ def find_limb(
     block = covariance[np.ix_(own, own)]
     samples = _drawn(body, own, pose[own], block, s.stretch, plan.samples, rng)
     of_limb, of_rest = posterior.divided[chain]
-    others = of_rest.energies(forward(body.skeleton, pose[None]), observation, derivatives=False)
-    seen = of_limb.seen(observation, explained=others.costs)
-    seen = (*seen, posterior.likelihood.pose_prior, *posterior.known)
+    others = PoseEnergy(of_rest, (ObservedImage(of_rest, observation),))
+    explained = others.by_cue(pose[None], derivatives=False).outline_costs
+    seen = of_limb.seen(observation, explained=explained)
+    terms = (*seen, posterior.likelihood.pose_prior, *posterior.known)
     motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
-    term = PoseEnergy(of_limb, seen, motion, pose, own)
+    term = PoseEnergy(of_limb, terms, motion, pose, own)
     value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
     best = samples[np.argsort(value, kind='stable')[: plan.refined]]
     posterior.spent.append(len(samples) + plan.refined * s.iterations)

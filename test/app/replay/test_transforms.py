@@ -6,7 +6,6 @@ import pytest
 from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.inputs import recorded_input, upright_frame
-from hmt_ros.sessions import tracking_parameters
 from hmt_ros.sessions.camera_frames import UP_SIGMA
 from msg_tools import BagReader, RosbagsMessages
 from msg_tools.bags.bag_metadata import absolute_name
@@ -83,12 +82,10 @@ def test_ground_is_that_of_the_frame(replayed):
         assert ground.height == pytest.approx(1.25, abs=0.05)
 
 
-def test_same_numbers_as_with_parameters_of_the_same_gravity(
-    replayed, moving, tmp_path, monkeypatch
-):
+def test_same_numbers_as_with_parameters_of_the_same_gravity(replayed, moving, tmp_path):
     down = [float(x) for x in -VIEW.rotation[:, 2]]
-    monkeypatch.setattr(tracking_parameters, 'GRAVITY_SIGMA', UP_SIGMA)
-    settings = [f'gravity={down}', 'camera_height=1.25', 'fixed_frame=']
+    sure = f'gravity_sigma={np.degrees(UP_SIGMA)}'
+    settings = [f'gravity={down}', sure, 'camera_height=1.25', 'fixed_frame=']
     settings = [x for one in settings for x in ('--set', one)]
     arguments = [str(moving), '-o', str(tmp_path / 'out'), *PERSON, *SMALL, *settings]
     assert main([*arguments, '--no-smoother', '--quiet']) == 0

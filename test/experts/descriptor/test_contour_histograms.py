@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_learning.training.descriptor_learning import learned_codebook
 from hmt_ros.experts.descriptor.contour import sample_contour
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
     ANGULAR,
@@ -46,7 +47,7 @@ def test_contexts_change_with_rotation_alone() -> None:
 
 def test_histogram_is_by_inverse_distance_and_sums_to_one() -> None:
     contexts = shape_contexts(cloud(2))
-    codebook = ShapeContextCodebook.of(contexts, 12)
+    codebook = learned_codebook(contexts, 12)
     found = codebook.histogram(contexts)
     assert found.sum() == pytest.approx(1.0)
     wanted = np.zeros(12)
@@ -60,7 +61,7 @@ def test_histogram_is_by_inverse_distance_and_sums_to_one() -> None:
 
 def test_codebook_is_the_same_for_the_same_contexts() -> None:
     contexts = shape_contexts(cloud(3))
-    first, second = (ShapeContextCodebook.of(contexts, 10, seed=4) for _ in range(2))
+    first, second = (learned_codebook(contexts, 10, seed=4) for _ in range(2))
     np.testing.assert_array_equal(first.centres, second.centres)
 
 
@@ -69,11 +70,11 @@ def test_contexts_that_give_no_codebook(bad: str) -> None:
     contexts = shape_contexts(cloud(6))
     if bad == 'few':
         with pytest.raises(ValueError, match='60 shape contexts for 61 centres'):
-            ShapeContextCodebook.of(contexts, 61)
+            learned_codebook(contexts, 61)
     else:
         contexts[3, 3] = np.nan
         with pytest.raises(ValueError, match='finite'):
-            ShapeContextCodebook.of(contexts, 5)
+            learned_codebook(contexts, 5)
 
 
 def test_centres_of_another_shape() -> None:

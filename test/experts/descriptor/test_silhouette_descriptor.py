@@ -6,6 +6,7 @@ import pytest
 
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_learning.motion.viewpoint import Viewpoint
+from hmt_learning.training.descriptor_learning import learned_descriptor
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError, centred_view, person_blob
@@ -33,9 +34,7 @@ def masks() -> np.ndarray:
 
 @pytest.fixture(scope='module')
 def descriptor(masks: np.ndarray) -> SilhouetteDescriptor:
-    return SilhouetteDescriptor(codebook_size=30, components=40).fit(
-        [silhouette_parts(x) for x in masks]
-    )
+    return learned_descriptor([silhouette_parts(x) for x in masks], codebook_size=30, components=40)
 
 
 def described(descriptor: SilhouetteDescriptor, mask: np.ndarray) -> np.ndarray:
@@ -86,7 +85,7 @@ def test_an_uneven_outline_changes_little(
 
 
 def test_arrays_bring_it_back(descriptor: SilhouetteDescriptor, masks: np.ndarray) -> None:
-    again = SilhouetteDescriptor.from_arrays(descriptor.parameters(), descriptor.to_arrays())
+    again = SilhouetteDescriptor.from_arrays(descriptor.to_arrays(), 100)
     assert again.size == descriptor.size == 40
     np.testing.assert_allclose(
         described(again, masks[3]), described(descriptor, masks[3]), rtol=1e-4, atol=1e-4
@@ -96,23 +95,21 @@ def test_arrays_bring_it_back(descriptor: SilhouetteDescriptor, masks: np.ndarra
 def test_it_learns_the_same_from_the_same(
     descriptor: SilhouetteDescriptor, masks: np.ndarray
 ) -> None:
-    again = SilhouetteDescriptor(codebook_size=30, components=40).fit(
-        [silhouette_parts(x) for x in masks]
+    again = learned_descriptor(
+        [silhouette_parts(x) for x in masks], codebook_size=30, components=40
     )
-    np.testing.assert_array_equal(again.basis_, descriptor.basis_)
+    np.testing.assert_array_equal(again.basis, descriptor.basis)
 
 
 @pytest.mark.parametrize('name', ['basis', 'scale'])
 def test_damaged_arrays(descriptor: SilhouetteDescriptor, name: str) -> None:
     arrays = descriptor.to_arrays()
     with pytest.raises(ValueError, match='wanted'):
-        SilhouetteDescriptor.from_arrays(
-            descriptor.parameters(), arrays | {name: arrays[name][:-1]}
-        )
+        SilhouetteDescriptor.from_arrays(arrays | {name: arrays[name][:-1]}, 100)
     spoilt = arrays[name].copy()
     spoilt[0] = np.nan
     with pytest.raises(ValueError, match='finite'):
-        SilhouetteDescriptor.from_arrays(descriptor.parameters(), arrays | {name: spoilt})
+        SilhouetteDescriptor.from_arrays(arrays | {name: spoilt}, 100)
 
 
 def test_nobody(descriptor: SilhouetteDescriptor) -> None:
@@ -122,7 +119,7 @@ def test_nobody(descriptor: SilhouetteDescriptor) -> None:
 
 def test_one_silhouette_is_too_few(masks: np.ndarray) -> None:
     with pytest.raises(ValueError, match='2 silhouettes'):
-        SilhouetteDescriptor().fit([silhouette_parts(masks[0])])
+        learned_descriptor([silhouette_parts(masks[0])])
 
 
 def test_the_centred_view_undoes_place_and_lens() -> None:

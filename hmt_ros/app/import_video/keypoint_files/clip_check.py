@@ -19,13 +19,14 @@ above 4.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, Person
+from hmt_ros.app.progress import Tell
 from hmt_ros.image.keypoint_schemes import (
     AUTO,
     JOINTS,
@@ -37,8 +38,6 @@ from hmt_ros.image.keypoint_schemes import (
     unnamed_orders,
 )
 from hmt_ros.inference.arrays import Array, Mask
-
-Tell = Callable[[str], None]
 
 # Largest confidences that detectors write for what they are sure of.
 _SCALES = (100.0, 255.0, 1000.0)

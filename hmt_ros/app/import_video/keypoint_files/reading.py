@@ -10,11 +10,12 @@ import numpy as np
 from hmt_ros.app.import_video.frames import FrameSource
 from hmt_ros.app.import_video.keypoint_files.arrays import read_arrays
 from hmt_ros.app.import_video.keypoint_files.choice import Choice, chosen_person
-from hmt_ros.app.import_video.keypoint_files.clip_check import Tell, check_clip, check_steps
+from hmt_ros.app.import_video.keypoint_files.clip_check import check_clip, check_steps
 from hmt_ros.app.import_video.keypoint_files.folders import read_folder
 from hmt_ros.app.import_video.keypoint_files.json_layouts import add_json, read_json
 from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons
 from hmt_ros.app.import_video.keypoint_files.tables import read_table
+from hmt_ros.app.progress import Tell
 from hmt_ros.body.skeleton import other_side
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from hmt_learning.app import make_bag
-from hmt_ros.app.demo import main
 from hmt_ros.app.report.mixtures import Layer, Moment, read_mixtures
 from hmt_ros.app.report.skeletons import LEFT, RIGHT, draw_overview
 from hmt_ros.app.truth import read_truth
@@ -20,6 +19,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.keypoints import keypoints_message, positions_message
+from tools.demonstration.demo import main
 
 PICTURES = ('overview.png', 'overlays.png', 'side_views.png', 'weights.png', 'calibration.png')
 

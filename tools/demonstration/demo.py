@@ -1,6 +1,6 @@
 """The demonstration of `make demo`: tracks the person in a bag, prints the errors, writes a report.
 
-`python -m hmt_ros.app.demo bags/reach -o build/demo --live`
+    python tools/demonstration/demo.py bags/reach -o build/demo --live
 
 The person is tracked twice if the bag has keypoints of a detector: by the images alone, and by the
 images and the keypoints. Errors are those of the joints of the arms and legs that the detector has,

@@ -1,0 +1,86 @@
+"""Learning of the descriptor of silhouettes: its codebook, weights and principal components.
+
+K-means over shape contexts of the training silhouettes gives the codebook. The four parts of the
+descriptor are weighted by their spread, and projected on their principal components.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmt_ros.experts.descriptor.silhouette_descriptor import (
+    ShapeContextCodebook,
+    SilhouetteDescriptor,
+    SilhouetteParts,
+    features_of,
+)
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.clustering import k_means
+
+FOR_CODEBOOK = 20_000  # maximum number of shape contexts that are clustered
+# Share of each part in the distance between two silhouettes.
+WEIGHTS = {'shape_contexts': 1.0, 'edge_pairs': 0.5, 'distances': 1.0, 'moments': 0.5}
+# Components are divided by their standard deviation to this power: 0 keeps the metric of the parts,
+# 1 would make noise as important as everything else.
+WHITENING = 0.3
+
+
+def learned_codebook(contexts: Array, count: int = 50, seed: int = 0) -> ShapeContextCodebook:
+    """The codebook of contexts (N, 60); the same contexts and seed give the same centres.
+
+    Raises:
+        ValueError: there are fewer contexts than centres, or some are not finite.
+    """
+    if len(contexts) < count:
+        raise ValueError(f'{len(contexts)} shape contexts for {count} centres: give more masks')
+    if not np.isfinite(contexts).all():
+        raise ValueError('shape contexts must be finite')
+    return ShapeContextCodebook(k_means(np.sqrt(contexts), count, np.random.default_rng(seed))[0])
+
+
+def learned_descriptor(
+    parts: list[SilhouetteParts],
+    *,
+    codebook_size: int = 50,
+    points: int = 100,
+    components: int = 64,
+) -> SilhouetteDescriptor:
+    """The descriptor that silhouettes give.
+
+    Args:
+        parts: of silhouettes with so many points.
+        codebook_size: Number of centres of the codebook.
+        components: Maximum number of components of the vector.
+
+    Raises:
+        ValueError: there are too few silhouettes.
+    """
+    if len(parts) < 2:
+        raise ValueError(f'a descriptor needs 2 silhouettes at least, saw {len(parts)}')
+    total = len(parts) * points
+    step = max(total // FOR_CODEBOOK, 1)
+    chosen = np.random.default_rng(0).permutation(total)[: FOR_CODEBOOK * step : step]
+    contexts = np.concatenate([part.contexts for part in parts])[np.sort(chosen)]
+    codebook = learned_codebook(contexts, codebook_size)
+    rows = [features_of(codebook, part) for part in parts]
+    names = list(rows[0])
+    columns = {name: np.array([row[name] for row in rows]) for name in names}
+    scale = np.concatenate([_weights(name, columns[name]) for name in names])
+    features = np.concatenate([columns[name] for name in names], axis=1) * scale
+    centre = features.mean(0)
+    _, deviations, directions = np.linalg.svd(features - centre, full_matrices=False)
+    count = min(components, int((deviations > 1e-6 * deviations[0]).sum()))
+    # The sign of a direction is arbitrary: make its largest entry positive.
+    signs = np.sign(directions[np.arange(count), np.abs(directions[:count]).argmax(1)])
+    stretch = (deviations[:count] / deviations[0]) ** -WHITENING
+    basis = directions[:count].T * (signs * stretch)
+    return SilhouetteDescriptor(codebook, scale, centre, basis, points)
+
+
+def _weights(name: str, columns: Array) -> Array:
+    """Weights (k,) of the features (N, k) of a part; moments are weighted one by one."""
+    if name == 'moments':
+        spread = np.sqrt(columns.shape[1]) * np.maximum(columns.std(0), 1e-6)
+    else:
+        spread = np.full(columns.shape[1], max(float(np.sqrt(columns.var(0).sum())), 1e-9))
+    return np.asarray(WEIGHTS[name] / spread)
