@@ -197,10 +197,8 @@ class Posterior:
         last = self._last_fit
         if last is not None and last[0] is poses and last[1] is observation and last[2] == share:
             return last[3]
-        image, *keypoints = self.likelihood.seen(observation)
-        if keypoints:
-            keypoints = [self.likelihood.keypoint_term(observation, None, lifted_share=share)]
-        terms = (image, *keypoints, *self.likelihood.priors, *self.known)
+        seen_terms = self.likelihood.seen(observation, lifted_share=share)
+        terms = (*seen_terms, *self.likelihood.priors, *self.known)
         found = PoseEnergy(self.likelihood, terms).by_cue(poses)
         gradient, hessian = found.energy.derivatives()
         free = ~resting(poses, gradient, self.body.lower, self.body.upper)
@@ -232,15 +230,13 @@ class Posterior:
         """
         self.spent.append(len(poses))
         share = {name: errors.share(dt) for name, errors in ERRORS.items()}
-
-        image, *keypoints = self.likelihood.seen(observation)
-        if keypoints:
-            keypoints = [
-                self.likelihood.keypoint_term(
-                    observation, known_exchanges(exchanges), share['keypoints'], share['lifted']
-                )
-            ]
-        terms = (image, *keypoints, *self.likelihood.priors, *self.known)
+        seen = self.likelihood.seen(
+            observation,
+            exchanges=known_exchanges(exchanges),
+            share=share['keypoints'],
+            lifted_share=share['lifted'],
+        )
+        terms = (*seen, *self.likelihood.priors, *self.known)
         values = PoseEnergy(self.likelihood, terms).by_cue(poses, derivatives=False).values
         return np.asarray(values @ [share['image'], 1.0, share['prior']])
 
