@@ -13,8 +13,7 @@ from hmt_ros.tracking import observer as observer_module
 from hmt_ros.tracking import tracker as tracker_module
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps, LimbSearch
-from hmt_ros.tracking.proposals.sampling import CovarianceScaledSamples
+from hmt_ros.tracking.proposals import kinematic_jumps as jumps_module
 
 # Part of the tracker -> name of the stage; time in a part that another part calls is its own.
 Stages = Sequence[tuple[Any, str, str]]
@@ -23,9 +22,8 @@ STAGES: Stages = (
     (observer_module, 'observe', 'observation'),
     (MixtureFilter, 'begin', 'start of the track'),
     (filter_module, 'follow_flow', 'motion'),
-    (KinematicJumps, 'propose', 'combinations'),
-    (CovarianceScaledSamples, 'propose', 'samples'),
-    (LimbSearch, 'find', 'chain search'),
+    (filter_module, 'propose', 'proposals'),
+    (jumps_module, 'find_limb', 'chain search'),
     (Posterior, 'values', 'rating'),
     (Posterior, 'minimise', 'candidates'),
     (MixtureFilter, '_weigh', 'keeping'),
@@ -35,7 +33,7 @@ STAGES: Stages = (
 )
 # In these, minimisation is part of the stage.
 WHOLE = ('motion', 'start of the track', 'flesh')
-PROPOSED = ('combinations', 'samples')
+PROPOSED = ('proposals',)
 
 
 class StageClock:

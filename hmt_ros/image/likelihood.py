@@ -107,19 +107,21 @@ class ImageLikelihood:
         observation: Observation,
         explained: Array | None = None,
         exchanges: Array | None = None,
+        share: float = 1.0,
+        lifted_share: float = 1.0,
     ) -> tuple[ObservedImage | KeypointTerm, ...]:
         """The terms of the image and of the keypoints.
 
         Args:
             observation: of the image.
             explained: as for `ObservedImage`.
-            exchanges: as for `keypoint_term`.
+            exchanges, share, lifted_share: as for `keypoint_term`.
         """
         image = ObservedImage(self, observation, explained)
         keypoints, s = observation.keypoints, self.settings.keypoints
         if keypoints is None or s.weight == 0:
             return (image,)
-        return (image, self.keypoint_term(observation, exchanges))
+        return (image, self.keypoint_term(observation, exchanges, share, lifted_share))
 
     def keypoint_term(
         self,

@@ -4,8 +4,8 @@ from hmt_ros.body.ground_terms import GroundSettings
 from hmt_ros.image.subject import Subject, SubjectError, read_subject
 from hmt_ros.tracking.existence import Status
 from hmt_ros.tracking.ground import Ground, KnownGround
+from hmt_ros.tracking.hypotheses import PosePrediction
 from hmt_ros.tracking.lagged_weights import Lagged, LaggedWeights
-from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.tracker import Tracker
 

@@ -31,8 +31,8 @@ from hmt_ros.image.person_shape import (
 )
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.error_model import seconds
+from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.settings import MAJORITY, UNDECIDED_FRACTION
-from hmt_ros.tracking.view import View
 
 
 class Silhouetted(NamedTuple):

@@ -26,9 +26,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 
@@ -39,7 +38,7 @@ from hmt_ros.experts.lifted_fit import KNOWN_SIZE, poses_of
 from hmt_ros.experts.lifter import landmark_rays
 from hmt_ros.image.joint_depths import depths_of, moved_to_depth
 from hmt_ros.image.keypoint_evidence import FEWEST_KEYPOINTS, shows_a_part, suffices
-from hmt_ros.image.observation import Box, Observation
+from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.person_shape import looks_like_person
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.subject import Subject
@@ -50,15 +49,16 @@ from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.existence import CLEAR, Existence
 from hmt_ros.tracking.ground import Gravity
+from hmt_ros.tracking.hypotheses import PosePrediction
 from hmt_ros.tracking.initialisation import (
+    Start,
     mixture_from_box,
     poses_from_keypoints,
     poses_from_outline,
     start_from_keypoints,
 )
-from hmt_ros.tracking.pose_prediction import PosePrediction
+from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOMENT
-from hmt_ros.tracking.view import View
 
 # What a prediction is sure of by itself, nats: in the first image nothing else has spoken.
 AT_ONCE = 1.5 * CLEAR.nats
@@ -85,27 +85,6 @@ FROM_SILHOUETTES = (Source.PREDICTION, Source.ARRIVAL)
 
 
 @dataclass(frozen=True, eq=False)
-class Beginning:
-    """A start, as `MixtureFilter.begin` takes it; see there.
-
-    Attributes:
-        source: the input that it comes from.
-    """
-
-    source: Source
-    body: Body
-    start: GaussianMixture | Array
-    clicked: Keypoints | None = None
-
-    @property
-    def best(self) -> Array:
-        """The most probable pose (1, d)."""
-        if isinstance(self.start, GaussianMixture):
-            return self.start.means[[int(np.argmax(self.start.weights))]]
-        return self.start[:1]
-
-
-@dataclass(frozen=True, eq=False)
 class Shown:
     """An image, and what was given before it.
 
@@ -117,7 +96,6 @@ class Shown:
         upright: gravity; None: unknown.
         given: subject or mixture that the track starts from; None: the images start it.
         box: (left, top, right, bottom) of the person, px; None: unknown.
-        observed: makes the observation of the image.
     """
 
     view: View
@@ -127,7 +105,6 @@ class Shown:
     upright: Gravity | None
     given: Subject | GaussianMixture | None
     box: Box | None
-    observed: Callable[[], Observation]
 
     @property
     def depths(self) -> ImageMap | None:
@@ -135,7 +112,7 @@ class Shown:
         return depths_of(self.view.depth)
 
 
-def _from_subject(shown: Shown) -> Beginning:
+def _from_subject(shown: Shown) -> Start:
     subject = shown.given
     assert isinstance(subject, Subject)
     fresh = seconds(shown.view.stamp - subject.stamp_ns) <= SAME_MOMENT
@@ -146,15 +123,15 @@ def _from_subject(shown: Shown) -> Beginning:
         upright=shown.upright,
         depths=shown.depths if fresh else None,
     )
-    return Beginning(Source.SUBJECT, begun.body, begun.poses, clicked=subject.keypoints)
+    return replace(begun, clicked=subject.keypoints)
 
 
-def _from_mixture(shown: Shown) -> Beginning:
+def _from_mixture(shown: Shown) -> Start:
     assert isinstance(shown.given, GaussianMixture)
-    return Beginning(Source.MIXTURE, shown.body, shown.given)
+    return Start(shown.body, shown.given.means, shown.given)
 
 
-def _from_keypoints(shown: Shown) -> Beginning:
+def _from_keypoints(shown: Shown) -> Start:
     keypoints, camera, depths = shown.view.keypoints, shown.camera, shown.depths
     assert keypoints is not None
     begun = start_from_keypoints(
@@ -164,34 +141,35 @@ def _from_keypoints(shown: Shown) -> Beginning:
     if shown.view.prediction is not None:
         more.append(shown.view.prediction.seen_as(begun.body).means)
     poses = [moved_to_depth(begun.body, camera, x, depths) for x in more]
-    own = with_reversals(begun.body, begun.poses)
-    return Beginning(Source.KEYPOINTS, begun.body, np.concatenate([own, *poses]))
+    return Start(begun.body, np.concatenate([with_reversals(begun.body, begun.poses), *poses]))
 
 
-def _from_prediction(shown: Shown) -> Beginning:
+def _from_prediction(shown: Shown) -> Start:
     prediction = shown.view.prediction
     assert prediction is not None
-    both = _mixture_at(
-        prediction.both_ways(prediction.body), prediction.body, shown.camera, shown.depths
-    )
-    return Beginning(Source.PREDICTION, prediction.body, both)
+    return _at_depth(shown, prediction.body, prediction.both_ways(prediction.body))
 
 
-def _from_box(shown: Shown) -> Beginning:
+def _from_box(shown: Shown) -> Start:
     assert shown.box is not None
-    mixture = mixture_from_box(shown.model, shown.camera, shown.box)
-    start = _mixture_at(mixture, shown.model, shown.camera, shown.depths)
-    return Beginning(Source.BOX, shown.model, start)
+    return _at_depth(shown, shown.model, mixture_from_box(shown.model, shown.camera, shown.box))
 
 
-def _from_mask(shown: Shown) -> Beginning | None:
-    outline, camera = shown.observed().outline, shown.camera
-    if outline is None:
-        return None
-    poses = poses_from_outline(shown.model, camera, outline)
-    return Beginning(
-        Source.MASK, shown.model, moved_to_depth(shown.model, camera, poses, shown.depths)
+def _at_depth(shown: Shown, body: Body, mixture: GaussianMixture) -> Start:
+    """A mixture over poses, moved to where a depth image shows their trunks."""
+    means = moved_to_depth(body, shown.camera, mixture.means, shown.depths)
+    return Start(body, means, replace(mixture, means=means))
+
+
+def _from_mask(shown: Shown) -> Start | None:
+    view, model, camera = shown.view, shown.model, shown.camera
+    seen = observe(
+        view.image, view.silhouette, wanted=('coverage',), unsure=view.unsure, others=view.others
     )
+    if seen.outline is None:
+        return None
+    poses = poses_from_outline(model, camera, seen.outline)
+    return Start(model, moved_to_depth(model, camera, poses, shown.depths))
 
 
 def _masked(shown: Shown) -> bool:
@@ -199,56 +177,55 @@ def _masked(shown: Shown) -> bool:
     return mask is not None and silhouette is not None and looks_like_person(silhouette)
 
 
-class StartKind(NamedTuple):
-    """A row of the table.
-
-    Attributes:
-        needs: whether an image has what it takes.
-        sure: how sure it is that somebody is there, beside the evidence for existence, nats.
-        begin: makes the start; None: the image does not show it after all.
-    """
-
-    needs: Callable[[Shown], bool]
-    sure: float
-    begin: Callable[[Shown], Beginning | None]
-
-
-STARTS = (
-    StartKind(
+# The source; whether an image has what it takes; how sure it is that somebody is there, beside the
+# evidence for existence, nats; and what makes the start, None if the image does not show it.
+STARTS: tuple[
+    tuple[Source, Callable[[Shown], bool], float, Callable[[Shown], Start | None]], ...
+] = (
+    (
+        Source.SUBJECT,
         lambda x: (
             isinstance(x.given, Subject) and x.box is None and x.view.stamp >= x.given.stamp_ns
         ),
         math.inf,
         _from_subject,
     ),
-    StartKind(
-        lambda x: isinstance(x.given, GaussianMixture) and x.box is None, math.inf, _from_mixture
+    (
+        Source.MIXTURE,
+        lambda x: isinstance(x.given, GaussianMixture) and x.box is None,
+        math.inf,
+        _from_mixture,
     ),
-    StartKind(lambda x: suffices(x.view.keypoints, x.model), 0.0, _from_keypoints),
-    StartKind(lambda x: x.view.prediction is not None, AT_ONCE, _from_prediction),
-    StartKind(lambda x: shows_a_part(x.view.keypoints, x.model), 0.0, _from_keypoints),
-    StartKind(lambda x: x.box is not None, math.inf, _from_box),
-    StartKind(_masked, 0.0, _from_mask),
+    (Source.KEYPOINTS, lambda x: suffices(x.view.keypoints, x.model), 0.0, _from_keypoints),
+    (Source.PREDICTION, lambda x: x.view.prediction is not None, AT_ONCE, _from_prediction),
+    (Source.KEYPOINTS, lambda x: shows_a_part(x.view.keypoints, x.model), 0.0, _from_keypoints),
+    (Source.BOX, lambda x: x.box is not None, math.inf, _from_box),
+    (Source.MASK, _masked, 0.0, _from_mask),
 )
 
 
-def first_start(shown: Shown, existence: Existence) -> Beginning | None:
-    """The start of the track at an image; None: it does not start there."""
+def first_start(shown: Shown, existence: Existence) -> tuple[Source, Start] | None:
+    """The start of the track at an image, and its source; None: it does not start there."""
     awaited = shown.given is not None and shown.box is None
-    kinds = (
-        kind for kind in STARTS if kind.needs(shown) and (kind.sure == math.inf or not awaited)
+    usable = (
+        (source, sure, begin)
+        for source, has, sure, begin in STARTS
+        if has(shown) and (sure == math.inf or not awaited)
     )
-    kind = next(kinds, None)
-    if kind is None:
+    first = next(usable, None)
+    if first is None:
         return None
-    sure = math.inf if shown.box is not None else kind.sure
+    source, sure, begin = first
+    if shown.box is not None:
+        sure = math.inf
     log_odds = existence.log_odds + sure
     if log_odds < PRESENT_LOG_ODDS or (not sure and existence.last.llr <= 0.0):
         return None
-    begun = kind.begin(shown)
-    if begun is not None:
-        log_odds += log_prior_of_distance(shown.camera, float(begun.best[0, 2]))
-    return begun if log_odds >= PRESENT_LOG_ODDS else None
+    begun = begin(shown)
+    if begun is None:
+        return None
+    log_odds += log_prior_of_distance(shown.camera, float(begun.best[0, 2]))
+    return (source, begun) if log_odds >= PRESENT_LOG_ODDS else None
 
 
 def lifted_poses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
@@ -259,16 +236,6 @@ def lifted_poses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
     rays, confidences = landmark_rays(camera, keypoints)
     (found,) = poses_of(body, [lifted], rays[None], confidences[None], KNOWN_SIZE)
     return found.means
-
-
-def _mixture_at(
-    mixture: GaussianMixture, body: Body, camera: Camera, depths: ImageMap | None
-) -> GaussianMixture:
-    """A mixture over poses, moved to where a depth image shows their trunks."""
-    if depths is None:
-        return mixture
-    means = moved_to_depth(body, camera, mixture.means, depths)
-    return GaussianMixture(mixture.weights, means, mixture.covariances)
 
 
 def poses_to_search(

@@ -48,6 +48,7 @@ from hmt_ros.image.still_picture import StillPicture
 from hmt_ros.inference.error_model import seconds, share_of_time
 from hmt_ros.inference.markov_chain import MarkovChain, of_log_odds, update
 from hmt_ros.tracking.appearance import Appearance
+from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.settings import (
     ABSENT_PROBABILITY,
     EXISTENCE_CUES,
@@ -56,7 +57,6 @@ from hmt_ros.tracking.settings import (
     PRESENT_PROBABILITY,
     RATES,
 )
-from hmt_ros.tracking.view import View
 
 CHAIN = MarkovChain.of_two(*RATES['existence'])
 NO_MOTION = Motion(moved=False, still=False)

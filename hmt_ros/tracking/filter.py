@@ -21,12 +21,9 @@ from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.body.postures import postures_of
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface_points import SurfacePoints, seen_points
-from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.unseen_limbs import UnseenLimbs
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
-from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.inference.motion_states import PredictedStates
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.classes import (
     best_of_the_other_way,
@@ -35,16 +32,15 @@ from hmt_ros.tracking.classes import (
     ways,
     weigh_ways,
 )
-from hmt_ros.tracking.contact import contacts_of
-from hmt_ros.tracking.evaluation_plan import is_surprising
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import (
     Identities,
     Modes,
     Optimised,
-    joined,
+    PosePrediction,
     new_hypotheses,
 )
+from hmt_ros.tracking.initialisation import Start
 from hmt_ros.tracking.laplace_approximation import posterior_modes
 from hmt_ros.tracking.misfit import (
     KEYPOINTS,
@@ -54,13 +50,12 @@ from hmt_ros.tracking.misfit import (
     of_keypoints,
     of_silhouette,
 )
-from hmt_ros.tracking.optimisation import Search
+from hmt_ros.tracking.optimisation import Search, is_surprising
 from hmt_ros.tracking.point_estimate import PointEstimate
-from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
-from hmt_ros.tracking.proposals import proposals_of
-from hmt_ros.tracking.proposals.keypoint_poses import KeypointHistory
+from hmt_ros.tracking.proposals import proposals_of, propose
+from hmt_ros.tracking.proposals.whole_poses import PoseByKeypoints
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import FIRST_SHAPE_FITS, POSTURE_BITS, SHAPE_MODES, TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
@@ -78,26 +73,6 @@ class Judged(NamedTuple):
 
     misfits: dict[str, Misfit]
     alone: ByKeypoints | None
-
-
-class Weighed(NamedTuple):
-    """N distinct hypotheses.
-
-    Attributes:
-        optimised: at their optima.
-        log_weights: (N,).
-        facing: (N,) log odds of the way that each faces.
-        histories: (K, N) log w_k p(x_n | x_k), of K modes before; K is 0 where modes begin.
-        states: of the ancestors, predicted; None: the modes begin.
-        dt: time since the image before, s; infinite: the modes begin.
-    """
-
-    optimised: Optimised
-    log_weights: Array
-    facing: Array
-    histories: Array
-    states: PredictedStates | None
-    dt: float
 
 
 class MixtureFilter:
@@ -148,7 +123,8 @@ class MixtureFilter:
         self._identities = Identities()
         self._outline_costs = np.empty((0, 0))
         self._points: SurfacePoints | None = None
-        self._by_keypoints = KeypointHistory()
+        self._by_keypoints = PoseByKeypoints()
+        self._proposals = proposals_of(settings.proposals)
         self._use_body(body)
 
     @property
@@ -158,37 +134,24 @@ class MixtureFilter:
 
     # The start.
 
-    def begin(
-        self,
-        body: Body,
-        start: GaussianMixture | Array,
-        observation: Observation,
-        clicked: Keypoints | None = None,
-    ) -> Judged:
-        """Starts a track.
-
-        Args:
-            body: of the person; its shape is estimated.
-            start: expected poses, or poses (N, d) that all count the same.
-            observation: of the first image.
-            clicked: keypoints that the start is fitted to, in place of those of the image.
-        """
+    def begin(self, start: Start, observation: Observation) -> Judged:
+        """Starts a track from an observation of its first image."""
         self.spent.clear()
-        if isinstance(start, GaussianMixture):
-            poses = start.means
+        poses = start.poses
+        log_weights, precisions = np.zeros(len(poses)), np.zeros((*poses.shape, poses.shape[1]))
+        if start.expected is not None:
             with np.errstate(divide='ignore'):
-                log_weights = np.log(start.normalised().weights)
-            precisions = np.asarray(np.linalg.inv(start.covariances), dtype=np.float64)
-        else:
-            poses, log_weights = start, np.zeros(len(start))
-            precisions = np.zeros((len(poses), body.dimension, body.dimension))
-        seen = observation if clicked is None else replace(observation, keypoints=clicked)
-        if body is not self.body:
-            self._use_body(body)
-        self.shape = ShapeEstimate(body)
+                log_weights = np.log(start.expected.normalised().weights)
+            precisions = np.asarray(np.linalg.inv(start.expected.covariances), dtype=np.float64)
+        seen = observation
+        if start.clicked is not None:
+            seen = replace(observation, keypoints=start.clicked)
+        if start.body is not self.body:
+            self._use_body(start.body)
+        self.shape = ShapeEstimate(start.body)
 
         def settle(starts: Array, iterations: int) -> Array:
-            self._identities.restart()
+            self._identities = Identities()
             term = self.posterior.given(seen, poses, precisions)
             solved = self.posterior.minimise(term, starts, iterations)
             self._initialise(Optimised(new_hypotheses(solved.x, log_weights), solved), seen)
@@ -213,7 +176,7 @@ class MixtureFilter:
 
     def _initialise(self, optimised: Optimised, observation: Observation) -> None:
         """Sets the modes of a new track, at zero velocity."""
-        self._by_keypoints = KeypointHistory()
+        self._by_keypoints = PoseByKeypoints()
         optimised = _finite(optimised)
         log_weights = optimised.hypotheses.log_weights
         log_weights = log_weights - ERRORS['image'].independent * optimised.minima.value
@@ -222,7 +185,7 @@ class MixtureFilter:
         optimised, log_weights = optimised[rows], log_weights[rows]
         facing = first_facing(self.body, optimised.minima.x, log_weights)
         nothing = np.empty((0, len(rows)))
-        self._select(Weighed(optimised, log_weights, facing, nothing, None, np.inf), observation)
+        self._select(optimised, log_weights, facing, nothing, observation, None)
 
     # One image after another.
 
@@ -265,15 +228,16 @@ class MixtureFilter:
             self._by_keypoints.contradicted,
             prediction,
         )
-        candidates = [x.propose(search, base, predicted, self._rng) for x in self._proposals]
-        self._select(self._weigh(search, search.optimise(joined(candidates))), observation)
+        candidates = propose(self._proposals, search, base, predicted, self._rng)
+        weighed = self._weigh(search, search.optimise(candidates))
+        self._select(*weighed, observation, search)
         self._fit_shape(observation, ERRORS['shape'].share(dt))
         return self._judge(observation, search)
 
     # The steps.
 
-    def _weigh(self, search: Search, optimised: Optimised) -> Weighed:
-        """The hypotheses that are distinct, with their weights."""
+    def _weigh(self, search: Search, optimised: Optimised) -> tuple[Optimised, Array, Array, Array]:
+        """The hypotheses that are distinct, with their weights: what `_select` takes."""
         optimised = _finite(optimised)
         evidence = search.evidence(optimised)
         # Where hypotheses meet, one that has moved there is kept before one that has jumped.
@@ -298,12 +262,30 @@ class MixtureFilter:
             np.asarray(~optimised.hypotheses.jumped.all(1)),
             search.dt,
         )
-        return Weighed(optimised, log_weights, facing, histories, search.states, search.dt)
+        return optimised, log_weights, facing, histories
 
-    def _select(self, weighed: Weighed, observation: Observation) -> None:
-        """Makes the modes of an image."""
-        s, posterior, dt = self.settings, self.posterior, weighed.dt
-        log_weights, poses = weighed.log_weights, weighed.optimised.minima.x
+    def _select(
+        self,
+        optimised: Optimised,
+        log_weights: Array,
+        facing: Array,
+        histories: Array,
+        observation: Observation,
+        search: Search | None,
+    ) -> None:
+        """Makes the modes of an image.
+
+        Args:
+            optimised: N distinct hypotheses at their optima.
+            log_weights: (N,).
+            facing: (N,) log odds of the way that each faces.
+            histories: (K, N) log w_k p(x_n | x_k), of K modes before; K is 0 where modes begin.
+            observation: of the image.
+            search: that led to the hypotheses; None: the modes begin.
+        """
+        s, posterior, poses = self.settings, self.posterior, optimised.minima.x
+        before = None if search is None else search.modes
+        dt = np.inf if search is None else search.dt
         best = poses[int(np.argmax(log_weights))]
         self.limbs.look(self.body, self.camera, observation, best, dt)
         kept = choose_hypotheses(
@@ -316,22 +298,21 @@ class MixtureFilter:
         weights = at_least(normalised(kept.log_weights), s.least_log_weight)
         order = np.argsort(-weights, kind='stable')
         rows = kept.chosen[order]
-        selected = weighed.optimised[rows]
-        before = self.modes if weighed.states is not None else None
+        selected = optimised[rows]
         modes = posterior_modes(
             selected,
             weights[order],
-            pooled_origins(weighed.histories, log_weights, kept.owner)[order],
+            pooled_origins(histories, log_weights, kept.owner)[order],
             posterior,
             observation,
             self.shape,
             self.dynamics,
-            weighed.states,
+            None if search is None else search.states,
             dt,
         )
         modes = replace(
             modes,
-            facing=weighed.facing[rows],
+            facing=facing[rows],
             back=ways(self.body, modes.poses, modes.poses[0]),
             exchanges=seen_exchanges(
                 posterior.likelihood, observation, modes.poses, selected.hypotheses.exchanges
@@ -339,8 +320,7 @@ class MixtureFilter:
             identities=self._identities.of(selected.hypotheses, before),
         )
         if posterior.ground is not None:
-            plane, still = posterior.ground.plane, posterior.ground.still
-            modes = contacts_of(posterior.body, plane, modes, before, dt, still=still)
+            modes = posterior.ground.with_contacts(posterior.body, modes, before, dt)
         self.modes = modes
         self._publish(modes)
         self._outline_costs = posterior.fit(modes.poses, observation).outline_costs
@@ -429,7 +409,6 @@ class MixtureFilter:
         self.posterior = Posterior(
             body, self.camera, self.settings, self._extra, self._ground, self.spent
         )
-        self._proposals = proposals_of(self.posterior)
 
 
 def _finite(optimised: Optimised) -> Optimised:

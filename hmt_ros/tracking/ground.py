@@ -22,7 +22,16 @@ from numpy.typing import ArrayLike
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import AXES, IMAGE_UP, Camera, roll, shortest_turn
 from hmt_ros.body.camera_pose import USUAL_DISTANCE
-from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm, masses, soles
+from hmt_ros.body.foot_contact import contacts, first_contacts
+from hmt_ros.body.ground_terms import (
+    FEET,
+    FloorPlane,
+    GroundSettings,
+    GroundTerm,
+    masses,
+    sole_points,
+    soles,
+)
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import turned
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -74,21 +83,11 @@ class KnownGround:
             raise ValueError(f'camera_height must be a positive number of metres, saw {height}')
 
 
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """The present estimate of the ground.
+class Ground(FloorPlane):
+    """The present estimate of the ground, at the camera or where the person is.
 
-    Attributes:
-        up: (3,) unit vector against gravity in the camera frame.
-        up_sigma: standard deviation of its angle about each horizontal axis, rad.
-        height: height of the camera above the floor, m; None: unknown.
-        height_sigma: its standard deviation, m; inf where it is unknown.
+    The height has the deviation inf where it is unknown.
     """
-
-    up: Array
-    up_sigma: float
-    height: float | None
-    height_sigma: float
 
     @property
     def plane(self) -> Array | None:
@@ -138,6 +137,7 @@ class GroundEstimator:
         estimate: the present estimate.
         still: whether the motion of the camera is known, so that things at rest have known places
             in its frame; set by the tracker.
+        plane: gravity and floor where the person is, for the energy of poses.
         turning: whether a newer direction of gravity contradicts the rotation of the camera that
             was assumed.
     """
@@ -265,10 +265,33 @@ class GroundEstimator:
         """Gravity for a start, with a factor on its energy; None: it is unknown, or not used."""
         return Gravity(self.plane, weight) if self.vertical_known and weight > 0 else None
 
-    @property
-    def plane(self) -> FloorPlane:
-        """Gravity and floor where the person is, for the energy of poses."""
-        return self._plane
+    def with_contacts(self, body: Body, modes: Modes, before: Modes | None, dt: float) -> Modes:
+        """Modes with their soles, and the probabilities that these rest (`body.foot_contact`).
+
+        Args:
+            body: of the modes.
+            modes: of an image.
+            before: modes of the image before, in the same camera frame, where the ancestors are;
+                None: the modes come from nothing before.
+            dt: time since then, s.
+        """
+        points = sole_points(body, modes.poses)
+        if before is None:
+            return replace(modes, soles=points, contacts=first_contacts(self.plane, points))
+        rested, stood = before.contacts[modes.ancestors], before.soles[modes.ancestors]
+        found = contacts(self.plane, points, rested, stood, dt, still=self.still)
+        return replace(modes, soles=points, contacts=found)
+
+    def by_foot(self, modes: Modes) -> dict[str, float]:
+        """Probability that the heaviest mode rests on a foot, by 'left_foot' and 'right_foot'.
+
+        Empty without modes, where the terms of the ground are off, for a body without feet, and
+        while the motion of the camera is unknown.
+        """
+        if not (self.still and modes.contacts.size):
+            return {}
+        best = modes.contacts[0].reshape(len(FEET), -1).max(1)
+        return {f'{side}_foot': float(p) for side, p in zip(FEET, best, strict=True)}
 
     def update(self, body: Body, modes: Modes, resting: float, dt: float) -> None:
         """Takes in the modes of an image.
@@ -296,9 +319,8 @@ class GroundEstimator:
                 stands = (
                     2.0 * UPRIGHT_CONCENTRATION * np.exp(UPRIGHT_CONCENTRATION * (cosine - 1.0))
                 )
-                lies = np.exp(-RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0)))
-                said = -np.log(stands + lies) * min(dt / VERTICAL_TIME, 1.0)
                 most = RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0))
+                said = -np.log(stands + np.exp(-most)) * min(dt / VERTICAL_TIME, 1.0)
                 self._by_person = float(np.clip(self._by_person + said, -RIGHT_VERTICAL_NATS, most))
             elif self._seen is None:
                 self._follow_axis(axis, place, resting, dt)
@@ -343,19 +365,14 @@ class GroundEstimator:
             seen = Vertical(given, known.up_sigma)
         if seen is None:
             seen = Vertical(self._mean, float(np.sqrt(self._covariance.trace() / len(self._mean))))
-        up, up_sigma = seen.up, seen.sigma
-        tracked, tracked_sigma = self._tracked_level()
-        height, sigma = tracked, tracked_sigma
+        tracked = Ground(seen.up, seen.sigma, *self._tracked_level(), measured=False)
+        self.estimate = self.plane = tracked
         if known.camera_height is not None:
-            height, sigma = known.camera_height, 2.0 * MEASURED_SIGMA
-        self.estimate = Ground(up, up_sigma, height, sigma)
-        # An error of the vertical lifts the floor where the person is.
-        measured = known.camera_height is not None
-        if measured:
-            sigma = float(np.hypot(sigma, up_sigma * self._distance))
-        if sigma > tracked_sigma:
-            height, sigma, measured = tracked, tracked_sigma, False
-        self._plane = FloorPlane(up, up_sigma, height, sigma, measured)
+            self.estimate = Ground(seen.up, seen.sigma, known.camera_height, 2.0 * MEASURED_SIGMA)
+            # An error of the vertical lifts the floor where the person is.
+            sigma = float(np.hypot(self.estimate.height_sigma, seen.sigma * self._distance))
+            if sigma <= tracked.height_sigma:
+                self.plane = replace(self.estimate, height_sigma=sigma)
 
     def _tracked_level(self) -> tuple[float | None, float]:
         """Height of the camera over the lowest soles of the last seconds, and its deviation, m."""

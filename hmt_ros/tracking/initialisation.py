@@ -60,12 +60,21 @@ class Start:
     """Body and poses that a track starts from.
 
     Attributes:
-        body: with the person's lengths.
-        poses: (M, d) distinct poses, best first.
+        body: of the person; its shape is estimated while the track lasts.
+        poses: (M, d) distinct poses, best first, or the means of
+        expected: a mixture over poses; None: all poses count the same.
+        clicked: keypoints that the start is fitted to, in place of those of the image.
     """
 
     body: Body
     poses: Array
+    expected: GaussianMixture | None = None
+    clicked: Keypoints | None = None
+
+    @property
+    def best(self) -> Array:
+        """The most probable pose (1, d)."""
+        return self.poses[[0 if self.expected is None else int(self.expected.weights.argmax())]]
 
 
 def start_from_keypoints(
@@ -73,7 +82,6 @@ def start_from_keypoints(
     camera: Camera,
     subject: Subject,
     *,
-    prior_weight: float = 1.0,
     upright: Gravity | None = None,
     depths: ImageMap | None = None,
 ) -> Start:
@@ -83,7 +91,6 @@ def start_from_keypoints(
         body: model of the person.
         camera: that the joints were seen by.
         subject: joints, and measurements of the person.
-        prior_weight: factor on the soft prior of the body.
         upright: gravity; None: unknown, and the root leans little against the camera's axes.
         depths: of the image that the joints were seen in; None: unknown. They are not used where
             they make a stature that people do not have, or do not show the surface of any pose.
@@ -91,57 +98,43 @@ def start_from_keypoints(
     Raises:
         ValueError: joints from which no pose can be fitted.
     """
-    if depths is not None:
-        start = _start(body, camera, subject, prior_weight, upright, depths)
-        (misfit,) = of_depth(start.body, camera, start.poses[:1], depths)
-        sized = _sized(body, subject)
-        if _is_a_stature(sized, start.body.skeleton.lengths) and misfit <= UNDECIDED[DEPTH.name]:
-            return start
-    return _start(body, camera, subject, prior_weight, upright, None)
-
-
-def _start(
-    body: Body,
-    camera: Camera,
-    subject: Subject,
-    prior_weight: float,
-    upright: Gravity | None,
-    depths: ImageMap | None,
-) -> Start:
-    """See `start_from_keypoints`."""
-    body = _sized(body, subject)
-    keypoints = subject.keypoints
-    measured = joint_depths(body, keypoints, depths)
-    fits = _fit_with_lengths(body, camera, keypoints, upright, measured)
+    sized, keypoints = _sized(body, subject), subject.keypoints
+    fits = _fit_with_lengths(
+        sized, camera, keypoints, upright, joint_depths(sized, keypoints, depths)
+    )
     best = np.argsort(fits.value, kind='stable')[:3]
     if not np.isfinite(fits.value[best[0]]):
         raise ValueError(NO_POSE)
     weights = np.exp(-(fits.value[best] - fits.value[best[0]]))
     d = body.dimension
     lengths = (weights / weights.sum()) @ fits.x[best, d:]
-    body = body.with_segment_lengths(dict(zip(body.skeleton.length_names, lengths, strict=True)))
+    own = sized.with_segment_lengths(dict(zip(body.skeleton.length_names, lengths, strict=True)))
     spread = np.linalg.inv(fits.hessian[best[0]])[d:, d:]
-    body = replace(body, length_covariance=0.5 * (spread + spread.T))
-    solved = _with_flips(body, camera, keypoints, prior_weight, upright, depths, fits.x[:, :d])
-    return Start(body, solved.x)
+    own = replace(own, length_covariance=0.5 * (spread + spread.T))
+    poses = _with_flips(own, camera, keypoints, upright, depths, fits.x[:, :d])
+    if depths is not None:
+        (misfit,) = of_depth(own, camera, poses[:1], depths)
+        people = _is_a_stature(sized, own.skeleton.lengths)
+        if not (people and misfit <= UNDECIDED[DEPTH.name]):
+            return start_from_keypoints(body, camera, subject, upright=upright)
+    return Start(own, poses)
 
 
 def _with_flips(
     body: Body,
     camera: Camera,
     keypoints: Keypoints,
-    prior_weight: float,
     upright: Gravity | None,
     depths: ImageMap | None,
     guesses: Array,
-) -> Minimum:
-    """Distinct poses that explain joints, best first, from guesses (N, d) and all their flips.
+) -> Array:
+    """Distinct poses (M, d) that explain joints, best first, from guesses (N, d) and their flips.
 
     Raises:
         ValueError: there is none.
     """
     least_squares = LikelihoodSettings.of_terms(keypoints=LEAST_SQUARES, depth=DEPTH.settings)
-    settings = replace(least_squares, prior_weight=prior_weight)
+    settings = replace(least_squares, prior_weight=1.0)
     leaning = body if upright is None else without_root_lean(body)
     likelihood = ImageLikelihood(leaning, camera, settings)
     evidence = {} if depths is None else {DEPTH.name: depths}
@@ -157,7 +150,7 @@ def _with_flips(
     raw = energy.energy(flips, derivatives=Derivatives.NONE).value
     keep = np.argsort(raw, kind='stable')[: 2 * MAX_STARTS]
     solved = _distinct(energy.minimise(flips[keep]), body, MAX_STARTS)
-    return solved[np.argsort(solved.value, kind='stable')]
+    return solved.x[np.argsort(solved.value, kind='stable')]
 
 
 def poses_from_keypoints(
@@ -174,18 +167,14 @@ def poses_from_keypoints(
     Raises:
         ValueError: joints from which no pose can be fitted.
     """
-
-    def found(depths: ImageMap | None) -> Array:
-        measured = joint_depths(body, keypoints, depths)
-        guesses = _first_guesses(body, camera, keypoints, upright, measured)
-        return _with_flips(body, camera, keypoints, 1.0, upright, depths, guesses).x
-
+    measured = joint_depths(body, keypoints, depths)
+    guesses = _first_guesses(body, camera, keypoints, upright, measured)
+    poses = _with_flips(body, camera, keypoints, upright, depths, guesses)
     if depths is not None:
-        poses = found(depths)
         (misfit,) = of_depth(body, camera, poses[:1], depths)
-        if misfit <= UNDECIDED[DEPTH.name]:
-            return poses
-    return found(None)
+        if not misfit <= UNDECIDED[DEPTH.name]:
+            return poses_from_keypoints(body, camera, keypoints, upright)
+    return poses
 
 
 def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:

@@ -10,6 +10,10 @@ where the person is and whether the silhouettes of this track are believed.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -17,12 +21,49 @@ from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.person_shape import raster_step
 from hmt_ros.image.silhouettes import Silhouettes, region_of
 from hmt_ros.image.terms.depth import DEPTH
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
-from hmt_ros.inference.arrays import Array, Image
+from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.tracking.hypotheses import PosePrediction
 from hmt_ros.tracking.misfit import SILHOUETTE
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.validity import Validity
-from hmt_ros.tracking.view import View
+
+
+class View(NamedTuple):
+    """The view of a person in an image, before a pose is known, and what was given with the image.
+
+    Attributes:
+        image: (H, W, 3) BGR.
+        stamp: of the image, ns.
+        keypoints: of a detector; without any that was seen: it saw nobody. None: it has not
+            answered, or there is none.
+        prediction: pose hypotheses from an external predictor, if any.
+        mask: (H, W) of a segmenter; None: unknown.
+        predicted: whether a predictor expects somebody by this image; None: it has not answered, or
+            there is none.
+        others: (H, W) pixels that somebody else covers; None: none.
+        depth: (H, W) depth along the axis of the camera, m; None: unknown.
+        silhouette: (H, W) foreground near the person, all false where there is none; None: there is
+            no background.
+        anywhere: (h, w) all of the foreground of the image, on a coarser raster; None: there is no
+            background.
+        changed: share of the pixels that differ from the background.
+        unsure: (H, W) pixels of the person or of a shadow; None: none.
+    """
+
+    image: Image
+    stamp: int = 0
+    keypoints: Keypoints | None = None
+    prediction: PosePrediction | None = None
+    mask: Mask | None = None
+    predicted: bool | None = None
+    others: Mask | None = None
+    depth: NDArray[np.floating] | None = None
+    silhouette: Mask | None = None
+    anywhere: Mask | None = None
+    changed: float = 0.0
+    unsure: Mask | None = None
 
 
 class Observer:
@@ -60,13 +101,14 @@ class Observer:
         if last is not None and given.stamp <= last:
             raise ValueError(f'stamps must increase, saw {given.stamp} after {last} ns')
         size = (self._camera.height, self._camera.width)
-        masks = {'a mask of ': (given.mask, given.others), 'depths of ': (given.depth,)}
-        for name, arrays in {'': (given.image,), **masks}.items():
-            for each in arrays:
-                if each is not None and each.shape[:2] != size:
-                    raise ValueError(
-                        f'the camera gives images of {size}, saw {name}{each.shape[:2]}'
-                    )
+        for name, each in (
+            ('', given.image),
+            ('a mask of ', given.mask),
+            ('a mask of ', given.others),
+            ('depths of ', given.depth),
+        ):
+            if each is not None and each.shape[:2] != size:
+                raise ValueError(f'the camera gives images of {size}, saw {name}{each.shape[:2]}')
 
     def view(self, given: View, body: Body, poses: Array | None, dt: float) -> View:
         """The view of a person in an image.
@@ -91,13 +133,6 @@ class Observer:
             anywhere=silhouettes.anywhere(image, mask, others, raster_step(self._camera.height)),
             changed=silhouettes.background.changed if mask is None else 0.0,
         )
-
-    def seen_anywhere(self, view: View) -> View:
-        """The same view, with the silhouette of somebody who may be anywhere in it."""
-        found = self._silhouettes.silhouette(view.image, view.stamp, view.mask, None, view.others)
-        if found is None:
-            return view
-        return view._replace(silhouette=found.foreground, unsure=found.unsure)
 
     def observation(self, view: View, pose: Array | None, validity: Validity) -> Observation:
         """The evidence of an image about a person.

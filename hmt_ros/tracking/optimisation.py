@@ -1,20 +1,31 @@
 """Optimise: every hypothesis descends to a minimum of E (KJS figure 4, step 3).
 
 x_k = argmin E(x)          bounded Newton from x_k^0, within the joint limits
+
+An image that moves the modes far, as when people move fast, gets more evaluations: it is surprising
+where
+
+    m' P m  >  `SURPRISING_RATIO` E m' P m  =  `SURPRISING_RATIO` tr(I - P H^-1)
+
+m leads from the prediction of the heaviest mode, which has the precision P, to its optimum, where
+the energy has the Hessian H; so the covariance of m is P^-1 - H^-1. The usual distance grows with
+the information in the image, so with the time between two images.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from hmt_ros.image.observation import Observation
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.motion_states import PredictedStates
-from hmt_ros.tracking.hypotheses import Hypotheses, Modes, Optimised
-from hmt_ros.tracking.pose_prediction import PosePrediction
+from hmt_ros.tracking.hypotheses import Hypotheses, Modes, Optimised, PosePrediction
 from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.settings import EvaluationPlan
+from hmt_ros.tracking.selection import choose_hypotheses
+from hmt_ros.tracking.settings import SURPRISING_RATIO, EvaluationPlan
 from hmt_ros.tracking.weighting import Continuity
 
 
@@ -53,6 +64,15 @@ class Search:
         """About the log weights (N,) that poses (N, d) of these energies (N,) would have."""
         return self.continuity.rated(poses) - ERRORS['image'].share(self.dt) * energies
 
+    def best(self, poses: Array, energies: Array) -> Index:
+        """Rows of poses (N, d) of these energies (N,) that stand for all, as many as candidates."""
+        return choose_hypotheses(
+            self.posterior.body.relative_joints(poses),
+            self.rated(poses, energies),
+            self.plan.candidates,
+            same=self.posterior.settings.hypothesis_merge_distance,
+        ).chosen
+
     def optimise(self, hypotheses: Hypotheses) -> Optimised:
         """Hypotheses (N, d) at their optima."""
         posterior = self.posterior
@@ -66,3 +86,15 @@ class Search:
         """Energies (N,) that the image adds to minus the log weights, nats."""
         exchanges = optimised.hypotheses.exchanges
         return self.posterior.evidence(optimised.minima.x, self.observation, exchanges, self.dt)
+
+
+def is_surprising(moved: Array, precision: Array, hessian: Array) -> bool:
+    """Whether an image has moved a mode far for its information; never where it has none.
+
+    Args:
+        moved: (d,) from the prediction of the mode to its optimum.
+        precision: (d, d) of the prediction.
+        hessian: (d, d) of the energy, motion prior included, at the optimum.
+    """
+    expected = len(moved) - np.trace(np.linalg.solve(hessian, precision))
+    return bool(moved @ precision @ moved > SURPRISING_RATIO * max(expected, 1.0))

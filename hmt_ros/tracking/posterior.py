@@ -118,6 +118,18 @@ class Posterior:
         s = self.settings
         return ImageLikelihood(self.body, self.camera, s.likelihood, threads=s.threads)
 
+    @cached_property
+    def divided(self) -> dict[str, tuple[ImageLikelihood, ImageLikelihood]]:
+        """By limb the likelihoods of its flesh, and of the rest of the body without it."""
+        chains, parts = self.body.skeleton.chains, self.body.flesh.parts
+        result = {}
+        for chain in (chain for pair in self.body.chain_pairs for chain in pair):
+            own = tuple(i for i, part in enumerate(parts) if part.segment in chains[chain])
+            rest = tuple(i for i in range(len(parts)) if i not in own)
+            of_limb = replace(self.likelihood, parts=own)
+            result[chain] = of_limb, replace(self.likelihood, parts=rest, occluders=rest)
+        return result
+
     def of_image(self, observation: Observation, exchanges: Array | None = None) -> PoseEnergy:
         """The energy without the motion prior; its evaluations are counted.
 
@@ -185,10 +197,8 @@ class Posterior:
         last = self._last_fit
         if last is not None and last[0] is poses and last[1] is observation and last[2] == share:
             return last[3]
-        image, *keypoints = self.likelihood.seen(observation)
-        if keypoints:
-            keypoints = [self.likelihood.keypoint_term(observation, None, lifted_share=share)]
-        terms = (image, *keypoints, *self.likelihood.priors, *self.known)
+        seen_terms = self.likelihood.seen(observation, lifted_share=share)
+        terms = (*seen_terms, *self.likelihood.priors, *self.known)
         found = PoseEnergy(self.likelihood, terms).by_cue(poses)
         gradient, hessian = found.energy.derivatives()
         free = ~resting(poses, gradient, self.body.lower, self.body.upper)
@@ -220,15 +230,13 @@ class Posterior:
         """
         self.spent.append(len(poses))
         share = {name: errors.share(dt) for name, errors in ERRORS.items()}
-
-        image, *keypoints = self.likelihood.seen(observation)
-        if keypoints:
-            keypoints = [
-                self.likelihood.keypoint_term(
-                    observation, known_exchanges(exchanges), share['keypoints'], share['lifted']
-                )
-            ]
-        terms = (image, *keypoints, *self.likelihood.priors, *self.known)
+        seen = self.likelihood.seen(
+            observation,
+            exchanges=known_exchanges(exchanges),
+            share=share['keypoints'],
+            lifted_share=share['lifted'],
+        )
+        terms = (*seen, *self.likelihood.priors, *self.known)
         values = PoseEnergy(self.likelihood, terms).by_cue(poses, derivatives=False).values
         return np.asarray(values @ [share['image'], 1.0, share['prior']])
 

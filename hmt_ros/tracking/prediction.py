@@ -63,48 +63,24 @@ def predicted_states(
     return PredictedStates(dynamics, *dynamics.predict(means, covariances, dt), wandered)
 
 
-def expected_poses(
-    modes: Modes, weights: Array, body: Body, motion: str, dt: float
-) -> GaussianMixture:
-    """The mixture over poses after dt seconds in which nothing is seen.
-
-    Args:
-        modes: of the last image in which the person was seen.
-        weights: (K,) of the modes, as they were published.
-        body: with the limits.
-        motion: the setting.
-        dt: time since that image, s.
-    """
-    d = body.dimension
-    known = modes.state_covariances.copy()
-    # The published covariances of the poses are larger than the propagated ones.
-    known[:, :d, :] = known[:, :, :d] = 0.0
-    known[:, :d, :d] = modes.covariances
-    states = predicted_states(modes, known, body, dynamics_of(body, motion), dt)
-    means = np.clip(states.poses, body.lower, body.upper)
-    return GaussianMixture(weights, means, states.pose_covariances)
-
-
 @dataclass(frozen=True, eq=False)
 class Forecaster:
     """Predicts a track from one image on; nothing in it changes, so that any thread may ask.
 
     Attributes:
-        modes: of that image.
-        weights: (K,) of the modes, as they were published.
+        modes: of that image, as they were published.
         body: with the limits.
         motion: the setting.
         stamp_ns: of the image.
     """
 
     modes: Modes
-    weights: Array
     body: Body
     motion: str
     stamp_ns: int
 
     def at(self, stamp_ns: int) -> GaussianMixture:
-        """The mixture over poses at a time without an image, as `expected_poses`.
+        """The mixture over poses at a time until which nothing is seen.
 
         Raises:
             ValueError: the time is before the image.
@@ -113,8 +89,15 @@ class Forecaster:
             raise ValueError(
                 f'{stamp_ns} ns is before the image of {self.stamp_ns} ns that is predicted from'
             )
-        dt = seconds(stamp_ns - self.stamp_ns)
-        return expected_poses(self.modes, self.weights, self.body, self.motion, dt)
+        modes, body, d = self.modes, self.body, self.body.dimension
+        known = modes.state_covariances.copy()
+        # The published covariances of the poses are larger than the propagated ones.
+        known[:, :d, :] = known[:, :, :d] = 0.0
+        known[:, :d, :d] = modes.covariances
+        dynamics = dynamics_of(body, self.motion)
+        states = predicted_states(modes, known, body, dynamics, seconds(stamp_ns - self.stamp_ns))
+        means = np.clip(states.poses, body.lower, body.upper)
+        return GaussianMixture(modes.mixture.weights, means, states.pose_covariances)
 
 
 def follow_flow(

@@ -19,8 +19,6 @@ from hmt_ros.body.ground_terms import GroundSettings
 from hmt_ros.image.likelihood import LikelihoodSettings
 
 MOTIONS = ('learned', 'random_walk')
-# Names of the proposals, whose classes are in `tracking.proposals`.
-PROPOSALS = ('kjs', 'css', 'ss')
 
 # --- Search
 
@@ -193,7 +191,8 @@ class TrackerSettings:
         max_hypotheses: Maximum number of modes that are kept, K.
         hypothesis_merge_distance: Mean distance of the joints below which two modes are merged, m.
         proposals: Proposal distribution: 'kjs' (kinematic jumps and covariance-scaled samples),
-            'css' (covariance-scaled samples alone) or 'ss' (spherical samples alone).
+            'css' (covariance-scaled samples alone) or 'ss' (spherical samples alone); the names
+            are those in `tracking.proposals`.
         candidates: Maximum number of hypotheses that are fully optimised in an image; as many as
             modes in any case.
         combinations: Maximum number of combinations of limb configurations on each trunk.
@@ -241,8 +240,6 @@ class TrackerSettings:
     ground: GroundSettings = field(default_factory=GroundSettings)
 
     def __post_init__(self) -> None:
-        if self.proposals not in PROPOSALS:
-            raise ValueError(f'proposals must be one of {PROPOSALS}, saw {self.proposals!r}')
         if self.motion not in MOTIONS:
             raise ValueError(f'motion must be one of {MOTIONS}, saw {self.motion!r}')
         for name in (

@@ -206,9 +206,7 @@ class Estimate:
         """
         if self.stamp_ns is None:
             raise ValueError('there is no track to predict')
-        return Forecaster(
-            self.published, self.posterior.weights, self.body, self.motion, self.stamp_ns
-        )
+        return Forecaster(self.published, self.body, self.motion, self.stamp_ns)
 
 
 def no_likelihood(dimension: int) -> Likelihood:

@@ -37,14 +37,12 @@ from hmt_ros.tracking.appearance import Appearance
 from hmt_ros.tracking.beginning import (
     FROM_JOINTS,
     FROM_SILHOUETTES,
-    Beginning,
     Shown,
     Source,
     first_start,
     poses_to_search,
 )
 from hmt_ros.tracking.camera_motion import CameraPath
-from hmt_ros.tracking.contact import by_foot
 from hmt_ros.tracking.existence import GIVEN, Existence
 from hmt_ros.tracking.filter import Judged, MixtureFilter
 from hmt_ros.tracking.ground import (
@@ -52,15 +50,14 @@ from hmt_ros.tracking.ground import (
     KnownGround,
     unit_vector,
 )
-from hmt_ros.tracking.initialisation import check_box
+from hmt_ros.tracking.hypotheses import PosePrediction
+from hmt_ros.tracking.initialisation import Start, check_box
 from hmt_ros.tracking.laplace_approximation import likelihood_modes
 from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE, of_depth_at_best
-from hmt_ros.tracking.observer import Observer
-from hmt_ros.tracking.pose_prediction import PosePrediction
+from hmt_ros.tracking.observer import Observer, View
 from hmt_ros.tracking.settings import GIVEN_UP_SIGMA, LIKELY_NATS, RESTING_SHARE, TrackerSettings
 from hmt_ros.tracking.track_state import Estimate, TrackState, no_likelihood
 from hmt_ros.tracking.validity import DEPTH, Validity
-from hmt_ros.tracking.view import View
 
 
 class Tracker:
@@ -329,7 +326,7 @@ class Tracker:
         """Moves the track on to an image; what the image shows, as far as it is believed."""
         state, track = self._state, self._track
         if state.existence.last.elsewhere:
-            view = self._observer.seen_anywhere(view)
+            view = self._observer.view(view, track.person, None, 0.0)
         observation = self._observer.observation(view, track.modes.poses[0], state.validity)
         poses = None
         if state.validity.lost or state.existence.last.elsewhere:
@@ -362,7 +359,7 @@ class Tracker:
                 return None
             magnification = self.camera.magnification(float(np.median(poses[:, 2])))
             near = replace(observation, magnification=magnification)
-            self._begin(near, Beginning(Source.ARRIVAL, self._track.body, poses))
+            self._begin(near, Source.ARRIVAL, Start(self._track.body, poses))
         else:
             begun = self._given_start(view, somebody=somebody)
             if begun is None:
@@ -392,30 +389,27 @@ class Tracker:
             self._ground.gravity(self.settings.ground.upright_weight),
             self._given,
             self._box,
-            lambda: self._observer.observation(view, None, self._state.validity),
         )
-        beginning = first_start(shown, existence)
-        if beginning is None:
+        found = first_start(shown, existence)
+        if found is None:
             if self._given is not None or existence.last.llr <= 0.0:
                 said = existence.last.said.get('detector', 0.0)
                 if masked and view.silhouette is not None:
                     said = 1.0 if view.silhouette.any() else -1.0
                 silhouettes.learn(view.image, view.stamp, said > 0.0 if said else None)
             return None
-        if beginning.source in FROM_JOINTS:
+        source, start = found
+        if source in FROM_JOINTS:
             if not masked:
-                silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
+                silhouettes.check(view.image, start.body, self.camera, start.best)
             if silhouettes.doubted:
                 view = view._replace(silhouette=None, anywhere=None, unsure=None)
             if shown.depths is not None:
-                share = of_depth_at_best(
-                    beginning.body, self.camera, beginning.best[0], shown.depths
-                )
+                share = of_depth_at_best(start.body, self.camera, start.best[0], shown.depths)
                 self._state.validity.update_depths(share, np.inf)
         for _ in range(2):
-            pose = beginning.best[0]
-            observation = self._observer.observation(view, pose, self._state.validity)
-            self._begin(observation, beginning)
+            observation = self._observer.observation(view, start.best[0], self._state.validity)
+            self._begin(observation, source, start)
             if self._state.validity.believes(SILHOUETTE):
                 break
             # The start is where the person is; the silhouette is not: once more without it.
@@ -425,11 +419,10 @@ class Tracker:
             self._state.existence.look(view, self._track.person)
         return observation
 
-    def _begin(self, observation: Observation, beginning: Beginning) -> None:
+    def _begin(self, observation: Observation, source: Source, start: Start) -> None:
         """Starts the modes of a track."""
-        self._started_from = beginning.source
-        judged = self._track.begin(beginning.body, beginning.start, observation, beginning.clicked)
-        self._judge(judged, observation.depths, np.inf)
+        self._started_from = source
+        self._judge(self._track.begin(start, observation), observation.depths, np.inf)
 
     def _new_track(self, body: Body) -> MixtureFilter:
         return MixtureFilter(
@@ -464,8 +457,7 @@ class Tracker:
             self.silhouettes.complete(view.image, track.person, self.camera, likely)
         dt = state.age(view.stamp)
         if self.settings.ground.on:
-            contacts = by_foot(modes) if self._ground.still else {}
-            resting = min(contacts.values(), default=RESTING_SHARE)
+            resting = min(self._ground.by_foot(modes).values(), default=RESTING_SHARE)
             self._ground.update(track.person, modes, resting, dt)
         # The motion takes in one image after another, so each with its own covariance alone.
         found = modes.mixture
@@ -517,7 +509,7 @@ class Tracker:
             misfit=track.misfit,
             evaluations=sum(track.spent),
             validity=state.validity,
-            contacts=by_foot(track.modes) if ground.still else {},
+            contacts=ground.by_foot(track.modes),
             ground=ground.estimate,
             vertical=ground.vertical,
             gravity_contradicted=ground.contradicted,

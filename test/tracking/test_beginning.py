@@ -20,7 +20,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import Status, Tracker, TrackerSettings
 from hmt_ros.tracking.beginning import Source
-from hmt_ros.tracking.pose_prediction import PosePrediction
+from hmt_ros.tracking.hypotheses import PosePrediction
 from test.clips import read_clip
 
 FRAME = 100_000_000  # ns

@@ -16,7 +16,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings
 from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath
-from hmt_ros.tracking.contact import by_foot, contacts_of
+from hmt_ros.tracking.classes import ways, weigh_ways
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.point_estimate import PointEstimate
@@ -144,6 +144,7 @@ def test_feet_rest_before_a_moving_camera(body):
     found = []
     for carried in (True, False):
         rested, estimator = None, GroundEstimator(KnownGround(UP, 1.0))
+        estimator.still = True
         before = drive(0.0)
         for t, pose in enumerate(standing):
             now = drive(0.1 * t)
@@ -154,12 +155,45 @@ def test_feet_rest_before_a_moving_camera(body):
             if step is not None and carried:
                 rested = step.modes(body, rested)
                 estimator.carry(step)
-            rested = contacts_of(body, estimator.plane, modes, rested, 0.1, still=True)
+            rested = estimator.with_contacts(body, modes, rested, 0.1)
             estimator.update(body, modes, 1.0, 0.1)
             before = now
-        found.append(max(by_foot(rested).values()))
+        found.append(max(estimator.by_foot(rested).values()))
     assert found[0] > 0.8
     assert found[1] < 0.3
+
+
+def test_ways_to_face_are_carried(body):
+    """Who turns the back to the camera is seen anew; the evidence so far goes on as it was."""
+    poses = np.tile(body.prior_mean, (3, 1))
+    poses[:, 2] = 4.0
+    heading = body.dof_names.index('root_z')
+    poses[:, heading] += np.radians([30.0, 210.0, -30.0])
+    odds = np.array([3.0, -3.0, 3.0])
+    modes = replace(modes_of(body, poses), back=ways(body, poses, poses[0]), facing=odds)
+    assert modes.back.tolist() == [False, True, False]
+    for degrees, back in ((90.0, [False, True, True]), (20.0, [False, True, False])):
+        # Around the person: from the side one of two who faced the camera turns the back.
+        around = Rotation.from_euler('y', degrees, degrees=True).as_matrix()
+        place = np.array([0.0, 0.0, 4.0])
+        still = CameraPose.of(np.zeros(3), np.eye(3))
+        motion = CameraMotion.between(still, CameraPose.of(place - around @ place, around))
+        carried = motion.modes(body, modes)
+        assert carried.back.tolist() == back
+        assert np.array_equal(carried.facing, odds)
+        # An image that tells nothing leaves either way of two the weight that it had.
+        found = []
+        for some in (modes[:2], carried[:2]):
+            nothing = np.zeros(2)
+            transitions = np.full((2, 2), -20.0)
+            found.append(
+                weigh_ways(
+                    body, some, some.poses, some.poses, transitions, nothing, nothing,
+                    np.ones(2, dtype=np.bool_), 0.1,
+                )
+            )  # fmt: skip
+        np.testing.assert_allclose(found[1], found[0])
+        assert 2.0 < found[0][0][0] - found[0][0][1] < 3.0
 
 
 # The path of the camera.

@@ -10,10 +10,9 @@ import pytest
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.sessions.tracking_parameters import LIVE_BUDGET
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.evaluation_plan import is_surprising
+from hmt_ros.tracking.optimisation import is_surprising
 from hmt_ros.tracking.settings import (
     ACCURATE_BUDGET,
-    PROPOSALS,
     SURPRISING_RATIO,
 )
 
@@ -26,13 +25,6 @@ def test_more_budget_is_never_less_of_anything():
         plan = astuple(TrackerSettings(evaluation_budget=budget).plan)
         assert all(a >= b for a, b in zip(plan, before, strict=True)), budget
         before = plan
-
-
-def test_settings_name_the_proposals_that_there_are():
-    for name in PROPOSALS:
-        assert TrackerSettings(proposals=name).proposals == name
-    with pytest.raises(ValueError, match='proposals must be one of'):
-        TrackerSettings(proposals='guesses')
 
 
 @pytest.mark.parametrize('seconds', [0.03, 0.3])

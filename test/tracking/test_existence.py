@@ -16,8 +16,8 @@ from hmt_ros.tracking.existence import (
     GIVEN,
     Existence,
 )
+from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.settings import ABSENT_PROBABILITY, PRESENT_PROBABILITY
-from hmt_ros.tracking.view import View
 
 SECOND = 1_000_000_000
 NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))

@@ -18,7 +18,6 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.contact import by_foot, contacts_of
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
@@ -73,10 +72,11 @@ def after(estimator: GroundEstimator, body, poses: np.ndarray) -> GroundEstimato
 
 def resting(body, plane, poses, rate: float, *, still: bool = True) -> list[list[float]]:
     """Probabilities that the left and the right foot rest, image by image."""
-    modes, found = None, []
+    modes, found, estimator, shown = None, [], GroundEstimator(), GroundEstimator()
+    estimator.plane, estimator.still, shown.still = plane, still, True
     for pose in poses:
-        modes = contacts_of(body, plane, single(pose), modes, 1.0 / rate, still=still)
-        found.append(list(by_foot(modes).values()))
+        modes = estimator.with_contacts(body, single(pose), modes, 1.0 / rate)
+        found.append(list(shown.by_foot(modes).values()))
     return found
 
 

@@ -13,14 +13,13 @@ from hmt_ros.body import load_body
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.joint_depths import depths_of, joint_depths
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import Subject, Tracker
-from hmt_ros.tracking.beginning import Shown, first_start
+from hmt_ros.tracking.beginning import Shown, Source, first_start
 from hmt_ros.tracking.existence import Existence
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.misfit import of_depth_at_best
+from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.validity import DEPTH, Validity
-from hmt_ros.tracking.view import View
 
 STATURE, AWAY = 1.9, 3.5
 MS = 1_000_000
@@ -84,7 +83,7 @@ def test_depth_of_something_else_does_not_spoil_a_start(tall, camera, keypoints_
 def shown(view, stamp, model, camera, given=None, box=None):
     """An image without any other input."""
     view = view._replace(stamp=stamp)
-    return Shown(view, model, model, camera, None, given, box, lambda: None)
+    return Shown(view, model, model, camera, None, given, box)
 
 
 def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
@@ -95,9 +94,9 @@ def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
     found = {}
     for name, depth in (('with', depths[0]), ('without', None)):
         view = View(images[0], depth=depth)
-        beginning = first_start(shown(view, 0, model, camera, box=box), Existence())
-        assert isinstance(beginning.start, GaussianMixture)
-        found[name] = np.abs(beginning.start.means[:, 2] - poses[0, 2]).max()
+        source, start = first_start(shown(view, 0, model, camera, box=box), Existence())
+        assert source is Source.BOX
+        found[name] = np.abs(start.expected.means[:, 2] - poses[0, 2]).max()
     assert found['with'] < 0.18 < found['without']
 
 

@@ -474,7 +474,6 @@ def test_bad_images_are_refused_and_change_nothing(follow, human32, black, motio
 @pytest.mark.parametrize(
     ('values', 'said'),
     [
-        ({'proposals': 'magic'}, r"proposals must be one of .*kjs.* saw 'magic'"),
         ({'motion': 'still'}, r"motion must be one of .*learned.* saw 'still'"),
         ({'max_hypotheses': 0}, 'max_hypotheses must be at least 1, saw 0'),
         ({'evaluation_budget': 0}, 'evaluation_budget must be at least 1, saw 0'),
@@ -483,6 +482,11 @@ def test_bad_images_are_refused_and_change_nothing(follow, human32, black, motio
 def test_settings_that_are_refused(values, said):
     with pytest.raises(ValueError, match=said):
         TrackerSettings(**values)
+
+
+def test_a_proposal_that_is_not_in_the_list_is_refused(human32, camera):
+    with pytest.raises(ValueError, match=r"proposals must be one of .*kjs.* saw 'magic'"):
+        Tracker(human32, camera, TrackerSettings(proposals='magic'))
 
 
 @pytest.fixture(scope='module')

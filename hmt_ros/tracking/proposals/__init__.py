@@ -1,28 +1,26 @@
-"""Propose: where hypotheses come from (KJS 3 and 5). Each proposal is an object of its own."""
+"""Propose: where hypotheses come from (KJS 3 and 5). Each proposal is a function of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
 
 from hmt_ros.inference.bounded_newton import Minimum
-from hmt_ros.tracking.hypotheses import Hypotheses
+from hmt_ros.tracking.hypotheses import Hypotheses, joined
 from hmt_ros.tracking.optimisation import Search
-from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.proposals.keypoint_poses import KeypointPoses
-from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps
-from hmt_ros.tracking.proposals.predicted_poses import PredictedPoses
-from hmt_ros.tracking.proposals.reversals import Reversals
-from hmt_ros.tracking.proposals.sampling import CovarianceScaledSamples, SphericalSamples
+from hmt_ros.tracking.proposals.kinematic_jumps import jumped_poses
+from hmt_ros.tracking.proposals.sampling import covariance_scaled_poses, spherical_poses
+from hmt_ros.tracking.proposals.whole_poses import keypoint_poses, predicted_poses, reversed_poses
 
 
 class Proposal(Protocol):
     """Something that proposes hypotheses for an image."""
 
-    def propose(
-        self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
+    def __call__(
+        self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator, /
     ) -> Hypotheses:
         """Hypotheses that are to be optimised, if any; a proposal does not set their weights.
 
@@ -35,16 +33,31 @@ class Proposal(Protocol):
         ...
 
 
-# Of every tracker, before the one that the setting `proposals` selects. Each decides by itself
-# whether it applies to an image. A new proposal is a file beside this one and a name here.
-USUAL: tuple[Callable[[Posterior], Proposal], ...] = (PredictedPoses, KeypointPoses, Reversals)
-SELECTED: dict[str, Callable[[Posterior], Proposal]] = {
-    'kjs': KinematicJumps,
-    'css': CovarianceScaledSamples,
-    'ss': SphericalSamples,
-}
+# Of every tracker, before the one that the setting `proposals` selects by its name. Each decides by
+# itself whether it applies to an image. A new proposal is a file beside this one and a name here.
+USUAL: tuple[Proposal, ...] = (predicted_poses, keypoint_poses, reversed_poses)
+SELECTED: Mapping[str, Proposal] = MappingProxyType(
+    {'kjs': jumped_poses, 'css': covariance_scaled_poses, 'ss': spherical_poses}
+)
 
 
-def proposals_of(posterior: Posterior) -> list[Proposal]:
-    """The proposals of a tracker, by its settings."""
-    return [make(posterior) for make in (*USUAL, SELECTED[posterior.settings.proposals])]
+def proposals_of(selected: str) -> tuple[Proposal, ...]:
+    """The proposals of a tracker, by its setting.
+
+    Raises:
+        ValueError: another name.
+    """
+    if selected not in SELECTED:
+        raise ValueError(f'proposals must be one of {tuple(SELECTED)}, saw {selected!r}')
+    return (*USUAL, SELECTED[selected])
+
+
+def propose(
+    proposals: Sequence[Proposal],
+    search: Search,
+    base: Minimum,
+    sources: Hypotheses,
+    rng: np.random.Generator,
+) -> Hypotheses:
+    """All hypotheses of some proposals; the other arguments as for each of them."""
+    return joined([each(search, base, sources, rng) for each in proposals])

@@ -16,13 +16,11 @@ the silhouette's outline that the rest of the body explains costs a limb nothing
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
-
 import numpy as np
 
+from hmt_ros.body.body import Body
 from hmt_ros.flips.limb_products import LimbProducts
-from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage
+from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.keypoints import group_of
@@ -33,7 +31,6 @@ from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.selection import choose_hypotheses
 from hmt_ros.tracking.settings import (
     LIKELY_NATS,
     LIMB_TAILS,
@@ -44,212 +41,165 @@ from hmt_ros.tracking.settings import (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class LimbSearch:
-    """Finds other configurations of a limb in an image.
+def find_limb(
+    posterior: Posterior,
+    chain: str,
+    pose: Array,
+    covariance: Array,
+    observation: Observation,
+    plan: EvaluationPlan,
+    rng: np.random.Generator,
+) -> Array:
+    """Angles (A, chain dofs) of a limb that fit the image, distinct from each other or not.
 
-    Attributes:
+    Args:
         posterior: of the body before the camera.
         chain: name of the limb.
+        pose: (d,) whose other limbs are kept.
+        covariance: (d, d) how far the limb may have moved.
+        observation: of the image.
+        plan: allocation of its evaluations.
+        rng: source of randomness.
     """
-
-    posterior: Posterior
-    chain: str
-
-    @cached_property
-    def dofs(self) -> Index:
-        """Degrees of freedom of the limb."""
-        return np.asarray(self.posterior.body.skeleton.chain_dofs[self.chain])
-
-    @cached_property
-    def _likelihoods(self) -> tuple[ImageLikelihood, ImageLikelihood]:
-        """Those of the limb, and of the rest of the body without the limb."""
-        body, whole = self.posterior.body, self.posterior.likelihood
-        segments = set(body.skeleton.chains[self.chain])
-        of_limb = [part.segment in segments for part in body.flesh.parts]
-        own = tuple(i for i, ours in enumerate(of_limb) if ours)
-        rest = tuple(i for i, ours in enumerate(of_limb) if not ours)
-        return replace(whole, parts=own), replace(whole, parts=rest, occluders=rest)
-
-    def find(
-        self,
-        pose: Array,
-        covariance: Array,
-        observation: Observation,
-        plan: EvaluationPlan,
-        rng: np.random.Generator,
-    ) -> Array:
-        """Angles (A, chain dofs) of the limb that fit the image, distinct from each other or not.
-
-        Args:
-            pose: (d,) whose other limbs are kept.
-            covariance: (d, d) how far the limb may have moved.
-            observation: of the image.
-            plan: allocation of its evaluations.
-            rng: source of randomness.
-        """
-        s, own = self.posterior.settings.search, self.dofs
-        block = covariance[np.ix_(own, own)]
-        samples = self._draw(pose[own], block, plan.samples, rng)
-        of_limb, of_rest = self._likelihoods
-        others = PoseEnergy(of_rest, (ObservedImage(of_rest, observation),))
-        explained = others.by_cue(pose[None], derivatives=False).outline_costs
-        seen = of_limb.seen(observation, explained=explained)
-        terms = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
-        motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
-        term = PoseEnergy(of_limb, terms, motion, pose, own)
-        value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
-        best = samples[np.argsort(value, kind='stable')[: plan.refined]]
-        self.posterior.spent.append(len(samples) + plan.refined * s.iterations)
-        return term.minimise(best, max_iterations=s.iterations, tolerance=0.05).x
-
-    def _draw(self, angles: Array, block: Array, n: int, rng: np.random.Generator) -> Array:
-        """N samples from the mode, from it stretched, and from the body's prior: a third each."""
-        body, own, search = self.posterior.body, self.dofs, self.posterior.settings.search
-        noise = rng.standard_normal((n, len(own)))
-        near = noise @ np.linalg.cholesky(block).T
-        near[n // 3 :] *= search.stretch
-        result = angles + near
-        wide = body.prior_mean[own] + PRIOR_STRETCH * body.prior_sigma[own] * noise
-        result[2 * n // 3 :] = wide[2 * n // 3 :]
-        result[0] = angles
-        return np.clip(result, body.lower[own], body.upper[own])
+    body, s = posterior.body, posterior.settings.search
+    own: Index = np.asarray(body.skeleton.chain_dofs[chain])
+    block = covariance[np.ix_(own, own)]
+    samples = _drawn(body, own, pose[own], block, s.stretch, plan.samples, rng)
+    of_limb, of_rest = posterior.divided[chain]
+    others = PoseEnergy(of_rest, (ObservedImage(of_rest, observation),))
+    explained = others.by_cue(pose[None], derivatives=False).outline_costs
+    seen = of_limb.seen(observation, explained=explained)
+    terms = (*seen, posterior.likelihood.pose_prior, *posterior.known)
+    motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
+    term = PoseEnergy(of_limb, terms, motion, pose, own)
+    value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
+    best = samples[np.argsort(value, kind='stable')[: plan.refined]]
+    posterior.spent.append(len(samples) + plan.refined * s.iterations)
+    return term.minimise(best, max_iterations=s.iterations, tolerance=0.05).x
 
 
-@dataclass(frozen=True, eq=False)
-class KinematicJumps:
-    """Proposes poses far from those that are known, which fit the image as well.
+def _drawn(
+    body: Body,
+    own: Index,
+    angles: Array,
+    block: Array,
+    stretch: float,
+    n: int,
+    rng: np.random.Generator,
+) -> Array:
+    """N samples from the mode, from it stretched, and from the body's prior: a third each."""
+    noise = rng.standard_normal((n, len(own)))
+    near = noise @ np.linalg.cholesky(block).T
+    near[n // 3 :] *= stretch
+    result = angles + near
+    wide = body.prior_mean[own] + PRIOR_STRETCH * body.prior_sigma[own] * noise
+    result[2 * n // 3 :] = wide[2 * n // 3 :]
+    result[0] = angles
+    return np.clip(result, body.lower[own], body.upper[own])
 
-    Attributes:
-        posterior: of the body before the camera.
-    """
 
-    posterior: Posterior
-
-    def propose(
-        self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
-    ) -> Hypotheses:
-        """See `Proposal`."""
-        s, body = self.posterior.settings, self.posterior.body
-        plan, limbs = search.plan, self._not_shown(search.observation, search.plan.surprising)
-        left = plan.rated if limbs else plan.rated_alone
-        share = ERRORS['image'].share(search.dt)
-        price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
-        everything: list[tuple[Array, Index, Array]] = []
-        prior = search.rated(base.x, base.value)
-        groups = self._groups(base)
-        for group in groups[: plan.groups]:
-            likely = prior[group].max() > prior.max() - LIKELY_NATS
-            products = LimbProducts.of(
-                body,
-                base.x[group],
-                self._search(limbs, search, base.x[group[0]], sources.ancestors[group[0]], rng)
-                if likely
-                else {},
-                price['limb_flip'],
-                apart=SAME_LIMB_DISTANCE,
-                most=plan.alternatives,
-            ).at_most(left)
-            alone = products.alone
-            left -= len(alone)
-            best = products.best(
-                self.posterior.values(alone, search.observation),
-                sources.log_weights[group],
-                exchange=price['exchange'],
-                flip=price['trunk_flip'],
-                share=share,
-                count=plan.combinations,
-            )
-            everything.append((best.poses, group[best.parents], best.energies))
-        others = [k for group in groups[plan.groups :] for k in group]
-        if others:
-            poses = base.x[others]
-            energies = self.posterior.values(poses, search.observation)
-            everything.append((poses, np.array(others, dtype=np.intp), energies))
-        poses, members, energies = (
-            np.concatenate([part[i] for part in everything]) for i in range(3)
+def jumped_poses(
+    search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
+) -> Hypotheses:
+    """Poses far from those that are known, which fit the image as well."""
+    posterior, observation, plan = search.posterior, search.observation, search.plan
+    body, limbs = posterior.body, limbs_not_shown(posterior, observation, plan.surprising)
+    left = plan.rated if limbs else plan.rated_alone
+    share = ERRORS['image'].share(search.dt)
+    price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
+    everything: list[tuple[Array, Index, Array]] = []
+    prior = search.rated(base.x, base.value)
+    groups = _groups(body, base)
+    for group in groups[: plan.groups]:
+        likely = prior[group].max() > prior.max() - LIKELY_NATS
+        first = group[0]
+        products = LimbProducts.of(
+            body,
+            base.x[group],
+            _search_limbs(limbs, search, base.x[first], sources.ancestors[first], rng)
+            if likely
+            else {},
+            price['limb_flip'],
+            apart=SAME_LIMB_DISTANCE,
+            most=plan.alternatives,
+        ).at_most(left)
+        alone = products.alone
+        left -= len(alone)
+        best = products.best(
+            posterior.values(alone, observation),
+            sources.log_weights[group],
+            exchange=price['exchange'],
+            flip=price['trunk_flip'],
+            share=share,
+            count=plan.combinations,
         )
-        kept = choose_hypotheses(
-            self.posterior.body.relative_joints(poses),
-            search.rated(poses, energies),
-            plan.candidates,
-            same=s.hypothesis_merge_distance,
-        ).chosen
-        poses, members = poses[kept], members[kept]
-        # A chain that jumped is expected where it landed, the rest where it was predicted.
-        jumped = np.abs(poses - base.x[members]) > np.sqrt(np.finfo(np.float64).eps)
-        return sources.proposed(members, poses, jumped)
+        everything.append((best.poses, group[best.parents], best.energies))
+    others = np.array([k for group in groups[plan.groups :] for k in group], dtype=np.intp)
+    if len(others):
+        poses = base.x[others]
+        everything.append((poses, others, posterior.values(poses, observation)))
+    poses, members, energies = (np.concatenate(parts) for parts in zip(*everything, strict=True))
+    kept = search.best(poses, energies)
+    poses, members = poses[kept], members[kept]
+    # A chain that jumped is expected where it landed, the rest where it was predicted.
+    jumped = np.abs(poses - base.x[members]) > np.sqrt(np.finfo(np.float64).eps)
+    return sources.proposed(members, poses, jumped)
 
-    @cached_property
-    def _searches(self) -> dict[str, LimbSearch]:
-        pairs = self.posterior.body.chain_pairs
-        return {chain: LimbSearch(self.posterior, chain) for pair in pairs for chain in pair}
 
-    def _groups(self, base: Minimum) -> list[Index]:
-        """Modes with nearly the same trunk, each group with its best mode first."""
-        which = self.posterior.body.skeleton.joint_index(self.posterior.body.trunk_joints)
-        trunk = self.posterior.body.joint_positions(base.x)[:, which]
-        left = list(np.argsort(base.value, kind='stable'))
-        groups = []
-        while left:
-            gaps = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1)
-            near = gaps < SAME_TRUNK_DISTANCE
-            groups.append(np.array([i for i, ok in zip(left, near) if ok], dtype=np.intp))
-            left = [i for i, ok in zip(left, near) if not ok]
-        return groups
+def _groups(body: Body, base: Minimum) -> list[Index]:
+    """Modes with nearly the same trunk, each group with its best mode first."""
+    trunk = body.joint_positions(base.x)[:, body.skeleton.joint_index(body.trunk_joints)]
+    left = np.argsort(base.value, kind='stable')
+    groups = []
+    while len(left):
+        near = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1) < SAME_TRUNK_DISTANCE
+        groups.append(left[near])
+        left = left[~near]
+    return groups
 
-    def _not_shown(self, observation: Observation, surprising: bool) -> list[str]:
-        """The limbs that an image is searched for: those that no keypoints show.
 
-        Two keypoints fix a limb but for its flips; samples beside them mostly find other limbs and
-        the background. Where an image is surprising the keypoints may be wrong.
-        """
-        if not {'coverage', 'edges'} & observation.evidence.keys():
-            return []
-        names, keypoints = list(self._searches), observation.keypoints
-        if (
-            surprising
-            or keypoints is None
-            or self.posterior.settings.likelihood.keypoints.weight == 0
-        ):
-            return names
-        skeleton, beliefs = self.posterior.body.skeleton, observation.beliefs
-        seen = {name for name, known in zip(keypoints.names, keypoints.seen, strict=True) if known}
+def limbs_not_shown(posterior: Posterior, observation: Observation, surprising: bool) -> list[str]:
+    """The limbs that an image is searched for: those that no keypoints show.
 
-        def shown(limb: str) -> bool:
-            if beliefs is not None:
-                group = group_of(skeleton, skeleton.chains[limb][0])
-                if beliefs.keypoints[group] < 0.5:
-                    return False
-            joints = (skeleton.joint_names[j] for j in skeleton.chain_joints[limb])
-            return len(seen.intersection(joints)) >= 2
+    Two keypoints fix a limb but for its flips; samples beside them mostly find other limbs and
+    the background. Where an image is surprising the keypoints may be wrong.
+    """
+    if not {'coverage', 'edges'} & observation.evidence.keys():
+        return []
+    names, keypoints = list(posterior.divided), observation.keypoints
+    if surprising or keypoints is None or posterior.settings.likelihood.keypoints.weight == 0:
+        return names
+    skeleton, beliefs = posterior.body.skeleton, observation.beliefs
+    seen = {name for name, known in zip(keypoints.names, keypoints.seen, strict=True) if known}
 
-        return [limb for limb in names if not shown(limb)]
+    def shown(limb: str) -> bool:
+        group = group_of(skeleton, skeleton.chains[limb][0])
+        if beliefs is not None and beliefs.keypoints[group] < 0.5:
+            return False
+        joints = (skeleton.joint_names[j] for j in skeleton.chain_joints[limb])
+        return len(seen.intersection(joints)) >= 2
 
-    def _search(
-        self,
-        limbs: list[str],
-        search: Search,
-        pose: Array,
-        ancestor: int,
-        rng: np.random.Generator,
-    ) -> dict[str, Array]:
-        """Configurations of some limbs that fit the image, where the others are as in a pose (d,).
+    return [limb for limb in names if not shown(limb)]
 
-        Args:
-            limbs: that may be searched for.
-            search: of the image.
-            pose: (d,) the first of a group.
-            ancestor: of it.
-            rng: source of randomness.
-        """
-        plan = search.plan
-        count = min(plan.searched_chains, len(limbs))
-        if count == 0:
-            return {}
-        chosen = rng.choice(len(limbs), size=count, replace=False)
-        covariance = search.states.searched[ancestor]
-        return {
-            limbs[i]: self._searches[limbs[i]].find(pose, covariance, search.observation, plan, rng)
-            for i in sorted(chosen)
-        }
+
+def _search_limbs(
+    limbs: list[str], search: Search, pose: Array, ancestor: int, rng: np.random.Generator
+) -> dict[str, Array]:
+    """Configurations of some limbs that fit the image, where the others are as in a pose (d,).
+
+    Args:
+        limbs: that may be searched for.
+        search: of the image.
+        pose: (d,) the first of a group.
+        ancestor: of it.
+        rng: source of randomness.
+    """
+    count = min(search.plan.searched_chains, len(limbs))
+    if count == 0:
+        return {}
+    covariance = search.states.searched[ancestor]
+    posterior, observation, plan = search.posterior, search.observation, search.plan
+    return {
+        limbs[i]: find_limb(posterior, limbs[i], pose, covariance, observation, plan, rng)
+        for i in sorted(rng.choice(len(limbs), size=count, replace=False))
+    }

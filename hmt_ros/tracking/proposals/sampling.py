@@ -6,8 +6,7 @@ CSS     x ~ N(m, s^2 S)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Callable
 
 import numpy as np
 
@@ -16,8 +15,6 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
-from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.selection import choose_hypotheses
 
 
 def spherical_samples(
@@ -63,40 +60,34 @@ def _noise(shape: tuple[int, ...], scale: float, rng: np.random.Generator) -> Ar
     return noise / np.maximum(heavy, np.finfo(np.float64).eps)
 
 
-@dataclass(frozen=True, eq=False)
-class CovarianceScaledSamples:
-    """Proposes covariance-scaled samples around the predictions.
-
-    Attributes:
-        posterior: of the body before the camera.
-    """
-
-    posterior: Posterior
-    draw: ClassVar = staticmethod(covariance_scaled_samples)
-
-    def propose(
-        self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
-    ) -> Hypotheses:
-        """See `Proposal`."""
-        s, body, k = self.posterior.settings, self.posterior.body, len(sources)
-        observation, covariances = search.observation, search.states.searched
-        each = max(s.samples // k, 1)
-        drawn = self.draw(body, sources.expected, covariances, each, s.sample_scale, rng)
-        poses = np.concatenate([base.x, drawn.reshape(-1, body.dimension)])
-        rows = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
-        energies = self.posterior.values(poses, observation)
-        kept = choose_hypotheses(
-            body.relative_joints(poses),
-            search.rated(poses, energies),
-            search.plan.candidates,
-            same=s.hypothesis_merge_distance,
-        ).chosen
-        still = np.zeros((len(kept), body.dimension), dtype=np.bool_)
-        return sources.proposed(rows[kept], poses[kept], still)
+def covariance_scaled_poses(
+    search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
+) -> Hypotheses:
+    """Covariance-scaled samples around the predictions."""
+    return _sampled(covariance_scaled_samples, search, base, sources, rng)
 
 
-@dataclass(frozen=True, eq=False)
-class SphericalSamples(CovarianceScaledSamples):
-    """Proposes spherical samples of the same volume."""
+def spherical_poses(
+    search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
+) -> Hypotheses:
+    """Spherical samples of the same volume around the predictions."""
+    return _sampled(spherical_samples, search, base, sources, rng)
 
-    draw: ClassVar = staticmethod(spherical_samples)
+
+def _sampled(
+    draw: Callable[[Body, Array, Array, int, float, np.random.Generator], Array],
+    search: Search,
+    base: Minimum,
+    sources: Hypotheses,
+    rng: np.random.Generator,
+) -> Hypotheses:
+    """The best of samples, and the optima that are there."""
+    posterior, k = search.posterior, len(sources)
+    s, body = posterior.settings, posterior.body
+    each = max(s.samples // k, 1)
+    drawn = draw(body, sources.expected, search.states.searched, each, s.sample_scale, rng)
+    poses = np.concatenate([base.x, drawn.reshape(-1, body.dimension)])
+    rows = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
+    kept = search.best(poses, posterior.values(poses, search.observation))
+    still = np.zeros((len(kept), body.dimension), dtype=np.bool_)
+    return sources.proposed(rows[kept], poses[kept], still)

@@ -13,7 +13,7 @@ from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps
+from hmt_ros.tracking.proposals.kinematic_jumps import limbs_not_shown
 
 BODY = load_body('human37')
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
@@ -23,8 +23,8 @@ SHAPE = {'edges': object()}
 
 def searched_for(observation, *, surprising=False, settings=None):
     """Limbs that an image is searched for."""
-    jumps = KinematicJumps(Posterior(BODY, CAMERA, settings or TrackerSettings()))
-    return set(jumps._not_shown(observation, surprising))
+    posterior = Posterior(BODY, CAMERA, settings or TrackerSettings())
+    return set(limbs_not_shown(posterior, observation, surprising))
 
 
 def seen(*names):

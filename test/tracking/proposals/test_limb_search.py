@@ -10,7 +10,7 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.inference.energy import Student, Sum
 from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.proposals.kinematic_jumps import LimbSearch
+from hmt_ros.tracking.proposals.kinematic_jumps import find_limb
 from hmt_ros.tracking.settings import LIMB_TAILS, LimbSearchSettings, TrackerSettings
 
 CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
@@ -24,12 +24,15 @@ def test_without_an_image_a_limb_goes_where_the_prior_wants_it_given_the_other_l
         likelihood=LikelihoodSettings(pose_prior=kind, prior_weight=2.0),
         search=LimbSearchSettings(samples=24, refined=2, iterations=60),
     )
-    search = LimbSearch(Posterior(body, CAMERA, settings), 'left_arm')
+    posterior = Posterior(body, CAMERA, settings)
     pose = np.clip(body.prior_mean, body.lower + 0.05, body.upper - 0.05)
     pose[body.skeleton.dof_index(('root_tz', 'right_elbow', 'trunk_x'))] = (4.0, 0.5, -0.6)
     covariance = 0.3 * np.eye(37)
-    found = search.find(pose, covariance, Observation(), settings.plan, np.random.default_rng(0))
-    own = search.dofs
+    found = find_limb(
+        posterior, 'left_arm', pose, covariance, Observation(), settings.plan,
+        np.random.default_rng(0),
+    )  # fmt: skip
+    own = np.asarray(body.skeleton.chain_dofs['left_arm'])
     assert found.shape == (2, len(own))
     prior = PoseEnergy(
         ImageLikelihood(body, CAMERA), (pose_prior(body, kind, 2.0),), None, pose, own

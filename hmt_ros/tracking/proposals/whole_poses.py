@@ -1,30 +1,42 @@
-"""Poses fitted to keypoints alone, from which a silhouette of something else draws modes away.
+"""Proposals of whole poses: predicted ones, by keypoints alone, and reversed ones.
+
+Pose hypotheses from an external single-image predictor, such as a mixture of experts, are
+proposals, no evidence, which would count the image twice.
+
+Poses fitted to keypoints alone, from which a silhouette of something else draws modes away:
 
     x' = argmin sum_p d_p(x)^2 / 2 + E_prior(x) + (x - f)' P (x - f) / 2
 
 d_p is the distance to keypoint p in deviations, f the predicted pose of the heaviest mode, or x' of
 the image before while silhouette and keypoints go different ways, P the precision of the
 prediction.
+
+Reversals are the whole pose the other way round in depth, left taken for right (`body.mirror`). A
+silhouette hardly tells a pose from its reversal, so a turn can be taken the wrong way round, and no
+jump of a limb leads back. Where no mode of comparable weight faces one of the two ways, the best
+mode is reversed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from hmt_ros.body.mirror import reverse_depth
 from hmt_ros.image.terms.keypoints import KeypointTerm
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Quadratic
+from hmt_ros.tracking.classes import lost_a_facing
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.misfit import KEYPOINTS, Misfit, of_keypoints
 from hmt_ros.tracking.optimisation import Search
-from hmt_ros.tracking.posterior import Posterior
+from hmt_ros.tracking.settings import REVERSAL_ITERATIONS
 from hmt_ros.tracking.validity import UNDECIDED, ByKeypoints
 
 
-class KeypointHistory:
+class PoseByKeypoints:
     """The pose that keypoints alone have led to since the modes left some of them.
 
     Attributes:
@@ -65,27 +77,43 @@ class KeypointHistory:
         return ByKeypoints(of_keypoints(term, pose), gain)
 
 
-@dataclass(frozen=True, eq=False)
-class KeypointPoses:
-    """Proposes the pose to which keypoints alone would move the heaviest mode.
+def predicted_poses(
+    search: Search, _base: Minimum, sources: Hypotheses, _rng: np.random.Generator
+) -> Hypotheses:
+    """The means of a prediction, if there is one, each as a jump from the nearest mode."""
+    if search.prediction is None:
+        return sources[:0]
+    poses = search.prediction.seen_as(search.posterior.person).means
+    nearest = search.continuity.log_transitions(poses).argmax(0)
+    return sources.proposed(nearest, poses, np.ones(poses.shape, dtype=np.bool_))
 
-    It does so where the modes missed more than a quarter of the keypoints of the image before.
 
-    Attributes:
-        posterior: of the body before the camera.
+def keypoint_poses(
+    search: Search, _base: Minimum, sources: Hypotheses, _rng: np.random.Generator
+) -> Hypotheses:
+    """The pose to which keypoints alone would move the heaviest mode.
+
+    There is one where the modes missed more than a quarter of the keypoints of the image before.
     """
+    if not search.contradicted or search.posterior.placing(search.observation) is None:
+        return sources[:0]
+    pose = _by_keypoints(search, None)
+    first = np.zeros(1, dtype=np.intp)
+    return sources.proposed(first, pose, np.zeros(pose.shape, dtype=np.bool_), expected=pose)
 
-    posterior: Posterior
 
-    def propose(
-        self, search: Search, _base: Minimum, sources: Hypotheses, _rng: np.random.Generator
-    ) -> Hypotheses:
-        """See `Proposal`."""
-        if not search.contradicted or self.posterior.placing(search.observation) is None:
-            return sources[:0]
-        pose = _by_keypoints(search, None)
-        first = np.zeros(1, dtype=np.intp)
-        return sources.proposed(first, pose, np.zeros(pose.shape, dtype=np.bool_), expected=pose)
+def reversed_poses(
+    search: Search, base: Minimum, sources: Hypotheses, _rng: np.random.Generator
+) -> Hypotheses:
+    """The reversal of the best mode where a way to face is lost."""
+    log_weights = search.rated(base.x, base.value)
+    if not lost_a_facing(search.modes.back, log_weights):
+        return sources[:0]
+    best = np.argsort(-log_weights, kind='stable')[:1]
+    turned = reverse_depth(search.posterior.body, base.x[best])
+    term = search.posterior.of_image(search.observation)
+    moved = search.posterior.minimise(term, turned, REVERSAL_ITERATIONS).x
+    return sources.proposed(best, moved, np.ones(moved.shape, dtype=np.bool_))
 
 
 def _by_keypoints(search: Search, before: Array | None) -> Array:
