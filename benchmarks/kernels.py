@@ -73,7 +73,11 @@ def _cases(seconds: float) -> Iterator[dict[str, Any]]:
     joints, log_weights = rng.normal(0, 0.1, (256, 19, 3)), rng.normal(0, 3, 256)
     poses = _any_poses(128)
     cases: tuple[tuple[str, int, Callable[[], Any]], ...] = (
-        ('choice of hypotheses', 256, partial(choose_hypotheses, joints, log_weights, 16)),
+        (
+            'choice of hypotheses',
+            256,
+            partial(choose_hypotheses, joints, log_weights, 16, same=0.02),
+        ),
         ('flips of an arm', 1, partial(enumerate_flips, body, poses[:1], 'left_arm')),
         ('flips of an arm', 128, partial(enumerate_flips, body, poses, 'left_arm')),
         ('self-intersection', 128, partial(self_intersection_energy, body, poses)),

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,12 @@ _EFFECTS = {
 _MARKS = [*_EFFECTS.values()]
 RESULTS = DOCS.parent / 'benchmarks' / 'results'
 CONFIG = DOCS.parent / 'hmt_ros' / 'config'
+_WIDTH, _INDENT = 100, '    '
 
 
 def main(argv: list[str]) -> int:
     """Writes what is named."""
     from benchmarks import BENCHMARKS
-    from hmt_ros.sessions.parameter_file import parameter_file_text
 
     if not argv or any(name not in (*NODES, *BENCHMARKS) for name in argv):
         sys.stderr.write(f'generate.py: wanted some of {", ".join((*NODES, *BENCHMARKS))}\n')
@@ -105,6 +106,53 @@ def settings_of(node: str) -> Any:
         'people_node': PeopleParameters,
     }
     return kinds[node]()
+
+
+def parameter_file_text(node: str, settings: Any, like: str = '', others: Any = None) -> str:
+    """A parameter file with all parameters, each under a comment that describes it.
+
+    Args:
+        like: name of a node whose parameters this one has, too, and whose file lists those that
+            are the same; '': there is none.
+        others: settings of that node.
+    """
+    from hmt_ros.sessions.declared_parameters import EFFECTS, declared_parameters
+    from hmt_ros.sessions.parameter_file import PARAMETERS_KEY, yaml_scalar
+
+    declared = declared_parameters(settings)
+    if like:
+        known = declared_parameters(others)
+        declared = [parameter for parameter in declared if parameter not in known]
+    used = {parameter.effect for parameter in declared}
+    lines = [
+        f'# Parameters of {node}, with their defaults. A file needs only those that it changes:',
+        '#',
+        f'#     ros2 run hmt_ros {node} --ros-args --params-file FILE',
+        '#',
+        *([f'# All others are those of {like}: see {like}.yaml.', '#'] if like else []),
+        '# In square brackets: lowest and highest value, and when a new value takes effect:',
+        *(
+            f'# "{name}": {text[0].lower()}{text[1:]}'
+            for name, text in EFFECTS.items()
+            if name in used
+        ),
+        f'/**/{node}:',
+        f'  {PARAMETERS_KEY}:',
+    ]
+    for parameter in declared:
+        facts = parameter.bounds, parameter.effect
+        lines.extend(
+            textwrap.wrap(
+                f'{parameter.description} [{"; ".join(filter(None, facts))}]',
+                _WIDTH,
+                initial_indent=f'{_INDENT}# ',
+                subsequent_indent=f'{_INDENT}# ',
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+        )
+        lines.append(f'{_INDENT}{parameter.name}: {yaml_scalar(parameter.default)}')
+    return '\n'.join(lines) + '\n'
 
 
 def parameter_table(node: str) -> str:

@@ -1,7 +1,5 @@
 """What tests share: a ROS domain of their own, reproducible hypothesis runs, poses, clips."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -53,7 +51,7 @@ LONGEST = (
 _domain_reservation = pytest.StashKey[socket.socket]()
 
 
-def _reserve_ros_domain() -> tuple[int, socket.socket]:
+def _reserve_ros_domain():
     """Number of a ROS domain that no other test run on this machine uses, and what reserves it.
 
     A domain is taken while port 32768 + domain is bound, as ament's domain_coordinator does it. The
@@ -72,40 +70,40 @@ def _reserve_ros_domain() -> tuple[int, socket.socket]:
     raise RuntimeError('all ROS domains from 1 to 100 are in use by other test runs')
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     # Every process its own, also those of pytest-xdist: in one domain every node sees every other.
     domain, config.stash[_domain_reservation] = _reserve_ros_domain()
     os.environ['ROS_DOMAIN_ID'] = str(domain)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
-def pytest_unconfigure(config: pytest.Config) -> None:
+def pytest_unconfigure(config):
     reservation = config.stash.get(_domain_reservation, None)
     if reservation is not None:
         reservation.close()
 
 
-def pytest_itemcollected(item: pytest.Item) -> None:
+def pytest_itemcollected(item):
     if item.get_closest_marker('ros') is not None and 'AMENT_PREFIX_PATH' not in os.environ:
         reason = 'no ROS environment: "make test" or "source tools/environment.bash" first'
         item.add_marker(pytest.mark.skip(reason=reason))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     folder = Path(__file__).resolve().parent
     places = {folder / name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path, len(places)))
 
 
 @pytest.fixture(scope='session')
-def mediapipe_pose() -> None:
+def mediapipe_pose():
     """Skips tests that want MediaPipe Pose where it is not installed."""
     if not (has_runtime() and has_networks()):
         pytest.skip('MediaPipe Pose is not installed: run "make detector"')
 
 
 @pytest.fixture(scope='session')
-def mocap() -> Path:
+def mocap():
     """Folder of the development motions; tests that want it are skipped where it is absent."""
     root = Path(__file__).resolve().parents[1]
     folder = Path(os.environ.get('HMT_SHARED', root / '..' / 'shared')) / 'mocap'
@@ -115,12 +113,12 @@ def mocap() -> Path:
 
 
 @pytest.fixture(scope='session')
-def human32() -> Body:
+def human32():
     return load_body('human32')
 
 
 @pytest.fixture(scope='session')
-def human37() -> Body:
+def human37():
     return load_body('human37')
 
 
@@ -128,10 +126,10 @@ RandomPoses = Callable[[Body, int, int], np.ndarray]
 
 
 @pytest.fixture(scope='session')
-def random_poses() -> RandomPoses:
+def random_poses():
     """Function (body, n, seed) -> poses (n, d) inside the limits, root 2 to 5 m from the camera."""
 
-    def draw(body: Body, n: int, seed: int) -> np.ndarray:
+    def draw(body, n, seed):
         rng = np.random.default_rng(seed)
         lower = np.maximum(body.lower, -np.pi)
         upper = np.minimum(body.upper, np.pi)
@@ -145,7 +143,7 @@ def random_poses() -> RandomPoses:
 
 
 @pytest.fixture(scope='session')
-def walk_video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def walk_video(tmp_path_factory):
     """Folder with walk.mp4, seen at 60 degrees, the results walk.json of a perfect detector of COCO
     keypoints, and the rendered bag `rendered` that both come from, with truth.npz.
     """
@@ -154,7 +152,7 @@ def walk_video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = ['--duration', '0.8', '--fps', '10', '--size', '320x240', '--fov', '60']
     options += ['--distance', '3.2', '--quiet', '-o', str(rendered)]
     assert make_bag.main(['walk', *options]) == 0
-    kind = cv2.VideoWriter_fourcc(*'mp4v')  # type: ignore[attr-defined]
+    kind = cv2.VideoWriter_fourcc(*'mp4v')
     writer = cv2.VideoWriter(str(folder / 'walk.mp4'), kind, 10.0, (320, 240))
     assert writer.isOpened()
     with BagReader(rendered) as bag:

@@ -6,8 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,6 @@ from numba import njit
 import hmt_ros
 from hmt_ros.compiled_code import (
     FOLDERS,
-    KEPT,
     VARIABLE,
     folder_of,
     keep_compiled_code_apart,
@@ -68,25 +65,6 @@ def test_kernels_and_what_they_import_lie_in_the_folders():
         str(x.relative_to(root)) for x in seen if x.relative_to(root).parts[0] not in FOLDERS
     }
     assert outside <= {'__init__.py', 'compiled_code.py'}
-
-
-def test_it_is_in_the_package_where_that_can_be_written(package, monkeypatch, tmp_path):
-    assert folder_of(package).parent == package / '__pycache__'
-    monkeypatch.setattr(os, 'access', lambda *_: False)
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
-    assert folder_of(package).is_relative_to(tmp_path / 'cache' / 'hmt_ros')
-
-
-def test_folders_of_other_states_go_after_a_day(package, monkeypatch):
-    monkeypatch.delenv(VARIABLE)
-    old, recent = (package / '__pycache__' / f'compiled-{x}' for x in ('old', 'recent'))
-    for folder in (old, recent):
-        folder.mkdir(parents=True)
-    os.utime(old, (time.time() - KEPT - 60.0,) * 2)
-    keep_compiled_code_apart(package)
-    assert os.environ[VARIABLE] == str(folder_of(package))
-    assert not old.exists()
-    assert recent.exists()
 
 
 @pytest.mark.parametrize(
@@ -142,14 +120,3 @@ def test_loading_or_compiling_is_told(monkeypatch):
     prepare(lambda: thrice(2), lines.append)
     (line,) = lines
     assert line.startswith('kernels loaded in ')
-
-
-def test_what_fails_ends_the_report():
-    def fail():
-        raise ValueError('no')
-
-    lines = []
-    with pytest.raises(ValueError, match='no'):
-        prepare(fail, lines.append)
-    assert lines == []
-    assert not [thread for thread in threading.enumerate() if thread.name == 'kernels']

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from hmt_learning.app import make_bag
-from hmt_ros.app.report.mixtures import Layer, Moment, read_mixtures
-from hmt_ros.app.report.skeletons import LEFT, RIGHT, draw_overview
+from hmt_ros.app.report.skeletons import LEFT, RIGHT
 from hmt_ros.app.truth import read_truth
-from hmt_ros.body import Camera
 from hmt_ros.evaluation.pose_scores import HIPS
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -120,46 +118,3 @@ def test_keypoints_are_told_apart_from_images(source, tmp_path):
     assert errors['images and keypoints'] < errors['images alone']
     with BagReader(tmp_path / 'out' / 'images_alone') as alone:
         assert alone.topic('pose_mixture').message_count == 5
-
-
-def made_up_track(source):
-    """A made-up track: the true joints, and the same moved back and forth."""
-    truth = read_truth(source / 'truth.npz')
-    moments = {}
-    for stamp, joints in truth.joints.items():
-        shift = np.array([-0.1, 0.0, 0.2])[:, None, None] * [0, 0, 1]
-        moments[stamp] = Moment(stamp, np.array([0.6, 0.3, 0.1]), joints + shift)
-    return Layer('/pose_mixture', 'posterior', truth.frame_id, truth.joint_names, moments)
-
-
-def test_the_same_track_gives_the_same_picture(source, truth, tmp_path):
-    track = made_up_track(source)
-    stamps = list(track.mixtures)[:3]
-    camera = Camera(440.0, 440.0, 159.5, 119.5, 320, 240)
-    images = {stamp: np.full((240, 320, 3), 99, np.uint8) for stamp in stamps}
-    for name in ('a.png', 'b.png'):
-        draw_overview(tmp_path / name, track, camera, images, truth)
-    first, second = ((tmp_path / name).read_bytes() for name in ('a.png', 'b.png'))
-    assert first == second
-    assert len(first) < 300_000
-
-
-def test_recorded_mixtures_are_read_heaviest_first(output):
-    layers = read_mixtures(output[0] / 'small').layers
-    (track,) = (layer for layer in layers if layer.topic == '/pose_mixture')
-    assert len(track.mixtures) == 5
-    for moment in track.mixtures.values():
-        assert (np.diff(moment.weights) <= 0).all()
-        assert moment.joints.shape == (len(moment.weights), len(track.joint_names), 3)
-
-
-def test_input_that_can_not_be_used(source, tmp_path, capsys):
-    cases = {
-        'can not be read': [str(tmp_path / 'nowhere'), '-o', str(tmp_path / 'out')],
-        'required': [str(source)],
-    }
-    for wanted, arguments in cases.items():
-        assert main(arguments) == 1
-        errors = capsys.readouterr().err.splitlines()
-        assert len(errors) == 1
-        assert wanted in errors[0]

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
-from msg_tools import BagReader, BagWriter, RosbagsMessages
+from msg_tools import BagReader, RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message
 from msg_tools.messages.pose_mixtures import (
@@ -81,38 +80,6 @@ def test_a_robot_slows_down_and_stops_where_nothing_is_known():
         (keep_out(KeepOutState.LOST, 9.0, 0.6), 0.0),
     ):
         assert scale(message) == pytest.approx(wanted)
-
-
-def test_cells_under_capsules_are_occupied():
-    told = example('keep_out_grid')
-    centres = np.arange(-4.975, 5.0, 0.05)
-    x, y = np.meshgrid(centres, centres)
-    # One that stands, and one that lies across the grid's border.
-    under = told['shadows']([1, 2, 0, 4, -3, 1], [1, 2, 3, 9, -3, 1], [0.5, 0.3])
-    away = np.minimum(np.hypot(x - 1, y - 2) - 0.5, np.hypot(np.minimum(x - 4, 0), y + 3) - 0.3)
-    assert under.shape == x.shape
-    assert under[away <= 0].all()
-    assert not under[away > 0.05].any()
-    assert not told['shadows']([9, 9, 0], [9, 9, 1], [0.5]).any()
-
-
-@pytest.mark.parametrize(
-    ('state', 'unseen', 'frame', 'share'),
-    [
-        (KeepOutState.NOBODY, 0.0, 'odom', 0.0),
-        (KeepOutState.NOBODY, 0.0, 'eye', 1.0),
-        (KeepOutState.UNKNOWN, 0.0, 'odom', 1.0),
-        (KeepOutState.STALE, 0.0, 'odom', 1.0),
-        (KeepOutState.LOST, 0.6, 'odom', 1.0),
-        (KeepOutState.LOST, 0.4, 'odom', LYING),
-        (KeepOutState.TRACKING, 0.0, 'odom', LYING),
-    ],
-)
-def test_everything_is_occupied_where_nothing_is_known(state, unseen, frame, share):
-    message = keep_out(state, 1.5, unseen, frame)
-    cells = example('keep_out_grid')['occupancy'](message)
-    assert set(np.unique(cells)) <= {0, 100}
-    assert np.mean(cells == 100) == pytest.approx(share, abs=1e-3)
 
 
 def mixture(*heights, weights=(0.75, 0.25)):
@@ -265,29 +232,6 @@ def test_examples_tell_what_the_demonstration_shows(demonstration):
     found = [w @ x for x, w in zip(plotted[1], plotted[3], strict=True)]
     true = joints[:, names.index('pelvis'), 1] - hands[:, 1, 1]
     assert np.abs(np.array(found) - true).mean() < 0.1
-
-
-def test_the_height_of_a_joint_is_drawn(tmp_path, monkeypatch):
-    body = load_body('human37')
-    poses = np.tile(body.prior_mean, (2, 1))
-    poses[:, 2] = 3.0
-    covariance = 1e-4 * np.eye(body.dimension)
-    with BagWriter(tmp_path / 'bag') as bag:
-        for k in range(5):
-            posterior = GaussianMixture([0.6, 0.4], poses, [covariance] * 2)
-            content = PoseMixture.of_body(
-                body, posterior, MixtureKind.POSTERIOR, 10**9 + k * 10**8, 'eye',
-                state=TrackState.TRACKING,
-            )  # fmt: skip
-            bag.write('pose_mixture', content.stamp_ns, pose_mixture_message(MESSAGES, content))
-    words = ['plot_joint.py', str(tmp_path / 'bag'), '-o', str(tmp_path / 'a.png')]
-    monkeypatch.setattr(sys, 'argv', words)
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(EXAMPLES / 'plot_joint.py'), run_name='__main__')
-    assert ended.value.code == 0
-    picture = cv2.imread(str(tmp_path / 'a.png'))
-    assert picture.shape == (480, 900, 3)
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
 
 
 def test_the_notebook_runs_from_its_first_cell_to_its_last(monkeypatch, capsys):

@@ -3,8 +3,6 @@
 A panel that names another topic stays empty, without a word.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -34,12 +32,12 @@ NODE_TOPICS = {
 }
 
 
-def read(name: str) -> dict[str, Any]:
+def read(name):
     layout: dict[str, Any] = json.loads((ROOT / 'foxglove' / name).read_text('utf-8'))
     return layout
 
 
-def panels(layout: Any) -> set[str]:
+def panels(layout):
     """Panels that the tree of a layout names."""
     if isinstance(layout, str):
         return {layout}
@@ -47,7 +45,7 @@ def panels(layout: Any) -> set[str]:
     return panels(layout['first']) | panels(layout['second'])
 
 
-def topics_of(name: str, settings: dict[str, Any]) -> dict[str, str]:
+def topics_of(name, settings):
     """Topics of a panel, with the type that it wants, and the fields that it plots behind it."""
     kind = name.partition('!')[0]
     if kind == '3D':
@@ -65,7 +63,7 @@ def topics_of(name: str, settings: dict[str, Any]) -> dict[str, str]:
     return {'/rosout': SHOWN[kind]}
 
 
-def check_field(msgtype: str, path: str) -> None:
+def check_field(msgtype, path):
     """Asserts that a type has the field that a plot shows."""
     definitions = typestore().fielddefs
     for part in re.sub(r'\[-?\d+\]', '', path).split('.'):
@@ -76,7 +74,7 @@ def check_field(msgtype: str, path: str) -> None:
         msgtype = inner.group() if inner else ''
 
 
-def check_layout(name: str, there: dict[str, str], frames: set[str]) -> None:
+def check_layout(name, there, frames):
     """Asserts that no panel of a layout stays empty.
 
     Args:
@@ -99,7 +97,7 @@ def check_layout(name: str, there: dict[str, str], frames: set[str]) -> None:
             assert {settings['followTf'], settings['layers']['grid']['frameId']} <= frames
 
 
-def test_live_layout_shows_topics_of_the_nodes() -> None:
+def test_live_layout_shows_topics_of_the_nodes():
     there = {
         topic if topic.startswith('/') else f'{PERSON_1}/{topic}': published.msgtype
         for topic, published in NODE_TOPICS.items()
@@ -109,7 +107,7 @@ def test_live_layout_shows_topics_of_the_nodes() -> None:
     check_layout(LIVE, there, {'camera_upright'})
 
 
-def test_layout_of_bags_shows_what_replay_writes(still: Any, tmp_path: Path) -> None:
+def test_layout_of_bags_shows_what_replay_writes(still, tmp_path):
     bag = write(tmp_path / 'bag', recorded())
     assert main([str(bag), '-o', str(tmp_path / 'out'), *PERSON, '--quiet']) == 0
     with BagReader(tmp_path / 'out') as reader:

@@ -4,8 +4,6 @@
 what they are given take their place; what is given is then started as launch_ros would.
 """
 
-from __future__ import annotations
-
 import re
 import runpy
 import subprocess
@@ -16,18 +14,14 @@ import types
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import yaml
-from scipy.spatial.transform import Rotation
 
-from hmt_ros.detectors.detector import DetectorKind
 from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.sessions import bme_session, keypoints_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.declared_parameters import values_of, with_values
+from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.keypoints_session import KeypointsParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
@@ -59,12 +53,12 @@ SETTINGS = {
 class Kept:
     """Any action or substitution: keeps its arguments."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
+    def __init__(self, *arguments, **options):
         self.arguments, self.options = arguments, options
 
 
 class Configuration(Kept):
-    def perform(self, context: Any) -> str:
+    def perform(self, context):
         return str(context[self.arguments[0]])
 
 
@@ -87,7 +81,7 @@ STAND_INS = {
 }
 
 
-def with_stand_ins(file: Path) -> dict[str, Any]:
+def with_stand_ins(file):
     """Everything in a launch file, with stand-ins."""
     with pytest.MonkeyPatch.context() as patch:
         for name, content in STAND_INS.items():
@@ -97,7 +91,7 @@ def with_stand_ins(file: Path) -> dict[str, Any]:
         return runpy.run_path(str(file))
 
 
-def detector(installed: bool) -> DetectorKind:
+def detector(installed):
     """The usual detector, as if it were installed here, or not."""
     return replace(DETECTORS[USUAL_DETECTOR], is_installed=lambda: installed)
 
@@ -124,7 +118,7 @@ def actions(description, tmp_path, monkeypatch):
     return make
 
 
-def parameters(options: dict[str, Any]) -> dict[str, Any]:
+def parameters(options):
     """What a node is given beside its file in config/."""
     file, values, *_ = options['parameters']
     assert file == str(ROOT / 'hmt_ros' / 'config' / f'{options["name"]}.yaml')
@@ -250,21 +244,6 @@ def test_rep_155(actions):
     assert elsewhere['namespaces'] == '/lab/anna'
 
 
-def test_room_for_raw_images(actions, monkeypatch):
-    for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
-        monkeypatch.delenv(name, raising=False)
-    room = {'FASTRTPS_DEFAULT_PROFILES_FILE': str(ROOT / 'hmt_ros' / 'config' / 'fastdds.xml')}
-    assert Path(*room.values()).is_file()
-    assert {
-        name: one['additional_env'] for name, one in actions(bag='walk').items()
-    } == dict.fromkeys(('filter_node', 'smoother_node', 'bme_node', 'bag'), room)
-    compressed = actions(image_transport='compressed').values()
-    assert [one['additional_env'] for one in compressed] == [{}, {}, {}]
-    # Whoever has settings of their own keeps them.
-    monkeypatch.setenv('FASTDDS_DEFAULT_PROFILES_FILE', 'mine.xml')
-    assert actions()['filter_node']['additional_env'] == {}
-
-
 def test_arguments(actions, tmp_path):
     made = actions(
         body_id='anna',
@@ -341,43 +320,6 @@ def test_wrong_arguments_are_told_in_one_line(actions, given, message):
     assert '\n' not in str(caught.value)
 
 
-def test_what_is_not_installed_is_told_before_a_node_starts(actions, description, monkeypatch):
-    def directory(package):
-        if package == missing:
-            raise KeyError(f'package {package!r} not found')
-        return str(ROOT / package)
-
-    names = description['actions_of'].__globals__
-    monkeypatch.setitem(names, 'get_package_share_directory', directory)
-    for missing, argument, value in (
-        ('hri_msgs', 'hri', 'true'),
-        ('tf2_ros', 'rviz', 'true'),
-        ('tf2_ros', 'camera_frame', 'lens'),
-        ('rviz2', 'rviz', 'true'),
-    ):
-        with pytest.raises(ValueError, match=f'^{argument}: package {missing} is not installed$'):
-            actions(**{argument: value})
-    assert len(actions(camera_frame='lens')) == 4
-
-
-def test_views_are_upright(actions):
-    made = actions(rviz='true', camera_frame='lens', body_id='anna')
-    rviz = made['rviz2']
-    assert rviz['namespace'] == '/humans/bodies/anna'
-    # The package's share folder is hmt_ros/ here, with config/ alone.
-    assert rviz['arguments'] == ['-d', str(ROOT / 'hmt_ros' / 'rviz' / 'hmt.rviz')]
-    words = made['static_transform_publisher']['arguments']
-    options = dict(zip(words[::2], words[1::2], strict=True))
-    assert options['--frame-id'] == 'lens'
-    view = yaml.safe_load((ROOT / 'rviz' / 'hmt.rviz').read_text('utf-8'))
-    fixed = view['Visualization Manager']['Global Options']['Fixed Frame']
-    assert options['--child-frame-id'] == fixed
-    turn = Rotation.from_quat([float(options[f'--q{axis}']) for axis in 'xyzw']).as_matrix()
-    # Forward, left and up of the upright frame are depth, minus right and minus down.
-    np.testing.assert_allclose(turn, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
-    assert list(actions(nodes='bme_node')) == ['bme_node']
-
-
 @pytest.mark.parametrize(
     ('given', 'options', 'nodes'),
     [
@@ -415,84 +357,6 @@ def test_one_line_from_a_webcam_to_a_person(given, options, nodes, monkeypatch):
     assert source.arguments == (str(ROOT / 'hmt_ros' / 'launch' / 'hmt.launch.py'),)
     # Neither file has an argument of the other's name.
     assert not context.keys() & {name for name, _, _ in with_stand_ins(FILE)['ARGUMENTS']}
-
-
-def test_arguments_of_the_camera_that_can_not_be_used():
-    actions_of = with_stand_ins(CAMERA_FILE)['actions_of']
-    usual = {name: default for name, default, _ in with_stand_ins(CAMERA_FILE)['ARGUMENTS']}
-    for given, text in (
-        ({'fov': '60', 'calibration': 'c.yaml'}, 'fov and calibration: wanted one of them'),
-        ({'detector': 'yes'}, "detector: wanted 'auto', 'true' or 'false', saw 'yes'"),
-        ({'loop': 'yes'}, "loop: wanted 'true' or 'false', saw 'yes'"),
-        ({'rate': 'fast'}, "rate: wanted a number such as 0.5, saw 'fast'"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            actions_of({**usual, **given}, ROOT)
-
-
-@pytest.mark.parametrize(
-    ('installed', 'given', 'said'),
-    [
-        (True, {}, None),
-        (False, {}, 'not installed, and no image of the empty scene is given: nothing tells where'),
-        (False, {'background_file': 'empty.png'}, 'not installed: keypoints help most, run "ros2'),
-        (True, {'detector': 'false'}, 'no detector is wanted, and no image of the empty scene'),
-        (True, {'detector': 'false', 'background_file': 'empty.png'}, None),
-    ],
-)
-def test_what_nobody_can_be_found_without_is_said_before_anything_starts(
-    installed, given, said, monkeypatch, capsys
-):
-    camera_file = with_stand_ins(CAMERA_FILE)
-    patched = camera_file['actions_of'].__globals__
-    monkeypatch.setitem(patched, 'DETECTOR', detector(installed))
-    monkeypatch.setitem(patched, 'actions_of', lambda *_: pytest.fail('too early') if said else [])
-    *declared, function = camera_file['generate_launch_description']().arguments[0]
-    context = {one.arguments[0]: one.options['default_value'] for one in declared}
-    if said is None:
-        function.options['function']({**context, **given})
-        assert capsys.readouterr().err == ''
-        return
-    with pytest.raises(pytest.fail.Exception):
-        function.options['function']({**context, **given})
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith('camera.launch.py: ')
-    assert said in line
-    assert 'ros2 run hmt_ros install-detector' in line
-
-
-def test_the_camera_waits_for_the_nodes_of_the_person_that_is_named(monkeypatch):
-    camera_file = with_stand_ins(CAMERA_FILE)
-    usual = {name: default for name, default, _ in camera_file['ARGUMENTS']}
-    for handed, namespace in (
-        ({'body_id': 'anna', 'namespace': ''}, '/humans/bodies/anna'),
-        ({'namespace': '/lab/anna'}, '/lab/anna'),
-    ):
-        camera, person = camera_file['actions_of'](
-            {**usual, 'detector': 'false', 'loop': 'true', 'rate': '2'},
-            ROOT,
-            {**handed, 'focal_length_sigma': '0.1'},
-        )
-        (parameters,) = camera.options['parameters']
-        names = parameters.pop('wait_for').split()
-        assert names == [f'{namespace}/{x}_node' for x in ('filter', 'smoother', 'bme')]
-        assert parameters == {'loop': True, 'rate': 2.0}
-        # What a user says of the lens goes on as it is.
-        assert 'focal_length_sigma' not in dict(person.options['launch_arguments'])
-
-
-def test_an_uncertain_focal_length_and_a_jump_of_simulated_time(actions):
-    made = actions(focal_length_sigma='0.2', use_sim_time='true')
-    own = parameters(made['filter_node'])
-    assert own.pop('use_sim_time') is True
-    assert with_values(FilterParameters(), own).focal_length_sigma == 0.2
-    for options in made.values():
-        assert parameters(options)['reset_on_time_jump'] is True
-    people = actions(nodes='people_node', focal_length_sigma='.2')['people_node']
-    assert parameters(people)['focal_length_sigma'] == 0.2
-    for text in ('1.5', 'much', '-0.1'):
-        with pytest.raises(ValueError, match='focal_length_sigma: wanted a number from 0 to 1'):
-            actions(focal_length_sigma=text)
 
 
 def test_rviz_shows_topics_of_the_nodes_relative_to_a_namespace():
@@ -549,18 +413,10 @@ def test_page_lists_the_arguments(description):
     assert set(given) <= own | set(listed) - {'image', 'nodes'}
 
 
-def test_a_configuration_file_alone_changes_nothing(actions):
-    """ROS merges sections of one name: the same one in a params_file then goes before both."""
-    for name, options in actions().items():
-        assert read_parameter_file(options['parameters'][0], name) == values_of(SETTINGS[name])
-        config, values = (yaml.safe_load(Path(one).read_text()) for one in options['parameters'])
-        assert list(values) == list(config) == [f'/**/{name}']
-
-
 # The nodes, started with what the launch file gives launch_ros.
 
 
-def command(options: dict[str, Any]) -> list[str]:
+def command(options):
     """Arguments of a node as launch_ros makes them."""
     name, namespace = options['name'], options['namespace']
     words = ['--ros-args', '-r', f'__node:={name}', '-r', f'__ns:={namespace}']
@@ -738,23 +594,6 @@ def started(description, tmp_path_factory):
             process.terminate()
         codes = [process.wait(PATIENCE) for process in processes]
     assert codes == [0, 0, 0]
-
-
-@pytest.mark.ros
-def test_nodes_are_active_with_the_parameters_of_the_launch_file(started):
-    from rcl_interfaces.srv import GetParameters
-
-    for name in SETTINGS:
-        started.wait_until_active(name)
-    names = ['max_hypotheses', 'frame_prefix', 'use_predictions', 'image_transport']
-    names.append('subject_file')
-    answer = started.call(GetParameters, 'filter_node', 'get_parameters', names=names)
-    values = answer.values
-    assert values[0].integer_value == 5
-    assert values[1].string_value == 'body_p1/'
-    assert values[2].bool_value is True
-    assert values[3].string_value == 'compressed'
-    assert values[4].string_value == str(REACH / 'subject.yaml')
 
 
 @pytest.mark.ros

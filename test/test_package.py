@@ -1,9 +1,6 @@
 """The shape of the packages: layers, metadata, and what is installed."""
 
-from __future__ import annotations
-
 import ast
-import importlib
 import os
 import re
 import runpy
@@ -15,7 +12,6 @@ import zipfile
 from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -27,7 +23,6 @@ from test.conftest import LONGEST
 
 ROOT = Path(__file__).resolve().parents[1]
 HMT_MSGS = ROOT / 'msg_tools' / 'hmt_msgs'
-INTERFACES = sorted([*HMT_MSGS.glob('msg/*.msg'), *HMT_MSGS.glob('srv/*.srv')])
 
 # An import points to the right, never to the left.
 LAYERS = [
@@ -49,7 +44,7 @@ LAYERS = [
 ]
 
 
-def modules() -> dict[str, Path]:
+def modules():
     """Every module of the Python packages, by name."""
     found = {}
     for package in ('hmt_ros', 'msg_tools', 'hmt_learning'):
@@ -62,13 +57,13 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
-def layer_of(module: str) -> str | None:
+def layer_of(module):
     fitting = [layer for layer in LAYERS if f'{module}.'.startswith(f'{layer}.')]
     return max(fitting, key=len, default=None)
 
 
 @cache
-def imported_names(module: str) -> frozenset[str]:
+def imported_names(module):
     """Full names of the modules that a module's text imports, at its top or anywhere in it."""
     path = MODULES[module]
     package = module if path.name == '__init__.py' else module.rpartition('.')[0]
@@ -86,7 +81,7 @@ def imported_names(module: str) -> frozenset[str]:
     return frozenset(names)
 
 
-def test_layers_import_downwards_only() -> None:
+def test_layers_import_downwards_only():
     place = {layer: i for i, layer in enumerate(LAYERS)}
     upwards = [
         (module, name)
@@ -98,7 +93,7 @@ def test_layers_import_downwards_only() -> None:
     assert upwards == []
 
 
-def names_learning(text: str) -> list[str]:
+def names_learning(text):
     """Imports of hmt_learning anywhere in a source, and strings that name its modules."""
     found = []
     for node in ast.walk(ast.parse(text)):
@@ -115,31 +110,16 @@ def names_learning(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize('module', [x for x in MODULES if not x.startswith('hmt_learning')])
-def test_nothing_that_a_robot_has_imports_learning(module: str) -> None:
+def test_nothing_that_a_robot_has_imports_learning(module):
     assert names_learning(MODULES[module].read_text('utf-8')) == []
 
 
-@pytest.mark.parametrize(
-    'text',
-    [
-        'import numpy, hmt_learning.motion.rig',
-        'def f():\n    from hmt_learning.app import main',
-        "importlib.import_module('hmt_learning.app.train')",
-        "importlib.import_module(f'hmt_learning.app.{name}')",
-        "COMMANDS = {'train': ('hmt_learning.app.train', 'learn')}",
-        "__import__('hmt_learning')",
-    ],
-)
-def test_imports_of_learning_are_found(text: str) -> None:
-    assert len(names_learning(text)) == 1
-
-
-def test_every_module_belongs_to_a_layer() -> None:
+def test_every_module_belongs_to_a_layer():
     outside = {name for name in MODULES if layer_of(name) is None}
     assert outside <= {'hmt_ros', 'hmt_ros.__main__', 'hmt_ros.compiled_code'}
 
 
-def test_only_nodes_and_commands_name_rclpy() -> None:
+def test_only_nodes_and_commands_name_rclpy():
     users = {
         layer_of(name)
         for name in MODULES
@@ -148,7 +128,7 @@ def test_only_nodes_and_commands_name_rclpy() -> None:
     assert users <= {'hmt_ros.nodes', 'hmt_ros.app'}
 
 
-def test_all_but_the_nodes_imports_without_ros_and_nothing_slow_before_it_is_needed() -> None:
+def test_all_but_the_nodes_imports_without_ros_and_nothing_slow_before_it_is_needed():
     names = [
         name for name in MODULES if layer_of(name) != 'hmt_ros.nodes' and '__main__' not in name
     ]
@@ -178,7 +158,7 @@ def test_all_but_the_nodes_imports_without_ros_and_nothing_slow_before_it_is_nee
     assert result.stdout.splitlines() == ['[]', str(len(names))]
 
 
-def setup_arguments_of(command: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def setup_arguments_of(command, monkeypatch):
     """What setup.py hands to setuptools for a command."""
     arguments: dict[str, Any] = {}
     monkeypatch.setattr(setuptools, 'setup', lambda **given: arguments.update(given))
@@ -189,38 +169,24 @@ def setup_arguments_of(command: str, monkeypatch: pytest.MonkeyPatch) -> dict[st
 
 
 @pytest.fixture(scope='module')
-def setup_arguments() -> dict[str, Any]:
+def setup_arguments():
     """What setup.py hands to setuptools."""
     with pytest.MonkeyPatch.context() as patch:
         return setup_arguments_of('install', patch)
 
 
-def xml(path: Path) -> ET.Element:
+def xml(path):
     return ET.parse(path).getroot()
 
 
-def test_versions_agree(setup_arguments: dict[str, Any]) -> None:
+def test_versions_agree(setup_arguments):
     assert setup_arguments['version'] == hmt_ros.__version__
     assert xml(ROOT / 'package.xml').findtext('version') == hmt_ros.__version__
     for folder in (HMT_MSGS, ROOT / 'examples'):
         assert xml(folder / 'package.xml').findtext('version') == hmt_ros.__version__
 
 
-def test_launch_files_and_views_are_installed(setup_arguments: dict[str, Any]) -> None:
-    files = setup_arguments['data_files']
-    installed = {f'{target}/{Path(x).name}' for target, some in files for x in some}
-    wanted = ('launch/hmt.launch.py', 'launch/camera.launch.py', 'rviz/hmt.rviz')
-    wanted += ('foxglove/hmt.json', 'foxglove/hmt_bag.json', 'config/filter_node.yaml')
-    assert {f'share/hmt_ros/{name}' for name in wanted} <= installed
-
-
-def test_tests_are_found_by_colcon(setup_arguments: dict[str, Any]) -> None:
-    # colcon runs pytest where it sees it among the extras; with tests_require it runs nothing.
-    assert 'pytest' in setup_arguments['extras_require']['test']
-    assert 'tests_require' not in setup_arguments
-
-
-def test_dependencies_of_package_xml_cover_the_ros_packages_used() -> None:
+def test_dependencies_of_package_xml_cover_the_ros_packages_used():
     root = xml(ROOT / 'package.xml')
     declared = {element.text for element in root.iter() if element.tag.endswith('depend')}
     imported = {name.split('.')[0] for module in MODULES for name in imported_names(module)}
@@ -229,13 +195,7 @@ def test_dependencies_of_package_xml_cover_the_ros_packages_used() -> None:
     assert used - {'hmt_msgs'} <= declared
 
 
-def test_every_interface_is_generated() -> None:
-    text = (HMT_MSGS / 'CMakeLists.txt').read_text('utf-8')
-    listed = {word for word in text.split() if word.endswith(('.msg', '.srv'))}
-    assert listed == {str(path.relative_to(HMT_MSGS)) for path in INTERFACES}
-
-
-def test_package_data_covers_every_data_file(setup_arguments: dict[str, Any]) -> None:
+def test_package_data_covers_every_data_file(setup_arguments):
     for package, patterns in setup_arguments['package_data'].items():
         for path in (ROOT / package).rglob('*'):
             name = str(path.relative_to(ROOT / package))
@@ -243,7 +203,7 @@ def test_package_data_covers_every_data_file(setup_arguments: dict[str, Any]) ->
                 assert any(fnmatch(name, pattern) for pattern in patterns), name
 
 
-def test_entry_points_are_all_nodes_and_commands(setup_arguments: dict[str, Any]) -> None:
+def test_entry_points_are_all_nodes_and_commands(setup_arguments):
     lines = setup_arguments['entry_points']['console_scripts']
     points = dict(line.split(' = ') for line in lines)
     nodes = {name for name in points if points[name].startswith('hmt_ros.nodes.')}
@@ -258,7 +218,7 @@ def test_entry_points_are_all_nodes_and_commands(setup_arguments: dict[str, Any]
 
 @pytest.mark.filterwarnings('ignore:.*traverse:DeprecationWarning')
 @pytest.mark.parametrize('folder', [ROOT, HMT_MSGS], ids=['hmt_ros', 'hmt_msgs'])
-def test_changelog_can_be_released(folder: Path, tmp_path: Path) -> None:
+def test_changelog_can_be_released(folder, tmp_path):
     changelog = pytest.importorskip('catkin_pkg.changelog')
     version = hmt_ros.__version__
     text = (folder / 'CHANGELOG.rst').read_text('utf-8')
@@ -274,33 +234,7 @@ def test_changelog_can_be_released(folder: Path, tmp_path: Path) -> None:
     assert len(parsed.get_content_of_version(version)) > 0
 
 
-@pytest.mark.ros
-@pytest.mark.parametrize('path', INTERFACES, ids=lambda path: path.stem)
-def test_generated_interface_imports(path: Path) -> None:
-    kind = path.parent.name
-    generated = getattr(importlib.import_module(f'hmt_msgs.{kind}'), path.stem)
-    definition = path.read_text('utf-8')
-    if kind == 'srv':
-        generated, definition = generated.Request, definition.partition('---')[0]
-    lines = [line.split('#')[0].split() for line in definition.splitlines()]
-    fields = [words[1] for words in lines if len(words) == 2 and '=' not in words[1]]
-    assert list(generated.get_fields_and_field_types()) == fields
-
-
-@pytest.mark.parametrize(
-    ('command', 'there', 'wanted'),
-    [('bdist_wheel', False, True), ('bdist_wheel', True, False), ('install', False, False)],
-)
-def test_a_wheel_requires_opencv_where_there_is_none(
-    command: str, there: bool, wanted: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done = SimpleNamespace(returncode=int(not there))
-    monkeypatch.setattr(subprocess, 'run', lambda *_, **__: done)
-    required = setup_arguments_of(command, monkeypatch)['install_requires']
-    assert ('opencv-python-headless' in required) == wanted
-
-
-def test_a_wheel_has_the_library_and_one_command(tmp_path: Path) -> None:
+def test_a_wheel_has_the_library_and_one_command(tmp_path):
     sources = tmp_path / 'sources'
     for name in (
         *('hmt_ros', 'msg_tools', 'hmt_learning', 'resource'),
@@ -347,29 +281,5 @@ def test_a_wheel_has_the_library_and_one_command(tmp_path: Path) -> None:
     assert dimension == '37'
 
 
-@pytest.mark.ros
-def test_executables_are_installed(setup_arguments: dict[str, Any]) -> None:
-    index = importlib.import_module('ament_index_python')
-    folder = Path(index.get_package_prefix('hmt_ros')) / 'lib' / 'hmt_ros'
-    for line in setup_arguments['entry_points']['console_scripts']:
-        executable = folder / line.split('=')[0].strip()
-        assert os.access(executable, os.X_OK), executable
-
-
-@pytest.mark.ros
-def test_data_files_are_installed() -> None:
-    index = importlib.import_module('ament_index_python')
-    prefix = Path(index.get_package_prefix('hmt_ros'))
-    assert (prefix / 'share' / 'hmt_ros' / 'package.xml').is_file()
-    site = next(prefix.rglob('msg_tools/__init__.py')).parents[1]
-    for package in ('hmt_ros', 'msg_tools'):
-        sources = {
-            path.relative_to(ROOT)
-            for suffix in ('yaml', 'msg', 'srv', 'html', 'css', 'js')
-            for path in (ROOT / package).rglob(f'*.{suffix}')
-        }
-        assert {path for path in sources if not (site / path).is_file()} == set()
-
-
-def test_tests_that_begin_first_exist() -> None:
+def test_tests_that_begin_first_exist():
     assert [name for name in LONGEST if not (ROOT / 'test' / name).is_file()] == []

@@ -5,8 +5,6 @@ and compares them with the names in the bag; overrides of the quality of service
 compare them as they are.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path
@@ -24,21 +22,21 @@ PAGES = ('README.md', 'docs/bags.md', 'docs/views.md')
 REPLAYED = {absolute_name(x) for x in (*track_messages.TOPICS, *smoothed_messages.TOPICS)}
 
 
-def lines(verb: str) -> list[list[str]]:
+def lines(verb):
     """Words of the commands behind `ros2 bag <verb>` in the documentation."""
     text = '\n'.join((ROOT / page).read_text('utf-8') for page in PAGES)
     found = re.findall(rf'(?:^|`)ros2 bag {verb} ([^`\n]*)', text, re.MULTILINE)
     return [shlex.split(line) for line in found]
 
 
-def arguments(words: list[str], option: str) -> list[str]:
+def arguments(words, option):
     """What follows an option, up to the next."""
     rest = words[words.index(option) + 1 :] if option in words else []
     end = next((i for i, word in enumerate(rest) if word.startswith('-')), len(rest))
     return rest[:end]
 
 
-def recorded(bag: str) -> set[str]:
+def recorded(bag):
     """Names of the topics of a bag, in its metadata and in its file, which must be the same."""
     if bag == 'tracked':
         return REPLAYED
@@ -53,13 +51,13 @@ def recorded(bag: str) -> set[str]:
     return names
 
 
-def expanded(name: str) -> str:
+def expanded(name):
     """A name as rclcpp expands it for the player, whose node is in the root."""
     return name if name.startswith('/') else f'/{name}'
 
 
 @pytest.mark.parametrize('words', lines('play'), ids=' '.join)
-def test_played_topics_are_in_the_bag(words: list[str]) -> None:
+def test_played_topics_are_in_the_bag(words):
     there = recorded(words[0])
     for option in ('--topics', '--exclude-topics'):
         for name in arguments(words, option):
@@ -69,7 +67,7 @@ def test_played_topics_are_in_the_bag(words: list[str]) -> None:
         assert {old, new} & there == {old}
 
 
-def test_lines_for_playing_and_recording_are_there() -> None:
+def test_lines_for_playing_and_recording_are_there():
     played, stored = lines('play'), lines('record')
     for option in ('--topics', '--exclude-topics', '--remap'):
         assert any(option in words for words in played)

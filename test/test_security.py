@@ -1,7 +1,5 @@
 """What comes from outside is data: not executed, not unpickled, not unbounded."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path
@@ -39,7 +37,7 @@ FORBIDDEN_CALLS = {
 }  # fmt: skip
 
 
-def faults(text: str, name: str) -> list[str]:
+def faults(text, name):
     """What a source does that it must not do."""
     found = []
     for node in ast.walk(ast.parse(text)):
@@ -57,7 +55,7 @@ def faults(text: str, name: str) -> list[str]:
     return found
 
 
-def faults_of_call(call: ast.Call) -> list[str]:
+def faults_of_call(call):
     function = ast.unparse(call.func)
     words = {word.arg: ast.unparse(word.value) for word in call.keywords}
     found = [function] if function in FORBIDDEN_CALLS else []
@@ -70,30 +68,12 @@ def faults_of_call(call: ast.Call) -> list[str]:
     return found
 
 
-def test_nothing_that_is_read_is_executed() -> None:
+def test_nothing_that_is_read_is_executed():
     found = {str(x.relative_to(ROOT)): x.read_text('utf-8') for x in FILES}
     assert {name: wrong for name, text in found.items() if (wrong := faults(text, name))} == {}
 
 
-@pytest.mark.parametrize(
-    'text',
-    [
-        'import pickle',
-        'from urllib.request import urlopen',
-        'from urllib import request',
-        'import socket',
-        'eval("1")',
-        'np.load("a")',
-        'np.load("a", allow_pickle=True)',
-        'yaml.load("a", Loader=yaml.Loader)',
-        'subprocess.run("a", shell=True)',
-    ],
-)
-def test_the_rules_find_what_they_forbid(text: str) -> None:
-    assert len(faults(text, 'hmt_ros/app/replay/command.py')) > 0
-
-
-def test_limits_are_those_of_the_page() -> None:
+def test_limits_are_those_of_the_page():
     page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
     table = page.partition('## Limits')[2].partition('\n## ')[0]
     stated = {int(text.replace(' ', '')) for text in re.findall(r'\*\*([\d ]+)\*\*', table)}
@@ -114,7 +94,7 @@ def test_limits_are_those_of_the_page() -> None:
     assert limits <= stated
 
 
-def test_limits_of_bags_are_those_of_the_page() -> None:
+def test_limits_of_bags_are_those_of_the_page():
     page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
     (row,) = (line for line in page.splitlines() if line.startswith('| bag |'))
     stated = [int(text.replace(' ', '')) for text in re.findall(r'\*\*([\d ]+)\*\*', row)]
@@ -122,7 +102,7 @@ def test_limits_of_bags_are_those_of_the_page() -> None:
 
 
 @pytest.mark.ros
-def test_limits_of_messages_are_those_of_the_page() -> None:
+def test_limits_of_messages_are_those_of_the_page():
     from hmt_ros.nodes import subscribed_topic
     from hmt_ros.sessions import image_inputs
 

@@ -1,7 +1,5 @@
 """The clone as one package among others: in a workspace of colcon, for rosdep, for bloom."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -12,7 +10,6 @@ import sys
 import sysconfig
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import setuptools
@@ -28,13 +25,13 @@ PAGE = (ROOT / 'docs' / 'consumers.md').read_text('utf-8')
 RCLCPP = ROOT / 'test' / 'rclcpp_stand_in'
 
 
-def code(language: str) -> str:
+def code(language):
     """The only block of code in a language on the page on consumers."""
     (found,) = re.findall(rf'^```{language}\n(.*?)^```$', PAGE, re.M | re.S)
     return found
 
 
-def package_xml(name: str, build_type: str, depends: str) -> str:
+def package_xml(name, build_type, depends):
     return f"""<package format="3">
   <name>{name}</name><version>0.0.0</version><description>Uses hmt_msgs.</description>
   <maintainer email="somebody@example.com">somebody</maintainer><license>Apache-2.0</license>
@@ -70,7 +67,7 @@ install_scripts=$base/lib/listener
 }
 
 
-def ros_without_this_package() -> dict[str, str]:
+def ros_without_this_package():
     """The environment of the tests, without the workspace in which they were built."""
     environment = dict(os.environ)
     prefixes = [Path(x) for x in os.environ['AMENT_PREFIX_PATH'].split(os.pathsep) if x]
@@ -98,7 +95,7 @@ def ros_without_this_package() -> dict[str, str]:
     return environment
 
 
-def write_packages(folder: Path, replace: tuple[str, str] = ('', '')) -> None:
+def write_packages(folder, replace=('', '')):
     """Writes the packages that use the messages, with a text in place of another."""
     for name, text in CONSUMERS.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -106,7 +103,7 @@ def write_packages(folder: Path, replace: tuple[str, str] = ('', '')) -> None:
 
 
 @pytest.fixture(scope='module')
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(tmp_path_factory):
     """A workspace with the clone in src/, after "colcon build"."""
     if shutil.which('colcon') is None:
         pytest.skip('colcon is not installed: a workspace cannot be built')
@@ -138,7 +135,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def sourced(workspace: Path, command: str) -> subprocess.CompletedProcess[str]:
+def sourced(workspace, command):
     """A command in a shell that has sourced the workspace."""
     return subprocess.run(
         ['bash', '-c', f'source {workspace}/install/setup.bash && {command}'],
@@ -152,7 +149,7 @@ def sourced(workspace: Path, command: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.ros
-def test_colcon_build_in_a_workspace_builds_the_messages(workspace: Path) -> None:
+def test_colcon_build_in_a_workspace_builds_the_messages(workspace):
     program = (
         'import hmt_ros, json, sys; from hmt_msgs.msg import PoseComponent, PoseMixture; '
         'from rclpy.serialization import deserialize_message, serialize_message; '
@@ -171,7 +168,7 @@ def test_colcon_build_in_a_workspace_builds_the_messages(workspace: Path) -> Non
 
 
 @pytest.mark.ros
-def test_packages_that_use_the_messages_run(workspace: Path) -> None:
+def test_packages_that_use_the_messages_run(workspace):
     for package, name in (('consumer', 'consumer'), ('hmt_ros_examples', 'stop_near_hand')):
         ran = sourced(workspace, f'install/{package}/lib/{package}/{name}')
         # Stops before anything has come, for a hand that may be near, for a lost person, and for
@@ -188,7 +185,7 @@ def test_packages_that_use_the_messages_run(workspace: Path) -> None:
 
 
 @pytest.mark.ros
-def test_a_node_of_a_workspace_starts(workspace: Path) -> None:
+def test_a_node_of_a_workspace_starts(workspace):
     node = subprocess.Popen(
         ['bash', '-c', 'source install/setup.bash && exec install/hmt_ros/lib/hmt_ros/filter_node'],
         cwd=workspace,
@@ -209,12 +206,12 @@ def test_a_node_of_a_workspace_starts(workspace: Path) -> None:
 
 
 @pytest.fixture
-def install_messages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SimpleNamespace:
+def install_messages(monkeypatch, tmp_path):
     """setup.py's functions, its commands of CMake recorded instead of run."""
     calls: list[tuple[list[str], dict[str, str]]] = []
     codes: list[int] = []
 
-    def run(command: list[str], *, env: dict[str, str], check: bool) -> SimpleNamespace:
+    def run(command, *, env, check):
         calls.append((command, env))
         return SimpleNamespace(returncode=codes.pop() if codes else 0)
 
@@ -225,7 +222,7 @@ def install_messages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SimpleN
     return SimpleNamespace(calls=calls, codes=codes, **names)
 
 
-def install_definitions(prefix: Path) -> Path:
+def install_definitions(prefix):
     share = prefix / 'share' / 'hmt_msgs'
     for name in ('msg', 'srv'):
         shutil.copytree(HMT_MSGS / name, share / name)
@@ -233,15 +230,7 @@ def install_definitions(prefix: Path) -> Path:
     return share
 
 
-def test_messages_of_the_ros_environment_are_not_built_twice(
-    install_messages: Any, tmp_path: Path
-) -> None:
-    install_definitions(tmp_path / 'ros')
-    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
-    assert install_messages.calls == []
-
-
-def test_messages_with_other_definitions_are_built(install_messages: Any, tmp_path: Path) -> None:
+def test_messages_with_other_definitions_are_built(install_messages, tmp_path):
     share = install_definitions(tmp_path / 'ros')
     (share / 'msg' / 'Body.msg').write_text('string name\n', 'utf-8')
     install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
@@ -252,30 +241,7 @@ def test_messages_with_other_definitions_are_built(install_messages: Any, tmp_pa
     assert environment['DESTDIR'] == ''
 
 
-def test_what_was_built_here_is_kept_up_to_date(install_messages: Any, tmp_path: Path) -> None:
-    """Also if the environment has the same definitions: the copy in the prefix comes first."""
-    install_definitions(tmp_path / 'ros')
-    (tmp_path / 'build').mkdir()
-    (tmp_path / 'build' / 'CMakeCache.txt').touch()
-    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
-    assert len(install_messages.calls) == 3
-
-
-def test_cmake_does_not_see_the_prefix_that_colcon_gives_to_setup_py(
-    install_messages: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folders = ['/build/prefix_override', '/colcon/colcon_distutils_commands', '/opt/ros/site']
-    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(folders))
-    monkeypatch.setenv('CMAKE_ARGS', '-DCMAKE_BUILD_TYPE=Release "-DX=a b"')
-    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '/root')
-    command, environment = install_messages.calls[0]
-    assert environment['PYTHONPATH'] == '/opt/ros/site'
-    assert environment['CMAKE_PREFIX_PATH'].startswith(str(tmp_path / 'ros'))
-    assert command[-2:] == ['-DCMAKE_BUILD_TYPE=Release', '-DX=a b']
-    assert environment['DESTDIR'] == '/root'
-
-
-def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_path: Path) -> None:
+def test_a_failed_build_of_messages_says_what_to_do(install_messages, tmp_path):
     install_messages.codes.append(1)
     with pytest.raises(SystemExit, match='rosdep install') as raised:
         install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
@@ -283,38 +249,13 @@ def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_p
     assert len(install_messages.calls) == 1
 
 
-def test_without_a_ros_environment_nothing_is_built(
-    install_messages: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv('AMENT_PREFIX_PATH')
-    with pytest.raises(SystemExit, match=r'source /opt/ros/jazzy/setup\.bash'):
-        install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
-    assert install_messages.calls == []
-
-
-def test_only_an_installation_into_ros_builds_messages(
-    install_messages: Any, tmp_path: Path
-) -> None:
-    """pip, which gives no prefix, installs the library alone."""
-    assert not install_messages.in_colcon(tmp_path / 'install' / 'hmt_ros')
-    (tmp_path / 'install').mkdir()
-    (tmp_path / 'install' / '.colcon_install_layout').write_text('isolated\n', 'utf-8')
-    assert install_messages.in_colcon(tmp_path / 'install' / 'hmt_ros')
-    assert install_messages.in_colcon(tmp_path / 'install')
-
-
 @pytest.mark.parametrize(('variable', 'code'), [('', 0), ('', 1), ('later', 0)])
 def test_kernels_are_compiled_where_the_package_is_installed(
-    install_messages: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    variable: str,
-    code: int,
-) -> None:
+    install_messages, tmp_path, monkeypatch, capsys, variable, code
+):
     runs: list[tuple[list[str], str]] = []
 
-    def run(command: list[str], *, env: dict[str, str], cwd: str, check: bool) -> SimpleNamespace:
+    def run(command, *, env, cwd, check):
         runs.append((command[1:], env['PYTHONPATH'].split(os.pathsep)[0]))
         return SimpleNamespace(returncode=code)
 
@@ -330,7 +271,7 @@ def test_kernels_are_compiled_where_the_package_is_installed(
 
 
 @pytest.fixture
-def clone(tmp_path: Path) -> Path:
+def clone(tmp_path):
     """What the stage of the detector reads of a clone that is set up, without the packages."""
     for name in (
         'tools/workspace.sh',
@@ -356,7 +297,7 @@ def clone(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run_detector_stage(clone: Path) -> tuple[int, list[str], int]:
+def run_detector_stage(clone):
     """Exit code, lines on stderr but for how long it takes, and calls of Python of one run."""
     (clone / 'calls').unlink(missing_ok=True)
     done = subprocess.run(
@@ -369,7 +310,7 @@ def run_detector_stage(clone: Path) -> tuple[int, list[str], int]:
     return done.returncode, lines, count
 
 
-def test_the_detector_is_installed_once(clone: Path) -> None:
+def test_the_detector_is_installed_once(clone):
     assert run_detector_stage(clone) == (0, ['hmt_ros: installing MediaPipe Pose'], 2)
     pip, networks = (
         ' -m pip -qq --disable-pip-version-check --no-input install --no-compile --retries 1 '
@@ -388,7 +329,7 @@ def test_the_detector_is_installed_once(clone: Path) -> None:
 
 
 @pytest.mark.parametrize(('what', 'calls'), [('pip', 1), ('install-detector', 2)])
-def test_without_network_the_rest_goes_on(clone: Path, what: str, calls: int) -> None:
+def test_without_network_the_rest_goes_on(clone, what, calls):
     (clone / 'offline').write_text(what, 'utf-8')
     code, (begun, told), count = run_detector_stage(clone)
     assert (code, begun, count) == (78, 'hmt_ros: installing MediaPipe Pose', calls)
@@ -403,24 +344,10 @@ def test_without_network_the_rest_goes_on(clone: Path, what: str, calls: int) ->
     assert run_detector_stage(clone)[::2] == (0, 2)
 
 
-@pytest.mark.parametrize('target', ['setup', 'demo'])
-def test_setup_and_demo_install_the_detector_if_they_can(target: str) -> None:
-    makefile = (ROOT / 'Makefile').read_text('utf-8')
-    (recipe,) = re.findall(rf'^{target}:\n((?:\t.*\n)+)', makefile, re.M)
-    lines = [line.strip() for line in recipe.splitlines()]
-    place = lines.index('@$(WITH_DETECTOR)')
-    assert 'kernels' in lines[place - 1]
-    (command,) = re.findall(r'^WITH_DETECTOR := (.*)$', makefile, re.M)
-    for code, wanted in ((0, 0), (78, 0), (130, 1), (1, 1)):
-        shell = command.replace('$(WORKSPACE) detector', f'(exit {code})').replace('$$', '$')
-        done = subprocess.run(['bash', '-e', '-o', 'pipefail', '-c', shell], check=False)
-        assert done.returncode == wanted, code
-
-
 # ---- What colcon, rosdep and bloom read ----
 
 
-def test_rosdep_can_resolve_what_it_finds() -> None:
+def test_rosdep_can_resolve_what_it_finds():
     """rosdep finds one package here, and knows no package of this repository."""
     packages = pytest.importorskip('catkin_pkg.packages')
     found = packages.find_packages(str(ROOT))
@@ -437,7 +364,7 @@ def test_rosdep_can_resolve_what_it_finds() -> None:
     assert needed <= names
 
 
-def order(folder: Path, *options: str) -> list[str]:
+def order(folder, *options):
     """Names of packages in the order in which colcon builds them."""
     if shutil.which('colcon') is None:
         pytest.skip('colcon is not installed')
@@ -446,7 +373,7 @@ def order(folder: Path, *options: str) -> list[str]:
     return done.stdout.split()
 
 
-def test_messages_alone_are_linked_into_a_workspace(tmp_path: Path) -> None:
+def test_messages_alone_are_linked_into_a_workspace(tmp_path):
     """The lines of docs/workspace.md, with the clone beside the workspace."""
     text = (ROOT / 'docs' / 'workspace.md').read_text('utf-8')
     (line,) = re.findall(r'^ln -s .*$', text, re.M)
@@ -459,35 +386,10 @@ def test_messages_alone_are_linked_into_a_workspace(tmp_path: Path) -> None:
     assert order(folder) == ['hmt_msgs', 'consumer', 'listener']
 
 
-def test_colcon_builds_the_messages_first_where_both_are_named(tmp_path: Path) -> None:
-    write_packages(tmp_path / 'src')
-    for name in ('colcon.pkg', 'package.xml', 'setup.py', 'setup.cfg', 'msg_tools/hmt_msgs'):
-        target = tmp_path / 'src' / 'hmt_ros' / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.symlink_to(ROOT / name)
-    assert order(tmp_path) == ['hmt_ros', 'consumer', 'listener']
-    text = (ROOT / 'docs' / 'workspace.md').read_text('utf-8')
-    (options,) = re.findall(r'^colcon build (--base-paths .*)$', text, re.M)
-    both = order(tmp_path, *options.split())
-    assert both == ['hmt_msgs', 'hmt_ros', 'consumer', 'listener']
-    described = yaml.safe_load((ROOT / 'colcon.pkg').read_text('utf-8'))
-    assert described == {'dependencies': ['hmt_msgs']}
-
-
-def test_metadata_of_a_release() -> None:
-    package = pytest.importorskip('catkin_pkg.package')
-    ours, *others = (package.parse_package(str(folder)) for folder in (ROOT, HMT_MSGS, EXAMPLES))
-    assert {url.type for url in ours.urls} == {'website', 'bugtracker', 'repository'}
-    assert ours.licenses == ['Apache-2.0']
-    for other in others:
-        assert [url.url for url in ours.urls] == [url.url for url in other.urls]
-        assert (ours.version, ours.licenses) == (other.version, other.licenses)
-
-
 # ---- A file that is not run here: its one command is ----
 
 
-def test_workflow_runs_what_the_project_is_tested_with() -> None:
+def test_workflow_runs_what_the_project_is_tested_with():
     workflow = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text('utf-8'))
     (job,) = workflow['jobs'].values()
     assert job['strategy']['matrix']['python'] == ['3.10', '3.11', '3.12', '3.13']

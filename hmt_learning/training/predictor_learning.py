@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_learning.training.calibration_learning import LearningCalibration
 from hmt_learning.training.descriptor_learning import learned_descriptor
 from hmt_learning.training.network_learning import LearningNetwork, tools_are_there
 from hmt_learning.training.training_set import TrainingSet
 from hmt_ros.body import Body
-from hmt_ros.experts.calibrated_experts import CalibratedExperts
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
     SilhouetteDescriptor,
@@ -139,7 +139,7 @@ def new_model(
     count = kind.experts if experts is None else experts
     if kind.few and samples is not None:
         count = max(min(count, samples // SAMPLES_PER_EXPERT), 1)
-    return CalibratedExperts(kind.make(count, seed, samples), kind.folds)
+    return LearningCalibration(kind.make(count, seed, samples), kind.folds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +241,7 @@ def learned_predictor(
 
 
 def _learn(model: ConditionalDensity, inputs: Array, targets: Array, motions: Index) -> None:
-    if isinstance(model, CalibratedExperts):
+    if isinstance(model, LearningCalibration):
         # With a single motion, intervals of time are left out.
         several = len(np.unique(motions)) > 1
         model.fit(inputs, targets, groups=motions if several else None)

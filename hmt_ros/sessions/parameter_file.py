@@ -1,8 +1,7 @@
-"""Parameter files of ROS 2: written with comments, and read without ROS."""
+"""Parameter files of ROS 2, read without ROS; `docs/generate.py` writes those in `config`."""
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,60 +9,13 @@ from typing import Any
 import yaml
 
 from hmt_ros.sessions.declared_parameters import (
-    EFFECTS,
     ParameterError,
     Value,
-    declared_parameters,
 )
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 PARAMETERS_KEY = 'ros__parameters'
-_WIDTH, _INDENT = 100, '    '
 LARGEST_FILE = 1_000_000  # bytes
-
-
-def parameter_file_text(node: str, settings: Any, like: str = '', others: Any = None) -> str:
-    """A parameter file with all parameters, each under a comment that describes it.
-
-    Args:
-        like: name of a node whose parameters this one has, too, and whose file lists those that
-            are the same; '': there is none.
-        others: settings of that node.
-    """
-    declared = declared_parameters(settings)
-    if like:
-        known = declared_parameters(others)
-        declared = [parameter for parameter in declared if parameter not in known]
-    used = {parameter.effect for parameter in declared}
-    lines = [
-        f'# Parameters of {node}, with their defaults. A file needs only those that it changes:',
-        '#',
-        f'#     ros2 run hmt_ros {node} --ros-args --params-file FILE',
-        '#',
-        *([f'# All others are those of {like}: see {like}.yaml.', '#'] if like else []),
-        '# In square brackets: lowest and highest value, and when a new value takes effect:',
-        *(
-            f'# "{name}": {text[0].lower()}{text[1:]}'
-            for name, text in EFFECTS.items()
-            if name in used
-        ),
-        f'/**/{node}:',
-        f'  {PARAMETERS_KEY}:',
-    ]
-    for parameter in declared:
-        facts = parameter.bounds, parameter.effect
-        lines.extend(
-            textwrap.wrap(
-                f'{parameter.description} [{"; ".join(filter(None, facts))}]',
-                _WIDTH,
-                initial_indent=f'{_INDENT}# ',
-                subsequent_indent=f'{_INDENT}# ',
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
-        )
-        lines.append(f'{_INDENT}{parameter.name}: {yaml_scalar(parameter.default)}')
-    return '\n'.join(lines) + '\n'
 
 
 def yaml_scalar(value: Value) -> str:

@@ -54,19 +54,6 @@ def test_commands_explain_themselves(command, capsys):
     assert line.startswith(f'{command}: the following arguments are required')
 
 
-def test_module_is_the_command(tmp_path):
-    result = subprocess.run(
-        [sys.executable, '-m', 'hmt_ros', 'replay', 'none', '-o', str(tmp_path / 'new' / 'bag')],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 1
-    assert result.stderr.startswith('replay: ')
-    assert not any(tmp_path.iterdir())
-
-
 def output_of_reader_that_leaves(lines, *command):
     """The first lines of a program that nobody reads further, exit code and stderr."""
     with subprocess.Popen(

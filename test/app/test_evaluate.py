@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from hmt_learning.app.rendered_bag import ground_truth
-from hmt_ros.app import progress
 from hmt_ros.app.evaluate import main
 from hmt_ros.body import load_body
-from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, joint_mixtures, score
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, joint_mixtures, score
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
@@ -130,47 +129,12 @@ def test_numbers_are_those_of_the_library(capsys, bag, body, poses, mixtures, tr
         assert found['by_joint'][joint] == pytest.approx(values)
 
 
-def test_progress_leaves_stdout_to_the_numbers(capsys, bag, truth_file, monkeypatch):
-    wanted = report(capsys, bag, '--truth', truth_file)
-    monkeypatch.setattr(progress, 'INTERVAL', 1e-4)
-    code, out, errors = run(capsys, bag, '--truth', truth_file, '--json')
-    assert (code, json.loads(out)) == (0, wanted)
-    assert errors[-1].startswith(f'evaluate: 100% {FRAMES + 1}/{FRAMES + 1} [')
-    assert run(capsys, bag, '--truth', truth_file, '--json', '--quiet') == (0, out, [])
-
-
 def test_truth_from_the_bag_itself_and_from_another_bag(capsys, bag, truth_file):
     from_file = report(capsys, bag, '--truth', truth_file)
     from_bag = report(capsys, bag)
     assert from_bag['topics'] == from_file['topics']
     assert from_bag['truth'] == f'{bag} (/ground_truth)'
     assert report(capsys, bag, '--truth', bag)['topics'] == from_file['topics']
-
-
-def test_truth_without_pelvis_is_aligned_at_the_hips(capsys, tmp_path, bag, body, poses, mixtures):
-    names = [name for name in body.joint_names if name != 'pelvis']
-    joints = body.joint_positions(poses)[:, body.skeleton.joint_index(names)]
-    path = tmp_path / 'truth.npz'
-    np.savez(path, stamps=STAMPS, joint_names=names, joints=joints + 0.7)
-    found = report(capsys, bag, '--truth', path)['topics']['/pose_mixture']
-    where = [names.index(name) for name in EVALUATED_JOINTS]
-    hips = [names.index('left_hip'), names.index('right_hip')]
-    truth = joints[:, where] - joints[:, hips].mean(1, keepdims=True)
-    wanted = score(joint_mixtures(body, mixtures, origin=HIPS), truth, seed=0).summary()
-    for key, value in without_names(wanted).items():
-        assert found[key] == pytest.approx(value, rel=1e-9), key
-    assert found['note'] == ''
-
-
-def test_model_sigma_and_seed(capsys, bag):
-    usual, wide, seeded = (
-        report(capsys, bag, *more)['topics']['/pose_mixture']
-        for more in ((), ('--model-sigma', '0.2'), ('--seed', '5'))
-    )
-    assert wide['heaviest_mm'] == usual['heaviest_mm']
-    assert wide['negative_log_likelihood'] > usual['negative_log_likelihood'] + 20
-    assert wide['coverage_50'] == 1.0
-    assert seeded['negative_log_likelihood'] == usual['negative_log_likelihood']
 
 
 def test_table_for_people(capsys, bag, truth_file):
@@ -187,15 +151,6 @@ def test_table_for_people(capsys, bag, truth_file):
     ]
     assert max(map(len, lines)) <= 120
     assert [line.split()[0] for line in lines[-13:]] == list(EVALUATED_JOINTS)
-
-
-def test_frames_without_mixture_and_mixtures_without_truth(capsys, tmp_path, body, poses, mixtures):
-    path = write(tmp_path / 'out', body, mixtures[:4])
-    truth = tmp_path / 'truth.npz'
-    joints = body.joint_positions(poses)
-    np.savez(truth, stamps=STAMPS[1:], joint_names=body.joint_names, joints=joints[1:])
-    found = report(capsys, path, '--truth', truth)['topics']['/pose_mixture']
-    assert (found['frames'], found['missing'], found['without_truth']) == (3, 2, 1)
 
 
 def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
@@ -221,18 +176,6 @@ def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
     assert out.splitlines()[-1].startswith('/pose_mixture: its body is unknown')
 
 
-def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):
-    def forget(message):
-        for component in message.components:
-            component.covariance = np.empty(0)
-        return message
-
-    path = write(tmp_path / 'out', body, mixtures, change=forget)
-    found = report(capsys, path, '--truth', truth_file)['topics']['/pose_mixture']
-    assert found['coverage_90'] is None
-    assert found['best_mm'] > 0
-
-
 @pytest.mark.parametrize('torn', [False, True])
 def test_mixtures_carry_the_lengths(capsys, tmp_path, body, mixtures, truth_file, torn):
     """The bag's body is of another person; joints that lie elsewhere are noticed."""
@@ -248,36 +191,6 @@ def test_mixtures_carry_the_lengths(capsys, tmp_path, body, mixtures, truth_file
     note = 'joint positions are not those of the body human37 of the bag'
     assert found['note'] == (note if torn else '')
     assert (found['coverage_90'] is None) == torn
-
-
-def without_lengths(message):
-    message.segment_names, message.segment_lengths = [], np.empty(0)
-    return message
-
-
-def test_mixtures_without_lengths(capsys, tmp_path, body, mixtures, bag, truth_file):
-    """They are about the body that the bag describes; without one only positions are compared."""
-    wanted = report(capsys, bag, '--truth', truth_file)['topics']['/pose_mixture']
-    described = write(tmp_path / 'described', body, mixtures, change=without_lengths)
-    found = report(capsys, described, '--truth', truth_file)['topics']['/pose_mixture']
-    assert found == wanted
-    bare = write(tmp_path / 'bare', body, mixtures, with_body=False, change=without_lengths)
-    found = report(capsys, bare, '--truth', truth_file)['topics']['/pose_mixture']
-    assert found['best_mm'] == wanted['best_mm']
-    assert found['coverage_90'] is None
-
-
-def test_predictions_without_anybody_are_missing(capsys, tmp_path, body, mixtures, truth_file):
-    path = tmp_path / 'out'
-    with BagWriter(path) as bag:
-        for i, (stamp, mixture) in enumerate(zip(STAMPS, mixtures)):
-            message = mixture_message(body, mixture, stamp, kind=MixtureKind.PREDICTION)
-            if i < 2:
-                message.components = []
-            bag.write('pose_prediction', stamp, message)
-    found = report(capsys, path, '--truth', truth_file)['topics']['/pose_prediction']
-    assert (found['frames'], found['missing']) == (FRAMES - 2, 2)
-    assert found['coverage_90'] is not None
 
 
 def test_a_bag_of_nobody_and_a_truth_without_anybody(
@@ -310,42 +223,6 @@ def test_a_bag_of_nobody_and_a_truth_without_anybody(
 def without_components(message):
     message.components = []
     return message
-
-
-def test_the_body_may_change_on_the_way(capsys, tmp_path, body, poses, truth_file):
-    """After a new start the lengths may be others: each mixture is measured with its own."""
-    path = tmp_path / 'out'
-    rng = np.random.default_rng(0)
-    with BagWriter(path) as bag:
-        for i, stature in enumerate((1.82, 1.70)):
-            own = body.with_stature(stature)
-            bag.write(
-                'body', STAMPS[3 * i], message_of_body(MESSAGES, own, STAMPS[3 * i], FRAME_ID)
-            )
-            for t in range(3 * i, 3 * i + 3):
-                mean = poses[t] + 0.01 * rng.normal(size=body.dimension)
-                mixture = GaussianMixture([1.0], mean[None], 0.001 * np.eye(body.dimension)[None])
-                bag.write('pose_mixture', STAMPS[t], mixture_message(own, mixture, STAMPS[t]))
-    found = report(capsys, path, '--truth', truth_file)['topics']['/pose_mixture']
-    assert found['note'] == ''
-    assert found['frames'] == FRAMES
-    assert 0 < found['coverage_90'] <= 1
-
-
-def test_model_that_only_the_option_knows(capsys, tmp_path, body, mixtures, truth_file):
-    path = tmp_path / 'out'
-    with BagWriter(path) as bag:
-        content = message_of_body(MESSAGES, body, START_NS, FRAME_ID)
-        content.name = 'my_body'
-        bag.write('body', START_NS, content)
-        for stamp, mixture in zip(STAMPS, mixtures):
-            bag.write('pose_mixture', stamp, mixture_message(body, mixture, stamp, name='my_body'))
-    unknown = report(capsys, path, '--truth', truth_file)['topics']['/pose_mixture']
-    assert unknown['coverage_90'] is None
-    named = report(capsys, path, '--truth', truth_file, '--body', 'human37')['topics'][
-        '/pose_mixture'
-    ]
-    assert named['coverage_90'] is not None
 
 
 def test_every_topic_gets_a_row_and_one_can_be_chosen(

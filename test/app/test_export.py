@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 import re
 from dataclasses import dataclass, replace
 
@@ -23,7 +22,7 @@ from msg_tools.messages.pose_mixtures import (
     pose_mixture_message,
     pose_mixture_of,
 )
-from test.app.conftest import STAMPS, write_out
+from test.app.conftest import STAMPS
 
 MESSAGES = RosbagsMessages()
 UP, HEIGHT = np.array([0.0, -0.8, -0.6]), 1.5
@@ -153,16 +152,6 @@ def test_a_table_has_positions_and_the_radii_of_their_regions(run, body, tmp_pat
     assert 0.9 <= (np.linalg.norm(drawn, axis=1) < radius).mean() < 0.97
 
 
-def test_mixtures_without_covariances_have_no_radii(body, poses, tmp_path):
-    nothing = {'covariances': None, 'joint_covariances': None, 'joint_covariances_relative': None}
-    bag = write_run(
-        tmp_path / 'bag', body, poses, STEPS, change=lambda content: replace(content, **nothing)
-    )
-    assert 'covariances' not in arrays(bag, tmp_path / 'bare')
-    head, *_ = exported(bag, tmp_path / 'bare.csv').read_text().splitlines()
-    assert head.startswith('stamp,weight,pelvis_x,pelvis_y,pelvis_z,neck_x')
-
-
 def test_skeletons_have_the_joints_of_the_messages(run, body, poses, tmp_path):
     found, fps = bvh_joints(run, tmp_path / 'run', body)
     assert fps == pytest.approx(10.0)
@@ -207,35 +196,6 @@ def test_the_longest_track_is_taken_or_the_one_that_is_named(body, poses, tmp_pa
     assert found['track_id'] == 3
 
 
-def test_skeletons_have_the_last_lengths(body, poses, tmp_path, capsys):
-    steps = [Step(t, thigh=0.40 + 0.005 * i) for i, t in enumerate(STAMPS)]
-    bag = write_run(tmp_path / 'bag', body, poses, steps)
-    assert export.main([str(bag), '-o', str(tmp_path / 'a.npz')]) == 0
-    out = capsys.readouterr().out
-    assert 'lengths of segments change by up to 30 mm: skeletons have the last' in out
-    kept = arrays(bag, tmp_path / 'b')
-    found, _ = bvh_joints(bag, tmp_path / 'b', body)
-    assert np.abs(found[-1] - room(kept['joints'][-1])).max() < 1e-4
-    assert np.abs(found[0] - room(kept['joints'][0])).max() == pytest.approx(0.03, abs=0.005)
-    thigh = kept['segment_names'].tolist().index('thigh')
-    np.testing.assert_allclose(kept['segment_lengths'][:, thigh], [x.thigh for x in steps])
-
-
-def test_another_rate(run, body, tmp_path):
-    found, fps = bvh_joints(run, tmp_path / 'run', body, '--fps', 20)
-    assert (len(found), fps) == (13, pytest.approx(20.0))
-    wanted = room(arrays(run, tmp_path / 'run')['joints'])
-    assert np.abs(found[::2] - wanted).max() < 1e-4
-
-
-def test_one_pose_is_a_motion(body, poses, tmp_path):
-    bag = write_run(tmp_path / 'bag', body, poses, STEPS[:1])
-    found, fps = bvh_joints(bag, tmp_path / 'one', body)
-    assert (len(found), fps) == (1, pytest.approx(30.0))
-    for kind in ('csv', 'npz'):
-        exported(bag, tmp_path / f'one.{kind}')
-
-
 def test_skeletons_stand_on_the_floor(body, poses, tmp_path, capsys):
     grounds = [(stamp, UP, HEIGHT) for stamp in STAMPS]
     bag = write_run(tmp_path / 'bag', body, poses, STEPS, grounds=grounds)
@@ -267,15 +227,6 @@ def test_what_is_known_of_gravity_is_told(body, poses, tmp_path, capsys, grounds
     bag = write_run(tmp_path / 'bag', body, poses, STEPS, grounds=grounds)
     assert export.main([str(bag), '-o', str(tmp_path / 'd.bvh')]) == 0
     assert told in capsys.readouterr().out
-
-
-def test_a_camera_that_looks_straight_down_has_axes(body, poses, tmp_path):
-    grounds = [(STAMPS[0], np.array([0.0, 0.0, -1.0]), None)]
-    bag = write_run(tmp_path / 'bag', body, poses, STEPS, grounds=grounds)
-    turn = arrays(bag, tmp_path / 'a')['room_from_frame']
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(turn) == pytest.approx(1.0)
-    np.testing.assert_allclose(turn[1], [0.0, 0.0, -1.0])
 
 
 def test_a_body_that_is_not_known_leaves_tables(body, poses, tmp_path, capsys):
@@ -314,18 +265,6 @@ def test_bad_input_is_one_line(run, tmp_path, capsys, out, options, said):
     assert (tmp_path / 'there.bvh').read_text() == 'mine'
 
 
-def test_a_file_that_is_not_writable_stays(run, tmp_path, capsys, monkeypatch):
-    path = tmp_path / 'mine.csv'
-    path.write_text('mine')
-    monkeypatch.setattr(os, 'access', lambda place, mode: place != path)
-    assert export.main([str(run), '-o', str(path), '--overwrite']) == 1
-    assert 'mine.csv can not be written' in capsys.readouterr().err
-    assert path.read_text() == 'mine'
-    monkeypatch.undo()
-    exported(run, path, '--overwrite')
-    assert path.read_text().startswith('stamp,')
-
-
 def test_recordings_without_a_motion(made, body, poses, tmp_path, capsys):
     out = str(tmp_path / 'a.bvh')
     empty = [Step(stamp, weights=(), identities=()) for stamp in STAMPS]
@@ -357,28 +296,3 @@ def test_recordings_without_a_motion(made, body, poses, tmp_path, capsys):
         (line,) = capsys.readouterr().err.splitlines()
         assert re.search(said, line), line
     exported(likely, out, '--topic', 'likelihood')
-
-
-def test_messages_that_contradict_each_other_are_told(body, poses, tmp_path, capsys):
-    def change(content):
-        names = content.joint_names
-        later = content.stamp_ns > STAMPS[2]
-        return replace(content, joint_names=(*names[1:], names[0])) if later else content
-
-    bag = write_run(tmp_path / 'bag', body, poses, STEPS, change=change)
-    assert export.main([str(bag), '-o', str(tmp_path / 'a.csv')]) == 1
-    assert f'/smoothed at {STAMPS[3]} ns: mixture: joint_names' in capsys.readouterr().err
-    assert not (tmp_path / 'a.csv').exists()
-
-
-def test_of_two_poses_with_one_stamp_the_first_counts(body, poses, tmp_path):
-    steps = [STEPS[0], Step(STAMPS[0], identities=(5, 6)), STEPS[1]]
-    bag = write_run(tmp_path / 'bag', body, poses, steps)
-    assert arrays(bag, tmp_path / 'a')['identities'].tolist() == [1, 1]
-
-
-def test_bags_of_the_report_have_a_motion(body, poses, tmp_path):
-    """Whoever writes a bag in a namespace finds its topics as well."""
-    bag = write_out(tmp_path / 'out', body, poses, namespace='/humans/bodies/p1')
-    found = exported(bag, tmp_path / 'd.bvh', '--topic', 'smoothed_pose_mixture')
-    assert found.read_text().startswith('HIERARCHY\nROOT pelvis\n')

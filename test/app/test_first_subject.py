@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hmt_ros.app.first_subject import WANTED, find_start, subject_text
+from hmt_ros.app.first_subject import find_start, subject_text
 from hmt_ros.body import Camera
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -70,36 +70,6 @@ def test_first_image_that_shows_enough(tmp_path, human37):
     assert list(read.keypoints.pixels[knee]) == [13.0 + i, 100.0 + 2 * i]
     # 3 % of the height of the person: from the left shoulder (5) to the right ankle (16).
     assert np.allclose(read.keypoints.covariances[0], 2.0**2 * np.eye(2))
-
-
-def test_image_that_shows_most(tmp_path, human37):
-    few = HIDDEN | {'right_knee': 0.0}
-    bag = write_bag(tmp_path / 'bag', [person('coco17', few), person('coco17', HIDDEN)] * 2)
-    assert started(bag, human37).stamp_ns == START_NS + STEP
-
-
-@pytest.mark.parametrize(
-    ('scheme', 'extra', 'missing'),
-    [
-        ('body25', {'pelvis', 'neck', 'left_toe', 'right_toe'}, {'head', 'left_hand'}),
-        ('mediapipe33', {'left_hand', 'right_toe'}, {'pelvis', 'neck', 'head'}),
-        ('halpe26', {'pelvis', 'neck', 'left_toe'}, {'head'}),
-        ('h36m17', {'pelvis', 'neck', 'head'}, {'left_toe'}),
-    ],
-)
-def test_names_of_detectors(scheme, extra, missing, tmp_path, human37):
-    bag = write_bag(tmp_path / 'bag', [person(scheme, {})])
-    read = started(bag, human37).keypoints
-    assert {*WANTED} | extra <= {*read.names}
-    assert not missing & {*read.names}
-    names = schemes()[scheme].names
-    if scheme == 'mediapipe33':
-        fingers = [names.index(f'left_{x}') for x in ('pinky', 'index', 'thumb')]
-        hand = read.pixels[read.names.index('left_hand')]
-        assert np.allclose(hand, [10 + np.mean(fingers), 100 + 2 * np.mean(fingers)], atol=0.05)
-        # The heel is not the ankle.
-        ankle = read.pixels[read.names.index('left_ankle')]
-        assert ankle[0] == 10 + names.index('left_ankle')
 
 
 @pytest.mark.parametrize(

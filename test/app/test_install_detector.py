@@ -1,7 +1,5 @@
 """`install-detector`: what it asks pip for, takes from the wheel and writes, without a network."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 import sys
@@ -22,12 +20,12 @@ CONTENT = {name: name.encode() for name in blazepose_models.CHECKSUMS}
 class Pip:
     """Stands for pip: notes its arguments, and puts a wheel where a download is wanted."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.asked: list[list[str]] = []
         self.content = dict(CONTENT)
         self.fault = ''
 
-    def __call__(self, command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+    def __call__(self, command, **_):
         assert command[:3] == [sys.executable, '-m', 'pip']
         self.asked.append(command[5:])
         if self.fault:
@@ -41,7 +39,7 @@ class Pip:
 
 
 @pytest.fixture
-def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+def folders(tmp_path, monkeypatch):
     """Folder of the environment, and of the user; neither exists."""
     found = tmp_path / 'environment' / 'share', tmp_path / 'user' / 'share'
     monkeypatch.setattr(blazepose_models, 'folders', lambda: found)
@@ -51,7 +49,7 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path
 
 
 @pytest.fixture
-def pip(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> Pip:
+def pip(folders, monkeypatch):
     stand_in = Pip()
     monkeypatch.setattr(subprocess, 'run', stand_in)
     # No runtime yet.
@@ -59,18 +57,13 @@ def pip(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> Pip:
     return stand_in
 
 
-def with_runtime(monkeypatch: pytest.MonkeyPatch) -> None:
+def with_runtime(monkeypatch):
     module = types.ModuleType('ai_edge_litert')
-    module.__spec__ = types.SimpleNamespace()  # type: ignore[assignment]
+    module.__spec__ = types.SimpleNamespace()
     monkeypatch.setitem(sys.modules, 'ai_edge_litert', module)
 
 
-def test_runtime_and_networks_are_installed_once(
-    pip: Pip,
-    folders: tuple[Path, Path],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_runtime_and_networks_are_installed_once(pip, folders, monkeypatch, capsys):
     assert install_detector.main([]) == 0
     assert capsys.readouterr().out == 'MediaPipe Pose is installed\n'
     (install, download) = pip.asked
@@ -87,33 +80,7 @@ def test_runtime_and_networks_are_installed_once(
     assert capsys.readouterr() == ('', '')
 
 
-def test_networks_of_another_release_are_replaced(
-    pip: Pip, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with_runtime(monkeypatch)
-    environment, _ = folders
-    environment.mkdir(parents=True)
-    (environment / 'pose_detection.tflite').write_bytes(b'old')
-    assert install_detector.main([]) == 0
-    assert (environment / 'pose_detection.tflite').read_bytes() == b'pose_detection.tflite'
-
-
-def test_the_users_folder_where_the_environments_can_not_be_written(
-    pip: Pip, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    environment, user = folders
-    monkeypatch.setattr(blazepose_models.os, 'access', lambda path, _: path != environment)
-    assert install_detector.main([]) == 0
-    assert len(list(user.iterdir())) == len(CONTENT)
-    assert not list(environment.iterdir())
-    monkeypatch.setattr(sys, 'executable', '/usr/bin/python3')
-    with pytest.raises(DetectorError, match=r'/usr/bin/python3 has no ai-edge-litert: run "ros2'):
-        require_network('pose_detection.tflite')
-
-
-def test_without_networks_one_line_says_what_to_do(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_networks_one_line_says_what_to_do(folders, monkeypatch):
     with_runtime(monkeypatch)
     with pytest.raises(DetectorError) as caught:
         require_network('pose_detection.tflite')
@@ -123,7 +90,7 @@ def test_without_networks_one_line_says_what_to_do(
     assert text.endswith('run "ros2 run hmt_ros install-detector", or "make detector" in a clone')
 
 
-def test_what_goes_wrong_is_told_in_a_line(pip: Pip, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_goes_wrong_is_told_in_a_line(pip, capsys):
     pip.fault = 'ERROR: Ignored it\n\nerror: externally-managed-environment\n'
     assert install_detector.main([]) == 1
     (line,) = capsys.readouterr().err.splitlines()

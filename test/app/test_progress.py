@@ -40,39 +40,6 @@ def test_a_line_every_interval(capsys):
     assert not any('\r' in line for line in lines)
 
 
-@pytest.mark.usefixtures('often')
-def test_without_a_total_or_anything_to_count(capsys, monkeypatch):
-    """Compiling, which nothing counts, is told."""
-    monkeypatch.setattr(progress, 'compiling', lambda: True)
-    with show_progress('out', 'messages') as shown:
-        shown.update(3)
-        wait_for(capsys, 'out: 3 messages [00:0')
-    with show_progress('kernels'):
-        wait_for(capsys, 'kernels: 00:00 so far, compiling kernels, once\n')
-
-
-def test_a_short_command_prints_nothing(capsys):
-    with show_progress('out', 'images', 120) as shown:
-        shown.update(120)
-    assert capsys.readouterr() == ('', '')
-
-
-@pytest.mark.usefixtures('often')
-def test_an_error_ends_the_lines(capsys):
-    """The line about the error is the last."""
-
-    def work():
-        with show_progress('out', 'images', 120):
-            wait_for(capsys, 'out: ')
-            raise ValueError('bad')
-
-    with pytest.raises(ValueError, match='bad'):
-        work()
-    capsys.readouterr()
-    time.sleep(0.2)
-    assert capsys.readouterr().err == ''
-
-
 @pytest.mark.parametrize('columns', [100, 0])
 def test_bar_on_a_terminal_that_has_room(monkeypatch, columns):
     monkeypatch.setattr(progress, 'INTERVAL', 1e-2)
@@ -88,13 +55,6 @@ def test_bar_on_a_terminal_that_has_room(monkeypatch, columns):
     assert items == ['a', 'b', 'c']
     assert ('|' in shown) == (columns > 0)
     assert ('reading: 100% 3/3 [00:00<00:00, ' in shown) == (columns == 0)
-
-
-def test_quiet_shows_nothing(capsys, monkeypatch):
-    monkeypatch.setattr(progress, 'INTERVAL', 1e-3)
-    with show_progress('out', 'images', 2, quiet=True) as shown:
-        shown.update(2)
-    assert capsys.readouterr() == ('', '')
 
 
 def test_commands_without_a_terminal(tmp_path, capsys, monkeypatch):

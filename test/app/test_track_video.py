@@ -101,27 +101,6 @@ def test_a_stature_and_a_subject_file(walk_video, tmp_path, monkeypatch):
     assert [x.name for x in (tmp_path / 'given').iterdir()] == ['video']
 
 
-def test_gravity(walk_video, tmp_path, monkeypatch, capsys):
-    used = []
-
-    def replay_bag(source, target, options, tell):
-        used.append(options.settings)
-        raise ValueError('enough')
-
-    monkeypatch.setattr(track_video, 'replay_bag', replay_bag)
-    for i, options in enumerate((['--level'], ['--gravity', '0', '9', '-2.5'], [])):
-        given = [*options, '--set', 'evaluation_budget=80']
-        assert run(walk_video, '-o', str(tmp_path / str(i)), *keypoints(walk_video), *given) == 1
-    assert used == [
-        ['gravity=[0.0, 1.0, 0.0]', 'evaluation_budget=80'],
-        ['gravity=[0.0, 9.0, -2.5]', 'evaluation_budget=80'],
-        ['evaluation_budget=80'],
-    ]
-    both = ['--level', '--gravity', '0', '1', '0']
-    assert run(walk_video, '-o', str(tmp_path / 'both'), *both) == 1
-    assert 'not allowed with argument --level' in capsys.readouterr().err
-
-
 def video(path, pictures, fps=10.0):
     kind = cv2.VideoWriter_fourcc(*'mp4v')
     writer = cv2.VideoWriter(str(path), kind, fps, pictures[0].shape[1::-1])
@@ -186,27 +165,6 @@ def test_metadata_tell_the_lens(walk_video, begun, tmp_path, monkeypatch, capsys
     assert begun.imports[0].fov == 69.4
     assert begun.settings == [['focal_length_sigma=0.1']]
     assert 'by the metadata 69 degrees' in capsys.readouterr().err
-
-
-def test_a_folder_of_upright_images(begun, tmp_path, capsys):
-    folder = tmp_path / 'frames'
-    folder.mkdir()
-    cv2.imwrite(str(folder / '1.png'), np.zeros((64, 48, 3), np.uint8))
-    assert track_video.main([str(folder), '-o', str(tmp_path / 'out'), '--quiet']) == 0
-    (options,) = begun.imports
-    assert (options.fps, options.fov, options.vertical_fov) == (30.0, None, 60.0)
-    rate, lens, found = capsys.readouterr().err.splitlines()
-    assert 'frames is a folder: 30 images a second, unless --fps says so' in rate
-    assert 'assumed' in lens
-    # Without detector and background the command does not pretend.
-    assert 'the person may not be found; run "python -m hmt_ros install-detector"' in found
-    assert begun.notes[0] == [x.partition(': ')[2] for x in (rate, lens, found)]
-
-
-def test_a_bag_is_for_replay(tmp_path, capsys):
-    (tmp_path / 'x.mcap').touch()
-    assert track_video.main([str(tmp_path)]) == 1
-    assert f'{tmp_path} is a bag: replay {tmp_path} tracks' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hmt_ros.body import load_body
 from hmt_ros.body.flesh import Flesh, Superquadric
@@ -73,33 +71,6 @@ def test_surface_points_satisfy_the_implicit_equation(part):
     assert (implicit(part, point - 1e-4 * normal) < 1).all()
 
 
-def test_normals_are_perpendicular_to_the_tangents(part):
-    rng = np.random.default_rng(1)
-    # Away from the edges of the rings, where exponents other than 1 have no derivative.
-    s = rng.uniform(-0.95, 0.95, 300)
-    s = np.where(np.abs(s) < 0.02, 0.1, s)
-    w = rng.integers(0, 4, 300) * np.pi / 2 + rng.uniform(0.1, np.pi / 2 - 0.1, 300)
-    _, normal = surface(part, s, w)
-    h = 1e-6
-    for ds, dw in ((h, 0.0), (0.0, h)):
-        tangent = (surface(part, s + ds, w + dw)[0] - surface(part, s - ds, w - dw)[0]) / (2 * h)
-        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-        np.testing.assert_allclose((normal * tangent).sum(1), 0.0, atol=1e-6)
-
-
-def test_contour_points_lie_on_the_surface_and_face_across_the_ray(part):
-    rotations, places = looks(60, 2)
-    contour = occluding_contour(Flesh((part,), (7,)), frames_of(rotations, places))
-    assert contour.points.shape == (14, 3, 60)
-    np.testing.assert_allclose(implicit(part, contour.local.transpose(0, 2, 1)), 1.0, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(contour.normals, axis=1), 1.0, atol=1e-9)
-    world = np.einsum('nij,pjn->pin', rotations, contour.local) + places.T
-    np.testing.assert_allclose(contour.points, world, atol=1e-12)
-    across = (contour.normals * contour.points).sum(1) / np.linalg.norm(contour.points, axis=1)
-    assert contour.exists.mean() > 0.6
-    np.testing.assert_allclose(across[contour.exists], 0.0, atol=1e-6)
-
-
 def test_contour_equals_a_search_over_all_angles(part):
     rotations, places = looks(25, 3)
     flesh = Flesh((part,), (5,))
@@ -148,18 +119,6 @@ def frames_points(frames, segments, local):
     return turned + frames.origins[segments]
 
 
-@given(
-    radii=st.tuples(*(st.floats(0.02, 0.3) for _ in range(3))),
-    e1=st.floats(0.4, 1.6), taper=st.floats(-0.4, 0.4), seed=st.integers(0, 10_000),
-)  # fmt: skip
-def test_contour_of_any_round_part_is_exact(radii, e1, taper, seed):
-    part = Superquadric(0, (0.0, 0.0, 0.0), radii, (e1, 1.0), (taper, taper))
-    rotations, places = looks(5, seed)
-    contour = occluding_contour(Flesh((part,), (5,)), frames_of(rotations, places))
-    across = (contour.normals * contour.points).sum(1)
-    np.testing.assert_allclose(across[contour.exists], 0.0, atol=1e-9)
-
-
 def test_mesh_of_every_part_is_closed_and_oriented_outward():
     flesh = HUMAN.flesh
     mesh = flesh.mesh(stacks=7, slices=10)
@@ -183,33 +142,6 @@ def test_mesh_of_every_part_is_closed_and_oriented_outward():
         assert ((facing * mean_normal).sum(1) > 0).all()
 
 
-def test_mesh_vertices_lie_on_their_parts():
-    flesh = HUMAN.flesh
-    mesh = flesh.mesh()
-    for part, shape in enumerate(flesh.parts):
-        value = implicit(shape, mesh.vertices[mesh.parts == part])
-        np.testing.assert_allclose(value, 1.0, atol=1e-9)
-
-
-def test_volume_of_a_fine_mesh_is_that_of_the_ellipsoid():
-    part = Superquadric(0, (0.1, 0.2, 0.3), (0.2, 0.1, 0.3))
-    mesh = Flesh((part,)).mesh(stacks=60, slices=80)
-    a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
-    volume = (np.cross(a, b) * c).sum() / 6
-    assert volume == pytest.approx(4 / 3 * np.pi * 0.2 * 0.1 * 0.3, rel=0.01)
-
-
-def test_widths_scale_the_cross_sections_alone():
-    factors = np.linspace(0.8, 1.3, len(HUMAN.flesh.parts))
-    growth = np.log(factors)[:, None] * [1.0, 1.0, 0.0, 0.0, 0.0]
-    wide = HUMAN.with_growth(growth).flesh
-    for before, after, factor in zip(HUMAN.flesh.parts, wide.parts, factors):
-        assert after.radii == pytest.approx(
-            (before.radii[0] * factor, before.radii[1] * factor, before.radii[2])
-        )
-        assert after.centre == before.centre
-
-
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
@@ -223,10 +155,3 @@ def test_an_impossible_part_is_refused(change, message):
     values = {'segment': 0, 'centre': (0, 0, 0), 'radii': (0.1, 0.1, 0.1)}
     with pytest.raises(ValueError, match=message):
         Superquadric(**{**values, **change})
-
-
-def test_wrong_counts_are_refused():
-    with pytest.raises(ValueError, match='2 ring counts for 1 parts'):
-        Flesh((PARTS['flat'],), (5, 5))
-    with pytest.raises(ValueError, match='a mesh needs'):
-        HUMAN.flesh.mesh(stacks=1)

@@ -12,16 +12,12 @@ from hmt_ros.body import load_body
 from hmt_ros.body.ground_terms import (
     LEAN_TAILS,
     PELVIS_SIGMA,
-    SHARES,
     TRUNK_LEAN,
     TRUNK_SIGMA,
     FloorPlane,
     GroundSettings,
     GroundTerm,
-    masses,
-    root_lean_dofs,
     soles,
-    without_root_lean,
 )
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_angles, root_rotations
@@ -151,63 +147,3 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
     square = 0.01**2 * (TRUNK_SIGMA[1] ** -2 + bends * PELVIS_SIGMA[1] ** -2)
     assert small == pytest.approx(0.5 * (LEAN_TAILS + 2) / LEAN_TAILS * square, rel=0.03)
     assert turned < 16.0
-
-
-def test_feet_below_the_floor_cost_and_feet_above_it_do_not(body, standing):
-    plane = level_plane(body, standing)
-
-    def cost(plane: FloorPlane) -> float:
-        return energy_of(GroundTerm(body, only('floor'), plane), body, standing).value[0]
-
-    costs = [
-        cost(replace(plane, height=plane.height - sunk)) for sunk in (-0.5, 0.0, 0.02, 0.04, 0.4)
-    ]
-    assert costs[0] == 0.0
-    assert costs[1] == pytest.approx(0.0, abs=1e-6)
-    assert 0.0 < costs[2] < costs[3] < costs[4] < 60.0
-    # Without a known floor nothing is below it, nor where only the feet of the track tell of it.
-    sunk = replace(plane, height=plane.height - 0.1)
-    for other in (replace(sunk, height=None), replace(sunk, measured=False)):
-        assert cost(other) == 0.0
-
-
-def test_masses_are_those_of_the_table(body):
-    mass = masses(body)
-    assert mass.shares.sum() == pytest.approx(1.0)
-    share = dict(zip(body.skeleton.segment_names, mass.shares, strict=True))
-    assert share['left_thigh'] == pytest.approx(SHARES['thigh'][0], rel=0.01)
-    # Of somebody who stands it is a little above the hips [Winter: 0.55 to 0.58 of the stature].
-    upright = np.zeros((1, body.dimension))
-    upright[0, 2] = 3.0
-    frames, feet = forward(body.skeleton, upright), soles(body)
-    high = mass.centre_of_mass(frames)[1, 0]
-    floor = frames.points(feet.segments, feet.local)[:, 1, 0].max()
-    assert 0.52 < (floor - high) / body.stature < 0.62
-
-
-def test_soles_are_the_lowest_points_of_the_feet(body):
-    feet, names = soles(body), body.skeleton.segment_names
-    assert [names[s] for s in feet.segments] == 2 * ['left_foot'] + 2 * ['right_foot']
-    mesh = body.flesh.mesh()
-    foot = mesh.vertices[mesh.segments == feet.segments[0]]
-    assert feet.local[:2, 1] == pytest.approx(foot[:, 1].min(), abs=0.01)  # y up, flat foot
-    heel, toe = feet.local[:2, 2]
-    assert heel > 0 > toe  # along -z from ankle to toe
-    wide = body.with_growth(np.tile(np.log([2.0, 2.0, 1.0, 1.0, 1.0]), (len(body.shapes), 1)))
-    assert (soles(wide).local[:, 1] < feet.local[:, 1] - 0.02).all()
-
-
-def test_a_body_without_a_prior_of_its_root_keeps_its_angles(body):
-    free = without_root_lean(body)
-    lean = root_lean_dofs(body)
-    assert [body.dof_names[i] for i in lean] == ['root_y', 'root_x']
-    assert np.isinf(free.prior_sigma[lean]).all()
-    others = np.setdiff1d(np.arange(body.dimension), lean)
-    assert np.array_equal(free.prior_sigma[others], body.prior_sigma[others])
-    assert without_root_lean(free) is free
-
-
-@pytest.mark.parametrize('value', [-1.0, np.nan, np.inf])
-def test_weights_that_are_refused(value):
-    with pytest.raises(ValueError, match=r'ground\.floor_weight must be a number of at least 0'):
-        GroundSettings(floor_weight=value)

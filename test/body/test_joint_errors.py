@@ -1,10 +1,7 @@
 """What the joints of a body err by in every pose."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import yaml
 
 from hmt_ros.body import load_body
 from hmt_ros.body.model_file import joint_errors_of
@@ -25,14 +22,6 @@ def test_both_sides_have_the_error_and_a_joint_without_one_the_worst():
     assert joint_errors_of(NAMES, table).tolist() == [0.0, 0.02, 0.02, 0.02]
 
 
-def test_a_body_has_errors_of_its_own(tmp_path):
-    path = tmp_path / 'own.yaml'
-    own = {'name': 'own', 'extends': 'human37', 'joint_errors': {'pelvis': 0.0, 'neck': 0.05}}
-    path.write_text(yaml.safe_dump(own))
-    body = load_body(path)
-    assert body.joint_errors[body.joint_names.index('neck')] == 0.05
-
-
 @pytest.mark.parametrize(
     ('table', 'says'),
     [
@@ -45,8 +34,3 @@ def test_a_body_has_errors_of_its_own(tmp_path):
 def test_a_wrong_table_is_refused(table, says):
     with pytest.raises(ValueError, match=says):
         joint_errors_of(NAMES, table)
-
-
-def test_errors_of_another_number_of_joints_are_refused(human37):
-    with pytest.raises(ValueError, match='joint_errors must be 19'):
-        replace(human37, joint_errors=np.zeros(3))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.keep_out import BARE, MARGIN, Capsules, keep_out_capsules, reach_after
+from hmt_ros.body.keep_out import BARE, MARGIN, Capsules, keep_out_capsules
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 
@@ -35,19 +35,6 @@ def test_capsules_hold_points():
     exact = np.pi * 0.25 * 2.0 + 4.0 / 3.0 * np.pi * 0.125
     assert one.volume(100_000) == pytest.approx(exact, rel=0.02)
     assert one.volume() == one.volume()
-
-
-def test_what_a_larger_capsule_holds_is_left_out():
-    inner, outer = [[0.0, 0.0, 0.5]], [[0.0, 0.0, 0.0]]
-    both = Capsules(
-        np.array([*inner, *outer]),
-        np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]),
-        np.array([0.2, 0.5]),
-    )
-    assert both.without_held().radii.tolist() == [0.5]
-    aside = np.array([[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    apart = Capsules(both.starts + aside, both.ends + aside, both.radii)
-    assert len(apart.without_held()) == 2
 
 
 def test_every_joint_of_every_mode_that_counts_is_inside():
@@ -80,20 +67,6 @@ def test_drawn_joints_are_inside_as_often_as_asked_for(probability):
     inside = held.contain(joints.reshape(-1, 3)).reshape(joints.shape[:2])
     assert inside.mean(0).min() >= probability - 0.05
     assert inside.mean() < 1.0 or probability > 0.9
-
-
-def test_more_is_held_where_less_is_known():
-    held = [keep_out_capsules(BODY, posterior(depth=s)) for s in (0.0, 0.2, 0.6)]
-    volumes = [one.volume(5_000) for one in held]
-    assert volumes[0] < volumes[1] < volumes[2]
-    # Along the line of sight, and not to all sides.
-    # A ball of this radius has 30 m^3.
-    assert volumes[2] < 8.0
-    assert held[0].grown(0.3).volume(5_000) > volumes[0]
-
-
-def test_a_hand_is_the_fastest_and_then_the_person():
-    assert [reach_after(t) for t in (0.0, 0.1, 1.0, 3.0)] == pytest.approx([0.0, 0.7, 3.7, 9.7])
 
 
 def test_a_body_without_flesh_has_its_bones():

@@ -14,7 +14,6 @@ from hmt_ros.body.kinematics import (
     directed_derivatives,
     forward,
     joint_length_jacobians,
-    origin_length_jacobians,
     point_jacobians,
     segment_sums,
 )
@@ -132,18 +131,6 @@ def test_length_jacobians_equal_central_differences(body, random_poses):
         np.testing.assert_allclose(jacobians[..., k], difference / (2 * STEP), atol=1e-8)
 
 
-def test_origins_of_segments_move_with_the_lengths(body, random_poses):
-    poses = random_poses(body, 3, 6)
-    jacobians = origin_length_jacobians(body.skeleton, forward(body.skeleton, poses))
-    assert jacobians.shape == (len(body.skeleton.parents), 3, len(body.segment_lengths), 3)
-    for k, (name, length) in enumerate(body.segment_lengths.items()):
-        ahead, behind = (
-            forward(body.with_segment_lengths({name: length + x}).skeleton, poses).origins
-            for x in (STEP, -STEP)
-        )
-        np.testing.assert_allclose(jacobians[:, :, k], (ahead - behind) / (2 * STEP), atol=1e-8)
-
-
 def random_points(body: Body, poses: np.ndarray, per_segment: int, seed: int):
     rng = np.random.default_rng(seed)
     segments = np.repeat(np.arange(len(body.skeleton.parents)), per_segment)
@@ -216,25 +203,6 @@ def test_a_pose_moves_no_point_within_its_segment(seed, name):
             i, j = body.skeleton.joint_index((f'{side}_{a}', f'{side}_{b}'))
             span = np.linalg.norm(joints[:, i] - joints[:, j], axis=1)
             np.testing.assert_allclose(span, lengths[bone], atol=1e-9)
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-def test_each_pose_of_a_batch_is_evaluated_alone(seed):
-    body = BODIES['human37']
-    poses = np.random.default_rng(seed).uniform(-1, 1, size=(7, body.dimension))
-    together = body.joint_positions(poses)
-    alone = np.concatenate([body.joint_positions(q[None]) for q in poses])
-    np.testing.assert_allclose(together, alone, atol=1e-12)
-
-
-def test_directions_turn_and_do_not_shift(random_poses):
-    body = BODIES['human37']
-    poses = random_poses(body, 3, 10)
-    frames = forward(body.skeleton, poses)
-    segments = np.array([3, 5, 8])
-    local = np.random.default_rng(0).normal(size=(3, 3))
-    expected = frames.points(segments, local) - frames.points(segments, np.zeros((3, 3)))
-    np.testing.assert_allclose(frames.directions(segments, local), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(

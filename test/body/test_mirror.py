@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.mirror import mirror, reverse_depth, root_angles, root_rotations
+from hmt_ros.body.mirror import mirror, reverse_depth
 
 BODIES = ('human37', 'human34', 'human32')
 
@@ -56,16 +56,3 @@ def test_depth_is_reversed_along_the_ray(name):
     assert np.abs(found - wanted).max() < 1e-9
     assert (reversed_poses >= body.lower).all()
     assert (reversed_poses <= body.upper).all()
-
-
-def test_joint_angles_stay_within_limits_that_are_alike_on_both_sides():
-    body = load_body('human37')
-    poses = drawn(body)
-    q = reverse_depth(body, poses)
-    assert np.array_equal(q[:, 6:], mirror(body, poses)[:, 6:])
-
-
-def test_angles_of_the_root():
-    body = load_body('human37')
-    poses = drawn(body)
-    assert np.abs(root_angles(body, root_rotations(body, poses)) - poses[:, 3:6]).max() < 1e-9

@@ -58,12 +58,6 @@ def test_the_pose_of_zeros_stands_upright_and_unturned():
     assert at['left_toe'][2] > 0.05
 
 
-def test_one_skeleton_has_the_names_of_its_joints():
-    names = MovingSkeleton.of_body(BODY, some_poses(), TIMES).names
-    assert set(BODY.joint_names) <= set(names)
-    assert len(set(names)) == len(names)
-
-
 def root_angles(name, low, high, count=60):
     """Angles (T, 3) of the root in a BVH while one of its degrees of freedom moves evenly."""
     poses = np.zeros((count, BODY.dimension))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.body import GROWTH, LEAST_HEIGHT
 from hmt_ros.body.kinematics import directed_derivatives, forward
 from hmt_ros.body.shape import ShapeSpace
 
@@ -39,29 +38,6 @@ def central_difference(space, function, size=STEP):
         ahead, behind = (np.asarray(function(space.moved(x))) for x in (step, -step))
         columns.append((ahead - behind) / (2 * size))
     return np.stack(columns, axis=-1)
-
-
-def test_names_of_the_variables(space, body):
-    assert len(space.names) == len(set(space.names)) == space.size
-    assert space.names[: space.lengths] == body.skeleton.length_names
-    assert {'trunk_width', 'shin_shift', 'head_end'} <= set(space.names)
-    # A pair of parts is one group.
-    assert 'left' not in ' '.join(space.names)
-    assert space.size == space.lengths + len(space.groups) * len(GROWTH)
-
-
-def test_the_vector_0_is_the_body(space, body):
-    same = space.moved(np.zeros(space.size))
-    assert same.segment_lengths == pytest.approx(body.segment_lengths)
-    assert np.array_equal(same.growth, body.growth)
-
-
-def test_moves_add_up(space):
-    first, second = 0.01 * np.random.default_rng(1).normal(size=(2, space.size))
-    once = space.moved(first + second)
-    twice = ShapeSpace(space.moved(first)).moved(second)
-    assert np.allclose(once.skeleton.lengths, twice.skeleton.lengths)
-    assert np.allclose(once.growth, twice.growth)
 
 
 def test_left_and_right_parts_grow_alike(human37):
@@ -178,18 +154,6 @@ def test_growth_of_a_part(human37):
     assert bottoms[1] - bottoms[0] == pytest.approx(-0.01)
 
 
-def test_a_part_does_not_vanish(human37):
-    growth = np.zeros_like(human37.growth)
-    growth[:, 2:4] = -5.0
-    shrunk = human37.with_growth(growth)
-    assert all(part.radii[2] == LEAST_HEIGHT for part in shrunk.flesh.parts)
-
-
-def test_growth_is_kept_by_other_lengths(body):
-    assert np.array_equal(body.with_stature(1.5).growth, body.growth)
-    assert np.array_equal(body.with_segment_lengths({'thigh': 0.4}).growth, body.growth)
-
-
 @pytest.mark.parametrize(
     'growth', [np.zeros(5), np.zeros((3, 5)), np.full((17, 5), np.nan), np.zeros((17, 4))]
 )
@@ -213,15 +177,6 @@ def test_parts_grow_with_the_length_that_they_belong_to(human37):
     long = human37.with_segment_lengths({name: 1.1 * human37.segment_lengths[name]})
     assert long.flesh.parts[thigh].radii == pytest.approx(1.1 * np.array(before[thigh].radii))
     assert long.flesh.parts[trunk] == before[trunk]
-
-
-def test_a_part_of_no_length_grows_with_the_whole_body(human37):
-    shapes = tuple(replace(shape, size=None) for shape in human37.shapes)
-    body = replace(human37, shapes=shapes).with_stature(1.1 * human37.stature)
-    for shape, before, after in zip(shapes, human37.flesh.parts, body.flesh.parts):
-        assert body.scale_of(shape) == pytest.approx(1.1)
-        assert after.radii == pytest.approx(1.1 * np.array(before.radii))
-        assert after.centre == pytest.approx(1.1 * np.array(before.centre))
 
 
 @pytest.mark.parametrize('whole', [False, True])

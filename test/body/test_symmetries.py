@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import yaml
 from scipy.linalg import expm
 from scipy.special import expit, logit
 
@@ -31,15 +30,6 @@ def test_odds_of_two_gaps_are_those_of_one(log_odds):
         )
 
 
-def test_nothing_is_known_after_long():
-    assert FACING.after(-8.0, 1000.0) == pytest.approx(0.0, abs=1e-12)
-    assert FACING.after(-10.0, np.inf) == 0.0
-    gaps = [FACING.after(-8.0, dt) for dt in (0.0, 0.1, 1.0, 10.0, 100.0)]
-    assert gaps[0] == pytest.approx(-8.0)
-    assert (np.diff(gaps) > 0).all()
-    assert max(gaps) < 0.0
-
-
 @pytest.mark.parametrize('dt', [1e-3, 0.03, 0.3, 30.0])
 def test_the_price_is_that_of_the_chain(dt):
     flip = Symmetry(2.0)
@@ -48,21 +38,9 @@ def test_the_price_is_that_of_the_chain(dt):
     assert flip.price(dt) > np.log(2.0) - 1e-12
 
 
-def test_nothing_goes_over_in_no_time():
-    assert Symmetry(2.0).price(0.0) == np.inf
-    assert Symmetry(2.0).price(np.inf) == pytest.approx(np.log(2.0))
-
-
 @pytest.mark.parametrize('name', ['human32', 'human34', 'human37'])
 def test_every_body_has_the_table(name):
     assert list(load_body(name).symmetries) == list(MAPS)
-
-
-def test_a_body_has_rates_of_its_own(tmp_path):
-    rates = dict.fromkeys(MAPS, 0.5)
-    path = tmp_path / 'own.yaml'
-    path.write_text(yaml.safe_dump({'name': 'own', 'extends': 'human37', 'symmetries': rates}))
-    assert {x.rate for x in load_body(path).symmetries.values()} == {0.5}
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,7 @@
 """BlazePose: its geometry and filters, its rules with networks that cost nothing, and itself."""
 
-from __future__ import annotations
-
 import math
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -20,7 +17,6 @@ from hmt_ros.detectors.blazepose import (
     _Square,
 )
 from hmt_ros.image.keypoint_schemes import schemes
-from hmt_ros.inference.arrays import Array
 from msg_tools import BagReader
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image
@@ -34,7 +30,7 @@ INTERVAL = 33_333_000
 
 
 @pytest.mark.parametrize('degrees', [0.0, 30.0, -100.0, 180.0])
-def test_a_square_stands_upright_about_a_circle(degrees: float) -> None:
+def test_a_square_stands_upright_about_a_circle(degrees):
     angle = math.radians(degrees)
     centre = np.array([100.0, 80.0])
     head = centre + 40 * np.array([math.sin(angle), -math.cos(angle)])
@@ -46,7 +42,7 @@ def test_a_square_stands_upright_about_a_circle(degrees: float) -> None:
     )
 
 
-def test_a_square_sees_and_spreads() -> None:
+def test_a_square_sees_and_spreads():
     rows, columns = np.mgrid[:60, :80]
     image = np.stack([columns, rows, 0 * rows], axis=-1).astype(np.uint8)
     square = _Square((40.0, 30.0), 32.0, math.pi / 2)
@@ -58,14 +54,14 @@ def test_a_square_sees_and_spreads() -> None:
     assert not spread[:, :20].any()
 
 
-def test_cells_of_the_first_network() -> None:
+def test_cells_of_the_first_network():
     anchors = _anchors()
     assert anchors.shape == (2254, 2)
     np.testing.assert_allclose(anchors[[0, 1, 2, 56]] * 224, [[4, 4], [4, 4], [12, 4], [4, 12]])
     np.testing.assert_allclose(anchors[-1] * 224, [208, 208])
 
 
-def test_points_move_to_the_heat_about_them() -> None:
+def test_points_move_to_the_heat_about_them():
     rows, columns = np.mgrid[:64, :64]
     heat = np.full((64, 64, 4), -20.0, np.float32)
     peaks = [(20.4, 30.7), (1.0, 62.5), (40.0, 40.0), (10.0, 10.0)]
@@ -85,7 +81,7 @@ def test_points_move_to_the_heat_about_them() -> None:
     np.testing.assert_array_equal(found[2:], points[2:])
 
 
-def test_the_one_euro_filter_number_by_number() -> None:
+def test_the_one_euro_filter_number_by_number():
     rng = np.random.default_rng(3)
     values = np.cumsum(rng.normal(size=(20, 3, 2)), axis=0)
     intervals = rng.uniform(0.02, 0.1, 20)
@@ -97,7 +93,7 @@ def test_the_one_euro_filter_number_by_number() -> None:
         for step in range(1, 20):
             dt, new = intervals[step], values[(step, *place)]
 
-            def share(cutoff: float, dt: float = dt) -> float:
+            def share(cutoff, dt=dt):
                 return 1 / (1 + 1 / (2 * math.pi * cutoff * dt))
 
             velocity += share(1.0) * ((new - last) / dt / 7.0 - velocity)
@@ -112,14 +108,14 @@ def test_the_one_euro_filter_number_by_number() -> None:
 class StandIns:
     """Networks that see somebody as long as `seen`, and how often each was asked."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.seen = True
         self.asked: list[str] = []
 
-    def __call__(self, name: str) -> Callable[[np.ndarray], list[np.ndarray]]:
+    def __call__(self, name):
         return self.person if name.startswith('pose_detection') else self.landmarks
 
-    def person(self, image: np.ndarray) -> list[np.ndarray]:
+    def person(self, image):
         self.asked.append('person')
         assert image.shape == (224, 224, 3)
         # Above and below the image, which is black there.
@@ -132,7 +128,7 @@ class StandIns:
                 boxes[n, 2:8] = 60.0, 60.0, 0.0, 40.0, shift, 0.0
         return [boxes, scores]
 
-    def landmarks(self, image: np.ndarray) -> list[np.ndarray]:
+    def landmarks(self, image):
         self.asked.append('landmarks')
         assert image.shape == (256, 256, 3)
         flat = np.zeros((39, 5), np.float32)
@@ -150,7 +146,7 @@ class StandIns:
 
 
 @pytest.fixture
-def networks(monkeypatch: pytest.MonkeyPatch) -> StandIns:
+def networks(monkeypatch):
     stand_ins = StandIns()
     monkeypatch.setattr(blazepose, '_Network', stand_ins)
     return stand_ins
@@ -159,7 +155,7 @@ def networks(monkeypatch: pytest.MonkeyPatch) -> StandIns:
 IMAGE = np.full((240, 320, 3), 90, np.uint8)
 
 
-def test_somebody_is_sought_once_and_then_followed(networks: StandIns) -> None:
+def test_somebody_is_sought_once_and_then_followed(networks):
     detector = BlazePose()
     for index in range(3):
         assert detector.detect(IMAGE, INTERVAL * (index + 1)) is not None
@@ -170,7 +166,7 @@ def test_somebody_is_sought_once_and_then_followed(networks: StandIns) -> None:
     assert networks.asked[4:] == ['landmarks', 'person', 'person']
 
 
-def test_landmarks_are_keypoints(networks: StandIns) -> None:
+def test_landmarks_are_keypoints(networks):
     detector = BlazePose(with_mask=True)
     found = detector.detect(IMAGE, INTERVAL)
     assert found is not None
@@ -209,7 +205,7 @@ def test_landmarks_are_keypoints(networks: StandIns) -> None:
         (3 * INTERVAL, 300, True),
     ],
 )
-def test_what_begins_a_new_sequence(networks: StandIns, stamp: int, width: int, anew: bool) -> None:
+def test_what_begins_a_new_sequence(networks, stamp, width, anew):
     detector = BlazePose()
     for each in (INTERVAL, 2 * INTERVAL):
         detector.detect(IMAGE, each)
@@ -221,7 +217,7 @@ def test_what_begins_a_new_sequence(networks: StandIns, stamp: int, width: int, 
 # ---- MediaPipe Pose itself ----
 
 
-def errors(found: list, known: Array) -> tuple[Array, Array, Array]:
+def errors(found, known):
     """Differences of keypoints from rows (T, 33, 6) of MediaPipe: px, visibilities, m."""
     pixels = np.array([each.pixels for each in found]) - known[..., :2]
     positions = np.array([each.positions for each in found]) - known[..., 3:]
@@ -229,7 +225,7 @@ def errors(found: list, known: Array) -> tuple[Array, Array, Array]:
     return np.linalg.norm(pixels, axis=2), abs(visibilities), np.linalg.norm(positions, axis=2)
 
 
-def test_it_finds_what_mediapipe_finds(mediapipe_pose: None) -> None:
+def test_it_finds_what_mediapipe_finds(mediapipe_pose):
     """MediaPipe 0.10.21, model 1, saw the first images of bags/reach as 30 a second."""
     with np.load(Path(__file__).parent / 'reach_mediapipe.npz') as file:
         known, packed = file['rows'].astype(float), file['mask']
@@ -248,7 +244,7 @@ def test_it_finds_what_mediapipe_finds(mediapipe_pose: None) -> None:
     assert (mask & detector.mask).sum() / (mask | detector.mask).sum() > 0.98
 
 
-def test_it_finds_what_mediapipe_finds_in_a_clip(mediapipe_pose: None) -> None:
+def test_it_finds_what_mediapipe_finds_in_a_clip(mediapipe_pose):
     if not CLIP.is_dir():
         pytest.skip(f'no development clip in {CLIP} (set HMT_SHARED)')
     with np.load(CLIP / 'keypoints_mediapipe.npz') as file:
@@ -266,7 +262,7 @@ def test_it_finds_what_mediapipe_finds_in_a_clip(mediapipe_pose: None) -> None:
     assert np.median(positions) < 0.005
 
 
-def test_the_same_images_give_the_same_bytes(mediapipe_pose: None) -> None:
+def test_the_same_images_give_the_same_bytes(mediapipe_pose):
     with BagReader(ROOT / 'bags' / 'reach') as bag:
         stored = zip(range(4), bag.messages(['image/compressed']))
         images = [decode_image(each.message) for _, each in stored]

@@ -8,8 +8,6 @@ from hmt_ros.image.association import (
     ImageTrack,
     Sighting,
     assigned,
-    hull,
-    moved,
     unknown_area,
 )
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -48,14 +46,6 @@ def test_two_people_who_cross_keep_their_tracks():
         left.update(found[pairs[1]], i * FRAME)
 
 
-def test_the_velocity_is_that_of_the_last_moments():
-    track = walked(0.0, 10.0, images=10)
-    np.testing.assert_allclose(track.velocity, [100.0, 0.0])
-    np.testing.assert_allclose(track.shift(9 * FRAME + FRAME // 2), [5.0, 0.0])
-    # Somebody who is not seen does not go on for ever.
-    np.testing.assert_allclose(track.shift(100 * FRAME), [100.0, 0.0])
-
-
 def test_the_cost_is_the_median_way_in_sizes():
     track = walked(0.0, 0.0)
     size = np.hypot(30.0, 50.0)
@@ -85,13 +75,3 @@ def test_what_others_cover_is_unknown():
     unknown = unknown_area(mine, [before], [behind])
     np.testing.assert_array_equal(unknown[0], [True, True, False, False, True, True])
     assert unknown_area(mine, [], [behind & mine]) is None
-
-
-def test_areas_move_and_leave_the_image():
-    area = np.zeros((5, 7), bool)
-    area[1:3, 2:4] = True
-    np.testing.assert_array_equal(moved(area, np.array([2.2, -1.0]))[0:2, 4:6], np.ones((2, 2)))
-    assert moved(area, np.array([2.2, -1.0])).sum() == 4
-    assert not moved(area, np.array([100.0, 0.0])).any()
-    assert hull(sighting(50.0, 50.0), (100, 100)).sum() > 1200
-    assert hull(sighting(50.0, 50.0, seen=0), (100, 100)).sum() > 1500

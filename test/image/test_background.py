@@ -121,20 +121,6 @@ def test_an_image_of_another_size_is_refused_and_changes_nothing(scene, method):
     assert before.sum() > 1700
 
 
-def test_other_people_outside_the_region(scene):
-    background = BackgroundModel.from_image(scene)
-    image = scene.copy()
-    image[40:80, 20:40] = (10, 240, 30)
-    image[20:110, 100:150] = (10, 240, 30)  # somebody larger
-    region = (10, 30, 60, 90)
-    found = background.silhouette(image, region)
-    assert found[41:79, 21:39].all()
-    assert not found[:, 60:].any()
-    assert background.silhouette(image)[30:100, 105:145].all()
-    assert background.silhouette(image, (0, 0, 160, 120)).sum() > found.sum()
-    assert not background.silhouette(image, (50, 0, 90, 120)).any()
-
-
 @pytest.mark.parametrize('method', METHODS)
 def test_a_background_with_a_person_in_it_is_put_together_anew(scene, method):
     """The person stood at the left while it was learned, and walks to the right."""
@@ -171,23 +157,6 @@ def test_a_background_with_a_person_in_it_is_put_together_anew(scene, method):
     found = background.silhouette(image)
     assert found[30:90, 60:90].mean() > 0.99
     assert not found[~person].any()
-
-
-def test_pixels_that_do_not_agree_stay_unknown(scene):
-    """A lamp blinks."""
-    background = BackgroundModel.from_image(scene)
-    background.forget()
-    lamp = np.zeros(scene.shape[:2], dtype=bool)
-    nobody = lamp.copy()
-    lamp[5:10, 5:10] = True
-    for i in range(40):
-        image = noisy(scene, i)
-        image[lamp] = 250 * (i // 5 % 2)
-        background.complete(image, nobody)
-    assert np.array_equal(background.unknown, lamp)
-    assert not background.foreground(noisy(scene, 50)).any()
-    with pytest.raises(ValueError, match=r'\(120, 160, 3\), saw an image \(60'):
-        background.complete(scene[:60], nobody[:60])
 
 
 def test_unknown_method_is_refused():
@@ -260,34 +229,3 @@ def test_large_images_are_made_smaller_and_the_outline_is_smooth(large, method):
     assert not (found & (within == 0)).any()
     assert found[inside > 0].all()
     assert found.sum() == pytest.approx(wanted.sum(), rel=0.03)
-
-
-def test_large_images_keep_to_the_region_and_to_what_others_leave(large):
-    empty, image, wanted, half = large
-    background = model(empty, 'mog2')
-    (left, right), top = np.flatnonzero(wanted.any(0))[[0, -1]], np.flatnonzero(wanted.any(1))[0]
-    assert not background.silhouette(image, (0, 0, left - 8, len(image))).any()
-    part = background.silhouette(image, (0, 0, image.shape[1], top + 2 * half))
-    assert part.any()
-    assert np.flatnonzero(part.any(1))[-1] <= top + 2 * half + 8
-    others = np.zeros(wanted.shape, np.bool_)
-    others[:, : (left + right) // 2] = True
-    open_to_view = background.split(image, others=others).foreground
-    assert not open_to_view[:, : (left + right) // 2 - 8].any()
-    assert open_to_view.sum() == pytest.approx((wanted & ~others).sum(), rel=0.05)
-
-
-def test_a_large_background_is_put_together_anew(large):
-    empty, image, wanted, _ = large
-    background = model(image, 'mog2')
-    background.forget()
-    assert background.unknown.all()
-    margin = cv2.dilate(wanted.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    for _ in range(12):
-        background.complete(image, margin)
-    assert np.array_equal(background.unknown, margin)
-    assert not background.silhouette(image)[margin].any()
-    for _ in range(12):
-        background.complete(empty, np.zeros_like(wanted))
-    assert background.unknown is None
-    assert background.silhouette(image)[wanted].mean() > 0.95

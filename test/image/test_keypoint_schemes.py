@@ -7,13 +7,10 @@ import pytest
 
 from hmt_ros.body import load_body
 from hmt_ros.image.keypoint_schemes import (
-    exchange_rates,
     noise_of,
-    position_deviations,
     recognised,
     scheme_of,
     schemes,
-    usual_exchanges,
 )
 from hmt_ros.image.terms.keypoints import Keypoints
 
@@ -48,11 +45,6 @@ def test_a_scheme_is_recognised_by_its_names(name):
     assert found.landmark(names[5]).joint == schemes()[name].landmarks[5].joint
 
 
-def test_limbs_alone_are_joints():
-    assert scheme_of(['left_hip', 'left_knee']) is None
-    assert scheme_of(['left_hip', 'left_knee'], 'coco17') is schemes()['coco17']
-
-
 def test_the_left_is_the_mirror_image_of_the_right():
     scheme = schemes()['mediapipe33']
     left, right = scheme.landmark('left_ear'), scheme.landmark('right_ear')
@@ -82,24 +74,3 @@ def test_known_covariances_and_joints_stay_as_they_are():
     np.testing.assert_array_equal(known.covariances, np.eye(2)[None])
     assert known.noise is None
     assert known.offsets is None
-
-
-def test_less_sure_keypoints_are_noisier():
-    sigma = noise_of(np.linspace(0.0, 1.0, 11))
-    assert (np.diff(sigma) <= 0).all()
-    assert sigma[0] > 3.0 * sigma[-1]
-
-
-def test_depths_of_unknown_detectors_are_less_sure():
-    known, other = position_deviations('mediapipe33'), position_deviations(None)
-    assert known.keys() == other.keys()
-    assert all(known[name] <= other[name] for name in known)
-    assert position_deviations('coco17') == other
-
-
-def test_exchanges_are_rare():
-    rates, usual = exchange_rates(), np.exp(usual_exchanges()[0])
-    np.testing.assert_allclose(rates.sum(1), 0.0, atol=1e-12)
-    assert rates[0, 1:].max() < 1.0
-    assert usual.sum() == pytest.approx(1.0)
-    assert usual[0] > 0.9

@@ -8,14 +8,12 @@ import pytest
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import directed_derivatives, forward
 from hmt_ros.body.pose_prior import AnglePrior
-from hmt_ros.body.self_intersection import SelfIntersection
-from hmt_ros.image.likelihood import OFF, ImageLikelihood, LikelihoodSettings, ObservedImage
-from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.likelihood import OFF, ImageLikelihood, ObservedImage
+from hmt_ros.image.observation import observe
 from hmt_ros.image.pose_energy import PoseEnergy
-from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
-from hmt_ros.image.terms.image_term import TermSettings, Weighting
+from hmt_ros.image.surface import COVER, HIDDEN
+from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
-from hmt_ros.image.terms.residuals import contour_sigma
 from hmt_ros.inference.energy import Derivatives
 from test.oracles import numpy_likelihood as oracle
 from test.oracles.numpy_contour import occluding_contour
@@ -165,25 +163,6 @@ def test_gradients_of_contour_terms_at_material_points(shot, observation, name):
     assert errors.max() < 1e-3
 
 
-@pytest.mark.parametrize('name', IMAGE_TERMS)
-def test_sliding_of_the_contour_hardly_changes_the_gradient(shot, observation, name):
-    """On the contour the skin is tangent to the ray: its points slide along the contour only."""
-    likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
-    poses = shot.near(8, 8)
-
-    def value(x):
-        return image_energy(likelihood, x, observation, Derivatives.NONE).value
-
-    found = image_energy(likelihood, poses, observation).gradient
-    wanted = numerical_gradient(value, poses)
-    assert np.median(relative_errors(found, wanted)) < 2e-3
-    cosine = (
-        (found * wanted).sum(1) / np.linalg.norm(found, axis=1) / np.linalg.norm(wanted, axis=1)
-    )
-    assert np.median(cosine) > 0.9995
-    assert cosine.min() > 0.997
-
-
 def test_gradient_and_hessian_of_the_soft_prior(shot):
     prior = AnglePrior(shot.body)
     poses = shot.near(5, 10, spread=0.4)
@@ -194,34 +173,6 @@ def test_gradient_and_hessian_of_the_soft_prior(shot):
     offset = (poses - shot.body.prior_mean)[:, known] / shot.body.prior_sigma[known]
     assert np.allclose(value, 0.5 * (offset**2).sum(1))
     assert np.allclose(hessian[0, known][:, known], np.diag(shot.body.prior_sigma[known] ** -2.0))
-
-
-def test_self_intersection_falls_against_its_gradient(shot):
-    """A Gauss-Newton model with the radii of the parts held: a direction of descent, not exact."""
-    body = shot.body
-    rng = np.random.default_rng(11)
-    poses = body.prior_mean + 0.5 * rng.normal(size=(200, body.dimension))
-    poses = np.clip(poses, body.lower, body.upper)
-
-    def energy(x):
-        return energy_of(SelfIntersection(body, 0.03), body, x)
-
-    value, gradient, hessian = energy(poses)
-    touching = value > 0.01
-    assert touching.sum() > 20
-    assert not gradient[value == 0].any()
-    poses, value, gradient, hessian = (x[touching] for x in (poses, value, gradient, hessian))
-    wanted = numerical_gradient(lambda x: energy(x)[0], poses)
-    cosine = (gradient * wanted).sum(1)
-    cosine /= np.linalg.norm(gradient, axis=1) * np.linalg.norm(wanted, axis=1)
-    # Of parts that lie deep in each other the nearest points jump, in few poses.
-    assert np.quantile(cosine, 0.02) > 0.0
-    assert np.median(cosine) > 0.97
-    # With one pair touching: 1/2 o^2 has the gradient o r and the Hessian r r^T, so H g = |r|^2 g.
-    assert (np.linalg.eigvalsh(hessian)[:, 0] > -1e-9 * value.max()).all()
-    step = 1e-4 * gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-    after = energy(poses - step)[0]
-    assert (after < value)[cosine > 0.0].all()
 
 
 # Lists of residuals.
@@ -255,14 +206,6 @@ def test_listed_residuals_sum_to_gradient_and_hessian(shot, observation, names):
         assert np.allclose(hessian, wanted.hessian[0], rtol=1e-9, atol=1e-9)
 
 
-def test_without_evidence_no_residuals_are_listed(shot, observation):
-    frames = forward(shot.body.skeleton, shot.poses[:1])
-    likelihood = ImageLikelihood(shot.body, shot.camera)
-    assert residuals(likelihood, frames, Observation()).shape == (0, 9)
-    switched_off = replace(likelihood, settings=LikelihoodSettings.of_terms())
-    assert residuals(switched_off, frames, observation).shape == (0, 9)
-
-
 def test_listed_residuals_of_keypoints_sum_to_gradient_and_hessian(shot):
     keypoints = keypoints_of(shot)
     pixels, confidences = keypoints.pixels.copy(), keypoints.confidences.copy()
@@ -287,41 +230,6 @@ def test_listed_residuals_of_keypoints_sum_to_gradient_and_hessian(shot):
 
 
 # Noise of contours.
-
-
-def test_noise_of_contours_in_pixels_grows_with_the_magnification():
-    near, far = (Weighting(30.0, 2.0, 3.0, pixels) for pixels in (400.0, 100.0))
-    assert contour_sigma(near, 0.015) == pytest.approx(np.hypot(2.0, 6.0))
-    assert contour_sigma(far, 0.015) == pytest.approx(np.hypot(2.0, 1.5))
-    assert contour_sigma(far._replace(magnification=0.0), 0.015) == 2.0
-
-
-def test_every_part_has_a_noise_of_its_contour(shot):
-    table = flesh_table_of(shot.body)
-    assert table.ring_noise.shape == (len(table.ring_parts), 2)
-    assert (table.ring_noise > 0.002).all()
-    assert (table.ring_noise < 0.05).all()
-    names = [shot.body.skeleton.segment_names[s] for s in table.part_segments]
-    left, right = (
-        table.ring_noise[table.ring_parts == names.index(f'{side}_thigh')]
-        for side in ('left', 'right')
-    )
-    assert np.array_equal(left, right)
-
-
-@pytest.mark.parametrize('name', IMAGE_TERMS)
-def test_the_nearer_a_person_the_less_a_pixel_says(shot, observation, name):
-    """In pixels; a centimetre says the same at any distance where the noise is that of the body."""
-    likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
-    frames = forward(shot.body.skeleton, shot.near(1, 24))
-    curvatures = [
-        residuals(likelihood, frames, replace(observation, magnification=pixels))[:, 4:]
-        for pixels in (0.0, 100.0, 400.0)
-    ]
-    sharpness = [
-        np.mean(np.linalg.norm(rows[:, :3], axis=1) ** 2 * rows[:, 4]) for rows in curvatures
-    ]
-    assert sharpness[0] > sharpness[1] > sharpness[2]
 
 
 # Visibility.
@@ -379,29 +287,6 @@ def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(shot, observation
             assert relative_difference(a[n : n + 1], b) <= 1e-12
 
 
-def test_values_without_derivatives_are_the_same(shot, observation):
-    likelihood = ImageLikelihood(shot.body, shot.camera)
-    poses = shot.near(5, 15)
-    full = image_energy(likelihood, poses, observation)
-    bare = image_energy(likelihood, poses, observation, Derivatives.NONE)
-    assert bare.gradient is None
-    assert np.array_equal(full.value, bare.value)
-
-
-def test_terms_without_evidence_are_off(shot):
-    likelihood = ImageLikelihood(shot.body, shot.camera)
-    poses = shot.near(2, 16)
-    image = shot.images[1]
-    empty = observe(image, np.zeros(image.shape[:2], dtype=bool))
-    full = observe(image, shot.masks[1])
-    for seen, on in ((observe(image), {'edges'}), (empty, {'edges'}), (full, set(IMAGE_TERMS))):
-        values = {x: image_energy(only(likelihood, x), poses, seen).value for x in IMAGE_TERMS}
-        assert {name for name, value in values.items() if value.any()} == on
-    nothing = image_energy(likelihood, poses, Observation())
-    assert np.array_equal(nothing.value, np.zeros(2))
-    assert not nothing.hessian.any()
-
-
 def test_the_truth_is_better_than_its_neighbours(shot, observation):
     likelihood = ImageLikelihood(shot.body, shot.camera)
     poses = np.concatenate([shot.poses[1:], shot.near(40, 17, spread=0.15)])
@@ -432,20 +317,6 @@ def test_what_others_explain_costs_no_more_than_that(shot, observation):
     assert not nothing.hessian.any()
 
 
-def test_parts_share_the_weight_of_the_whole_contour(shot, observation):
-    """Edges of all parts are the sum over groups of parts: each point has its own share."""
-    likelihood = only(ImageLikelihood(shot.body, shot.camera), 'edges')
-    poses = shot.near(5, 19, spread=0.2)
-    every = tuple(range(len(shot.body.flesh.parts)))
-    whole, *parts = (
-        image_energy(replace(likelihood, parts=group), poses, observation)
-        for group in (every, every[::2], every[1::2])
-    )
-    assert whole.value.min() > 0
-    assert np.allclose(whole.value, sum(part.value for part in parts))
-    assert np.allclose(whole.hessian, sum(part.hessian for part in parts))
-
-
 def keypoint_energy(shot, keypoints, poses, settings=None, derivatives=Derivatives.POSITIVE):
     term = KeypointTerm(
         shot.body.skeleton, shot.camera, keypoints, settings or TermSettings(1.0, 1.0, 5.0)
@@ -474,36 +345,3 @@ def test_gradient_of_keypoints(shot):
     assert np.array_equal(found.value, value(poses))
     errors = relative_errors(found.gradient, numerical_gradient(value, poses))
     assert errors.max() < 1e-6
-
-
-def test_keypoints_that_were_not_seen_do_not_count(shot):
-    keypoints, poses = keypoints_of(shot), shot.near(3, 21)
-    chosen = [2, 5, 11]
-    some = Keypoints(
-        tuple(keypoints.names[i] for i in chosen), keypoints.pixels[chosen],
-        keypoints.covariances[chosen], np.array([1.0, 0.5, 1.0]),
-    )  # fmt: skip
-    hidden = keypoints.pixels.copy()
-    hidden[[i for i in range(len(hidden)) if i not in chosen]] = np.nan
-    confidences = np.ones(len(hidden))
-    confidences[5] = 0.5
-    confidences[0] = 0.0
-    all_named = Keypoints(keypoints.names, hidden, keypoints.covariances, confidences)
-    a, b = (keypoint_energy(shot, k, poses) for k in (some, all_named))
-    assert a.value.min() > 0
-    assert np.allclose(a.value, b.value)
-    assert np.allclose(a.hessian, b.hessian)
-    with pytest.raises(KeyError, match='tail'):
-        keypoint_energy(shot, replace(keypoints, names=('tail', *keypoints.names[1:])), poses)
-
-
-def test_only_the_terms_that_are_named_are_on():
-    settings = LikelihoodSettings.of_terms(edges=TermSettings(20.0, 2.5, 3.0))
-    on = [name for name in (*IMAGE_TERMS, 'keypoints') if getattr(settings, name).weight > 0]
-    assert on == ['edges']
-
-
-@pytest.mark.parametrize('wrong', [(-1.0, 1.0, 1.0), (1.0, 0.0, 1.0), (1.0, 1.0, -1.0)])
-def test_settings_that_make_no_sense_are_refused(wrong):
-    with pytest.raises(ValueError, match='weight >= 0'):
-        TermSettings(*wrong)

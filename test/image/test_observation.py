@@ -64,18 +64,6 @@ def test_the_border_of_what_may_be_the_person_is_doubted():
     assert (sure.outline.beliefs == 1.0).all()
 
 
-def test_outline_of_holes_points_into_them():
-    mask = disc() & ~disc(radius=12)
-    outline = observe(grey(), mask).outline
-    offset = outline.pixels - [80, 60]
-    radius = np.linalg.norm(offset, axis=1)
-    hole = radius < 18
-    assert hole.sum() > 20
-    along = (offset * outline.normals).sum(1) / radius
-    assert along[hole].max() < -0.95
-    assert along[~hole].min() > 0.95
-
-
 @pytest.mark.parametrize('quarter', range(ORIENTATIONS))
 def test_edges_stand_in_the_bin_of_their_normal(quarter):
     """A dark half-plane whose normal is at quarter * 45 degrees."""
@@ -92,26 +80,6 @@ def test_edges_stand_in_the_bin_of_their_normal(quarter):
     assert np.abs(own - np.abs(signed[interior])).max() < 3.0
     # No edge of the direction across: nothing is near.
     assert across.min() >= 100
-
-
-def test_edges_far_outside_the_silhouette_belong_to_the_background():
-    image = grey()
-    image[:, 140:] = 250
-    mask = disc()
-    image[mask] = 20
-    with_silhouette = whole(observe(image, mask).evidence['edges'], 0)
-    without = whole(observe(image).evidence['edges'], 0)
-    assert without[60, 140] < 2
-    assert with_silhouette[60, 128] > 15
-    assert with_silhouette[60, 105] < 2.5
-
-
-def test_an_empty_silhouette_counts_as_unknown():
-    observation = observe(grey(), np.zeros(SIZE, dtype=bool))
-    assert observation.silhouette is None
-    assert 'coverage' not in observation.evidence
-    assert observation.outline is None
-    assert observation.evidence['edges'].values.shape == (ORIENTATIONS, *SIZE)
 
 
 @pytest.mark.parametrize(

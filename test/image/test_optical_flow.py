@@ -9,7 +9,7 @@ import pytest
 from hmt_ros.body import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.observation import observe
-from hmt_ros.image.optical_flow import SCALE, FlowTerm
+from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface_points import seen_points
 from hmt_ros.inference.energy import Derivatives
@@ -53,15 +53,6 @@ def test_the_flow_is_the_shift_between_the_images():
     flow = observe(last, last_image=first).flow
     middle = [np.median(channel[40:80, 60:100]) for channel in flow.values]
     assert middle == pytest.approx([5.0, 3.0], abs=0.5)
-
-
-def test_without_an_image_before_there_is_none(shot):
-    assert observe(shot.images[1], shot.masks[1]).flow is None
-
-
-def test_the_flow_of_a_tiny_image_is_none():
-    image = np.zeros((20, 20, 3), np.uint8)
-    assert not observe(image, last_image=image).flow.values.any()
 
 
 @pytest.mark.parametrize('lens', LENSES)
@@ -111,16 +102,6 @@ def test_where_the_points_went_costs_nothing(shot, before):
         energy_of(term, shot.body, x, camera=shot.camera).value[0] for x in (moved, pose)
     )
     assert there < 0.05 * stayed
-
-
-def test_what_others_hide_costs_what_is_usual(shot, before):
-    everything = np.ones(shot.masks[1].shape, dtype=bool)
-    flow = observe(shot.images[1], shot.masks[1], last_image=shot.images[0], others=everything).flow
-    assert np.isnan(flow.values).all()
-    term = term_of(shot, shot.camera, flow, before)
-    found = energy_of(term, shot.body, before, camera=shot.camera)
-    assert found.value == pytest.approx(WEIGHT * 0.5 / (1.0 + 1.0 / SCALE**2))
-    assert not found.gradient.any()
 
 
 def test_the_flow_is_of_the_window_around_the_person(shot, flow):

@@ -13,8 +13,6 @@ from hmt_ros.image.person_shape import (
     covered,
     largest_person,
     looks_like_person,
-    on_raster,
-    raster_step,
 )
 
 
@@ -38,13 +36,6 @@ def test_the_model_covers_what_it_shows(film, human32, camera):
         coarse = covered(human32, camera, pose, 3)
         assert coarse.shape == (80, 107)
         assert coarse.mean() == pytest.approx(mask.mean(), rel=0.2)
-
-
-def test_a_body_out_of_the_image_covers_nothing(film, human32, camera):
-    for axis, shift in ((0, 30.0), (2, -30.0)):
-        moved = film[0][0].copy()
-        moved[axis] += shift
-        assert not covered(human32, camera, moved).any()
 
 
 def test_shapes_of_persons(film):
@@ -76,19 +67,3 @@ def test_the_largest_piece_is_that_of_a_person(film):
     cut = largest_person(np.roll(half, -160, axis=1))
     assert cut is not None
     assert cut.cut
-
-
-def test_a_person_in_pieces_is_one(film):
-    mask = film[1][0].copy()
-    rows = np.flatnonzero(mask.any(1))
-    mask[rows[len(rows) // 2] - 2 : rows[len(rows) // 2] + 3] = False
-    assert largest_person(mask).area == pytest.approx(mask.sum(), rel=0.02)
-
-
-def test_rasters():
-    assert [raster_step(height) for height in (120, 240, 480, 720)] == [1, 1, 2, 3]
-    mask = np.zeros((480, 640), dtype=np.bool_)
-    mask[:, 320:] = True
-    coarse = on_raster(mask, np.zeros((240, 320), dtype=np.bool_))
-    assert coarse.dtype == np.bool_
-    assert coarse.mean() == 0.5

@@ -159,21 +159,6 @@ def test_energies_by_cue_are_those_of_the_terms(terms, poses, strange):
     assert values.energy.hessian is None
 
 
-def test_what_is_not_there_has_no_energy_of_its_own(terms, poses):
-    likelihood, (image, _, *known) = terms['all']
-    found = PoseEnergy(likelihood, tuple(known)).by_cue(poses)
-    assert found.values[:, 2].all()
-    assert not found.values[:, :2].any()
-    assert not found.hessians[:, :2].any()
-    assert found.outline_costs.shape == (COUNT, 0)
-    wanted = 'by_cue wants the terms of a whole pose alone, saw '
-    with pytest.raises(ValueError, match=f'{wanted}a motion'):
-        PoseEnergy(likelihood, (image,), motion_of(poses, 'gaussian', 37)).by_cue(poses)
-    free = np.arange(5)
-    with pytest.raises(ValueError, match=f'{wanted}variables that are fixed'):
-        PoseEnergy(likelihood, (image,), None, poses[0], free).by_cue(poses[:, free])
-
-
 @pytest.mark.parametrize('motion', ['none', 'student'])
 def test_energies_over_some_variables(terms, poses, body, motion):
     likelihood, some = terms['limb']
@@ -223,18 +208,6 @@ def test_each_pose_is_worked_on_alone(terms, poses):
             assert np.array_equal(a[0], b[n])
 
 
-def test_the_number_of_threads_does_not_matter(terms, poses):
-    likelihood, some = terms['all']
-    motion = motion_of(poses, 'gaussian', 37)
-    results = []
-    for threads in (1, 2, 4):
-        own = PoseEnergy(replace(likelihood, threads=threads), some, motion)
-        found = own.minimise(poses, max_iterations=5, **SOLVER)
-        results.append((found.x, found.value, found.hessian, *own.energy(poses)))
-    for other in results[1:]:
-        assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
 def test_a_term_without_a_kernel_is_added(terms, poses, body):
     likelihood, some = terms['image']
     own = PoseEnergy(likelihood, (*some, Strange()), motion_of(poses, 'gaussian', 37))
@@ -270,12 +243,3 @@ def test_poses_that_are_none_are_refused(terms, x, message):
         PoseEnergy(likelihood, some).energy(x)
     with pytest.raises(ValueError, match=message):
         PoseEnergy(likelihood, some).minimise(x, max_iterations=1, **SOLVER)
-
-
-def test_two_terms_of_a_kind_are_refused(terms):
-    likelihood, some = terms['image']
-    with pytest.raises(ValueError, match='at most, saw ObservedImage and ObservedImage'):
-        PoseEnergy(likelihood, (*some, *some))
-    two = (likelihood.pose_prior, terms['independent angles'][0].pose_prior)
-    with pytest.raises(ValueError, match='at most, saw MixturePrior and AnglePrior'):
-        PoseEnergy(likelihood, two)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_ros.body import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.surface_points import FACING, SurfacePoints, seen_points
 from test.oracles import numpy_likelihood as oracle
@@ -63,18 +62,6 @@ def test_points_project_to_their_pixels(shot, poses, points):
         assert (pixels < [shot.camera.width, shot.camera.height]).all()
 
 
-def test_a_lens_bends_the_pixels(shot, poses):
-    c = shot.camera
-    fisheye = Camera(
-        c.fx, c.fy, c.cx, c.cy, c.width, c.height, (0.02, -0.01, 0.003, 0.001), 'equidistant'
-    )
-    points = seen_points(shot.body, fisheye, forward(shot.body.skeleton, poses))
-    segments, local, pixels = used(points, 0)
-    places = in_space(shot.body, poses[0], segments, local)
-    assert np.abs(fisheye.project(places) - pixels).max() < 1e-9
-    assert np.abs(c.project(places) - pixels).max() > 1.0
-
-
 def test_points_face_the_camera_and_nothing_is_before_them(shot, poses, points):
     """Along the ray to a point, short of it, no other part is met."""
     body = shot.body
@@ -104,37 +91,6 @@ def test_points_face_the_camera_and_nothing_is_before_them(shot, poses, points):
             )
             normals = slopes / np.linalg.norm(slopes, axis=1)[:, None]
             assert (-(normals * at_camera).sum(1)).min() > FACING - 1e-4
-
-
-def test_few_points_are_spread_over_all(shot, poses, points):
-    """Few points are a subset of all, from the first to the last."""
-    frames = forward(shot.body.skeleton, poses)
-    everything = seen_points(shot.body, shot.camera, frames, points=5000)
-    assert (everything.counts < 1000).all()
-    few = seen_points(shot.body, shot.camera, frames, points=20)
-    for k in range(3):
-        total = everything.counts[k]
-        assert total >= 120
-        for coarse, count in ((few, 20), (points, 120)):
-            assert coarse.counts[k] == count
-            picked = np.arange(count) * total // count
-            for a, b in zip(used(coarse, k), used(everything, k)):
-                assert np.array_equal(a, b[picked])
-
-
-def test_each_pose_is_seen_by_itself(shot, poses, points):
-    for k, pose in enumerate(poses):
-        alone = seen_points(shot.body, shot.camera, forward(shot.body.skeleton, pose[None]))
-        assert all(np.array_equal(a[0], b[k]) for a, b in zip(alone, points))
-
-
-def test_of_nobody_in_the_image_nothing_is_seen(shot, poses):
-    away = poses.copy()
-    away[0, 0] += 50.0
-    away[1, 2] = -3.0
-    points = seen_points(shot.body, shot.camera, forward(shot.body.skeleton, away))
-    assert points.counts[0] == points.counts[1] == 0
-    assert points.counts[2] == 120
 
 
 def test_what_others_hide_is_not_seen(shot, poses, points):

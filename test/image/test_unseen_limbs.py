@@ -71,20 +71,6 @@ def test_legs_without_keypoints_leave_the_pelvis_free_to_turn(body, pose):
     assert not any(x.startswith(('root', 'neck')) or 'elbow' in x for x in found)
 
 
-def test_keypoints_outside_the_image_and_guesses_show_nothing(body, pose):
-    whole = keypoints(body, pose)
-    knees = int(whole.pixels[body.joint_names.index('left_knee'), 1])
-    cut = unseen_after(body, pose, camera_to(knees - 5), Observation(keypoints=whole))
-    assert cut >= {'left_hip_x', 'right_hip_x', 'left_knee'}
-    guessed = keypoints(body, pose, confidence=0.01)
-    assert 'left_hip_x' in unseen_after(body, pose, camera_to(240), Observation(keypoints=guessed))
-
-
-def test_without_keypoints_a_limb_in_the_image_is_shown(body, pose):
-    assert unseen_after(body, pose, camera_to(240), Observation()) == set()
-    assert 'left_knee' in unseen_after(body, pose, camera_to(150), Observation())
-
-
 def test_times_add_up_until_the_limb_is_shown_again(body, pose):
     limbs, camera = UnseenLimbs(body), camera_to(240)
     whole = Observation(keypoints=keypoints(body, pose))

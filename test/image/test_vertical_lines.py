@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera
-from hmt_ros.image.vertical_lines import seen_vertical, straight_lines, vertical_of
+from hmt_ros.image.vertical_lines import seen_vertical
 from test.image.drawn_rooms import ROOM_CAMERA as CAMERA
 from test.image.drawn_rooms import drawn, room, turn
 
@@ -68,27 +68,6 @@ def test_clutter_shows_none(count):
         grey = int(rng.integers(0, 255))
         cv2.line(image, tuple(map(int, place)), tuple(map(int, end)), (grey, grey, grey), 2)
     assert seen_vertical(image, CAMERA) is None
-
-
-def test_lines_are_counted_once_and_longest_first():
-    image = np.full((480, 640), 128, np.uint8)
-    cv2.line(image, (100, 50), (100, 400), 255, 3)
-    cv2.line(image, (300, 100), (420, 180), 255, 3)
-    lines = straight_lines(image, CAMERA)
-    # Both sides of the first, 3 px apart, are one line.
-    assert len(lines.normals) == 2
-    assert (np.diff(lines.errors) > 0).all()
-    assert np.linalg.norm(lines.normals, axis=1) == pytest.approx(1.0)
-    assert np.abs(lines.normals[0] @ [1.0, 0.0, 0.0]) > 0.9
-    assert vertical_of(lines) is None  # too few to tell
-
-
-def test_large_images_tell_the_same():
-    large = Camera(1575.0, 1575.0, 959.5, 719.5, 1920, 1440)
-    rotation = turn(np.radians(18.0), np.radians(2.0))
-    found = seen_vertical(drawn(room(), rotation, large), large)
-    assert found is not None
-    assert angle(found.up, rotation) < 1.0
 
 
 def test_the_same_image_gives_the_same_bytes():

@@ -385,11 +385,6 @@ class Executable:
         insisting.join()
         return lines
 
-    def refusal(self):
-        """The only line of a node that does not start."""
-        output, _ = self.process.communicate(timeout=PATIENCE)
-        return only_line(self.process.returncode, output)
-
 
 @pytest.fixture
 def executable():

@@ -1,15 +1,10 @@
 """The BME node itself, over DDS."""
 
-from pathlib import Path
-
 import pytest
 
 from hmt_ros.sessions.bme_parameters import BmeParameters
 
 pytestmark = pytest.mark.ros
-
-ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / 'hmt_ros' / 'config' / 'bme_node.yaml'
 
 
 @pytest.fixture
@@ -74,35 +69,3 @@ def test_parameters_are_those_of_the_file(running):
     assert running.set(max_hypotheses=1, queue_size=3) == (True, '')
     assert running.session.parameters.max_hypotheses == 1
     assert running.limit('image') == 3
-
-
-def test_diagnostics(world, somebody):
-    from hmt_msgs.msg import PoseMixture
-    from hmt_msgs.srv import PredictPose
-
-    one = world(background_file='').start()
-    answer = one.call(PredictPose, 'predict_pose', image=one.of_ros(somebody.image(0)))
-    assert 'no calibrated camera_info' in answer.message
-    assert one.diagnosis()[:2] == (1, 'waits for a calibrated camera_info')
-    one.send('camera_info', somebody.info())
-    found = one.hear({'pose_prediction': PoseMixture})['pose_prediction']
-    for index in range(16):
-        one.send('image', somebody.empty(index))
-        one.spin_until(lambda count=index: len(found) > count)
-    one.send('image', somebody.image(16))
-    one.spin_until(lambda: 'predicting' in one.diagnostics[-1].status[0].message)
-    _, _, values = one.diagnosis()
-    assert one.diagnostics[-1].status[0].name == 'bme_node: prediction'
-    assert values['images without a person'] == '16'
-    assert values['height of the silhouette, px'] == '24'
-
-
-def test_a_model_that_is_none_is_told(tmp_path, world_of):
-    from hmt_ros.nodes.bme_node import BmeNode
-
-    path = tmp_path / 'model.npz'
-    path.write_bytes(b'garbage')
-    one = world_of(BmeNode, 'bme_node', {}, model_file=str(path))
-    one.node.start()
-    (text,) = one.errors()
-    assert text.startswith(f'{path}: ')

@@ -83,7 +83,7 @@ def test_a_file_is_shown_at_its_rate_with_the_calibration_of_its_view(shown):
     assert (camera.width, camera.height) == (320, 240)
     assert camera.fx == pytest.approx(160 / np.tan(np.radians(30)))
     assert {message.header.frame_id for message in [*images, *infos]} == {'camera_optical_frame'}
-    assert 'walk.mp4: 8 images shown' in said
+    assert 'walk.mp4: 8 images shown; the file is over' in said
     assert 'assumed' not in said
 
 
@@ -121,11 +121,6 @@ def test_a_mirrored_file_is_refused(walk_video, tmp_path, ended):
     code, _, errors = ended('camera_node', str(path), '--fov', '60')
     assert code == 1
     assert f'{path}: its metadata mirror the images; write them as players show them' in errors
-
-
-def test_the_end_of_a_file_is_told(shown):
-    _, said = shown('--fov', '60')
-    assert 'walk.mp4: 8 images shown; the file is over' in said
 
 
 # A lifecycle node that activates itself late, in a process of its own.

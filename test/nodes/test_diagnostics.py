@@ -36,12 +36,6 @@ def best_effort():
     return QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def transient_local():
-    from rclpy.qos import DurabilityPolicy, QoSProfile
-
-    return QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
 def test_publisher_that_does_not_fit_is_one_warning_with_topic_and_policy(smoother):
     from hmt_msgs.msg import PoseMixture
 
@@ -69,17 +63,6 @@ def test_publisher_that_does_not_fit_is_one_warning_with_topic_and_policy(smooth
         smoother.other.destroy_publisher(publisher)
 
 
-def test_subscription_that_does_not_fit_is_one_warning(smoother):
-    from hmt_msgs.msg import PoseMixture
-
-    smoother.listen(PoseMixture, 'smoothed_pose_mixture', [], transient_local())
-    key = 'subscriptions to /smoothed_pose_mixture with another durability'
-    smoother.spin_until(lambda: smoother.diagnosis()[2].get(key) == '1', 'the event')
-    (text,) = smoother.warnings()
-    assert text.splitlines()[0].endswith('counted in /diagnostics)')
-    assert text.startswith('/smoothed_pose_mixture: a subscription asks for another durability')
-
-
 def test_lost_messages_are_told_once_and_counted():
     from hmt_ros.nodes.diagnostics import MiddlewareEvents
 
@@ -101,41 +84,6 @@ def test_lost_messages_are_told_once_and_counted():
     ]
 
 
-def test_other_types_and_unknown_policies_are_told():
-    from hmt_ros.nodes.diagnostics import MiddlewareEvents
-
-    texts = []
-    events = MiddlewareEvents(texts.append)
-    event = SimpleNamespace(total_count_change=1, last_policy_kind=12345)
-    events.of_subscription('/a').incompatible_type(event)
-    events.of_publisher('/b').incompatible_type(event)
-    events.of_publisher('/b').incompatible_qos(event)
-    events.of_subscription('/a').incompatible_qos(event)
-    assert [text.partition(',')[0] for text in texts] == [
-        '/a: a publisher has another type',
-        '/b: a subscription has another type',
-        '/b: a subscription asks for another policy 12345 than is offered',
-        '/a: a publisher offers another policy 12345 than is asked for',
-    ]
-    one = SimpleNamespace(topic_name='/a', get_publisher_count=lambda: 0)
-    fits = SimpleNamespace(topic_name='/a', get_publisher_count=lambda: 1)
-    text = '/a: publishers offer another policy 12345 than is asked for'
-    assert [events.deaf_topic([each]) for each in (one, fits)] == [text, '']
-    events.forget()
-    assert events.deaf_topic([one]) == ''
-
-
-def test_lost_messages_are_in_the_diagnostics(running, small_camera):
-    running.own_periods()
-    running.send('camera_info', small_camera.info())
-    running.send('image', small_camera.image(0))
-    running.event('/image', 'MESSAGE_LOST', total_count_change=4)
-    level, message, values = running.diagnosis()
-    assert (level, message) == (1, '4 messages lost on their way in a second')
-    assert values['messages lost of /image'] == '4'
-    assert running.warnings()[0].startswith('/image: 4 messages were lost on their way')
-
-
 def test_silence_is_told(running, small_camera):
     running.send('camera_info', small_camera.info())
     running.send('image', small_camera.image(0))
@@ -148,19 +96,6 @@ def test_silence_is_told(running, small_camera):
     assert running.diagnosis()[0] == 1
     running.send('image', small_camera.image(1))
     running.spin_until(lambda: running.diagnosis()[:2] == (0, 'tracking, 2 modes'), 'an end')
-
-
-def test_errors_of_the_node_itself_are_in_the_diagnostics(running, small_camera, stub_tracker):
-    running.send('camera_info', small_camera.info())
-    running.send('image', small_camera.image(0))
-    assert running.diagnosis()[2]['errors of the node itself'] == '0'
-    stub_tracker.fault = TypeError('a fault of ours')
-    # Whoever waits for an answer gets one.
-    handled = running.send('image', small_camera.image(1))
-    assert handled.faults == ('the node itself failed: TypeError: a fault of ours',)
-    values = running.diagnosis()[2]
-    assert values['errors of the node itself'] == '1'
-    assert values['last error of the node itself'] == 'TypeError: a fault of ours'
 
 
 def status_lines(world):

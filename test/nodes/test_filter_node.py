@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.sessions.camera_session import MOST_INCOMPLETE
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools.messages.cdr import serialise
 from test.nodes.conftest import PATIENCE, only_line
@@ -213,16 +212,6 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera, stu
     assert values['faults: mask'] == '2'
 
 
-def test_bytes_that_are_no_message(running, small_camera):
-    running.send('camera_info', small_camera.info())
-    data = serialise(small_camera.image(0))
-    count = len(running.handled)
-    running.receive('image', data[:60])
-    running.spin_until(lambda: len(running.handled) > count)
-    assert faults(running.handled[-1])[0].startswith('message of image can not be read: ')
-    assert faults(running.send('image', small_camera.image(1))) == []
-
-
 def test_faults_of_our_own_do_not_end_the_node(running, small_camera, stub_tracker):
     running.send('camera_info', small_camera.info())
     running.send('image', small_camera.image(0))
@@ -232,6 +221,9 @@ def test_faults_of_our_own_do_not_end_the_node(running, small_camera, stub_track
     assert len(running.warnings()) == 1
     assert 'TypeError: a fault of ours' in running.warnings()[0]
     assert 'Traceback' in running.warnings()[0]
+    values = running.diagnosis()[2]
+    assert values['errors of the node itself'] == '1'
+    assert values['last error of the node itself'] == 'TypeError: a fault of ours'
     stub_tracker.fault = None
     assert faults(running.send('image', small_camera.image(2))) == []
     assert len(stub_tracker.made) == 2
@@ -291,28 +283,6 @@ def test_node_without_its_subject_lives(world, subject_file, small_camera):
     one.connect()
     one.send('camera_info', small_camera.info())
     assert published(one.send('image', small_camera.image(0))) == STARTS
-
-
-def test_reset_counts_though_the_node_is_deactivated(world, small_camera, held_estimate):
-    from hmt_msgs.srv import Reset
-
-    begun, go = held_estimate
-    one = world().start()
-    one.send('camera_info', small_camera.info())
-    one.publishers['image'].publish(serialise(small_camera.image(0)))
-    one.spin_until(begun.is_set, 'the estimate of the first image')
-    session, before = one.session, one.session.start
-    answers = [one.call(Reset, 'reset') for _ in range(3)]
-    assert all(answer.success for answer in answers)
-    # Several wait as one, the last.
-    assert len(one.estimator.queue) == 1
-    one.publishers['image'].publish(serialise(small_camera.image(1)))
-    one.spin_until(lambda: len(one.estimator.queue) == 2)
-    threading.Timer(0.3, go.set).start()
-    assert one.change_state('deactivate')
-    assert session.start is not before
-    assert session.state.status == 'waiting'
-    assert session.state.counts == {'received': 2, 'tracked': 1, 'dropped': 1}
 
 
 def test_reset(running, small_camera, stub_tracker, subject_file, body):
@@ -394,18 +364,6 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     assert level in (0, 1)
 
 
-def test_what_images_waited_for_comes_before_that_they_are_late(world, small_camera):
-    one = world(use_keypoints=True, input_timeout=60.0).start()
-    one.send('camera_info', small_camera.info())
-    told = 'waits for keypoints; late: 3 images dropped in a second'
-    end_period = one.own_periods()
-    for index in range(MOST_INCOMPLETE + 3):
-        one.send('image', small_camera.image(index))
-    end_period()
-    one.spin_until(lambda: any(d.status[0].message == told for d in one.diagnostics), told)
-    assert one.session.state.counts['dropped'] == 3
-
-
 def test_late_node_goes_on_with_the_newest_complete_image(
     world, small_camera, stub_tracker, held_estimate
 ):
@@ -468,32 +426,6 @@ def test_diagnostics(running, small_camera):
     assert {'latency, mean, ms', 'images tracked a second', 'last fault'} <= values.keys()
 
 
-def informed(one, *parts):
-    """Whether the node has logged one line of information for each of some parts, and no more."""
-    one.warnings()
-    lines = re.findall(r'^\[INFO\] \[[0-9.]+\] \[filter_node\]: (.*)$', one.logged, re.M)
-    return [sum(part in line for line in lines) for part in parts] == len(parts) * [1]
-
-
-def test_a_track_leaves_lines_in_the_log(running, small_camera, stub_tracker):
-    from hmt_msgs.srv import Reset
-
-    running.own_periods()
-    running.send('camera_info', small_camera.info())
-    stub_tracker.empty |= {small_camera.stamp(2), small_camera.stamp(3)}
-    for index in range(6):
-        running.send('image', small_camera.image(index))
-    start = 'track 1 starts from what was given at the image of'
-    wanted = (start, 'nobody in view at the image of', 'track 2 starts')
-    assert informed(running, *wanted)
-    assert running.call(Reset, 'reset').success
-    running.send('image', small_camera.image(6))
-    text = '~/reset: a new track waits for an image'
-    running.spin_until(lambda: informed(running, text), text)
-    (warning,) = running.warnings()
-    assert 'were seen 0.6 s before' in warning
-
-
 # The executable.
 
 
@@ -536,28 +468,6 @@ def test_wrong_arguments_are_one_line(arguments, message, ended):
     line = only_line(code, output + errors)
     assert line.startswith('filter_node: ')
     assert message in line
-
-
-def test_an_empty_view_is_a_warning_and_no_error(running, small_camera, stub_tracker):
-    from hmt_msgs.msg import PoseMixture
-    from visualization_msgs.msg import Marker, MarkerArray
-
-    mixtures, markers = running.hear({'pose_mixture': PoseMixture, 'markers': MarkerArray}).values()
-    running.send('camera_info', small_camera.info())
-    stub_tracker.empty |= {small_camera.stamp(index) for index in (1, 2)}
-    outcomes = [published(running.send('image', small_camera.image(i))) for i in range(4)]
-    assert outcomes[1:] == [['pose_mixture', 'markers'], [], ['pose_mixture', 'markers']]
-    running.spin_until(lambda: len(mixtures) == len(markers) == 3)
-    assert [len(message.components) for message in mixtures] == [2, 0, 2]
-    assert {marker.action for marker in markers[1].markers} == {Marker.DELETE}
-    told = [
-        (status.level[0], status.message)
-        for array in running.diagnostics
-        for status in array.status
-        if {x.key: x.value for x in status.values}.get('status') == 'nobody'
-    ]
-    assert set(told) == {(1, 'nobody in view')}
-    assert running.diagnosis()[2]['track'] == '2'
 
 
 def test_robots_are_told_that_no_image_is_answered(world, small_camera):

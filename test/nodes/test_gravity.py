@@ -73,49 +73,6 @@ def test_gravity_of_a_frame(world, small_camera, stub_tracker):
     assert one.session.state.faults == {}
 
 
-def test_without_the_frame_nobody_listens(world, small_camera):
-    one = world(gravity=[0, 1, 0]).start()
-    assert one.node.count_subscribers('/tf') == one.node.count_subscribers('/tf_static') == 0
-    one.send('camera_info', small_camera.info())
-    assert one.send('image', small_camera.image(0)).warnings == ()
-    # Takes effect when the node is configured the next time.
-    assert one.set(gravity_frame='map') == (True, '')
-    assert one.node.count_subscribers('/tf') == 0
-
-
-def test_parameters_of_the_ground(world, stub_tracker, small_camera):
-    one = world(gravity=[0.0, 0.0, 9.81], camera_height=2.0).start()
-    one.assert_refused(
-        ({'gravity': [0.0, 0.0, 0.0]}, 'gravity must be three finite numbers, not all zero'),
-        ({'gravity': [1.0, 2.0]}, 'saw [1.0, 2.0]'),
-        ({'gravity': 'down'}, "gravity must be a list of numbers, saw 'down'"),
-        ({'gravity': ['down']}, "must be a list of numbers, saw ['down']"),
-        ({'camera_height': -1.0}, 'camera_height'),
-        ({'floor_in_gravity_frame': True}, 'needs the name of gravity_frame'),
-    )
-    one.send('camera_info', small_camera.info())
-    one.send('image', small_camera.image(0))
-    assert stub_tracker.made[0].known_ground.camera_height == 2.0
-    np.testing.assert_array_equal(stub_tracker.made[0].known_ground.up, [0.0, 0.0, -1.0])
-    for value, up in (([0, 2, 0], [0.0, -1.0, 0.0]), ([], None)):
-        assert one.set(gravity=value) == (True, '')
-        assert one.session.parameters.known_ground.up is None or up is not None
-        assert list(one.session.parameters.gravity) == [float(x) for x in value]
-
-
-def test_missing_frames_are_told_once(world, small_camera):
-    one = world(gravity_frame='map', input_timeout=0.0).start()
-    one.send('camera_info', small_camera.info())
-    one.send('tf_static', camera_place(0, 'world'))
-    for index in range(3):
-        one.send('image', small_camera.image(index))
-    one.spin_until(lambda: len(one.warnings()) == 1)
-    (warning,) = one.warnings()
-    assert "no transform from gravity_frame 'map' to 'lens'" in warning
-    assert "there is no frame 'map'; there are: lens, world" in warning
-    assert one.session.state.faults == {'no transform': 2}
-
-
 def test_no_value_is_an_empty_list_and_the_parameter_stays(world):
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
     from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
@@ -137,15 +94,3 @@ def test_no_value_is_an_empty_list_and_the_parameter_stays(world):
         [],
     )
     assert one.set(gravity=[0.0, 2.0, 0.0]) == (True, '')
-
-
-def test_an_empty_list_of_a_file_is_one_to_ros(world, tmp_path):
-    from hmt_ros.nodes.filter_node import FilterNode
-
-    context, file = world().node.context, tmp_path / 'given.yaml'
-    file.write_text('/**:\n  ros__parameters:\n    gravity: []\n', 'utf-8')
-    node = FilterNode(context=context, cli_args=['--ros-args', '--params-file', str(file)])
-    assert node.get_parameter('gravity').value == []
-    assert node.set_parameters([node.get_parameter('gravity')])[0].successful
-    assert node.get_parameter('gravity').value == []
-    node.destroy_node()

@@ -117,28 +117,6 @@ def test_people_come_and_go(installed, world_of, small_camera, likelihoods):
     one.assert_described(HriParameters())
 
 
-def test_people_who_are_gone_make_room(installed, world_of, monkeypatch):
-    from hmt_msgs.msg import PoseMixture as PoseMixtureMessage
-    from sensor_msgs.msg import CameraInfo
-
-    from hmt_ros.nodes import hri_node
-
-    monkeypatch.setattr(hri_node, '_MOST_TOPICS', 2)
-    one = world_of(hri_node.HriNode, 'hri_node', {'camera_info': CameraInfo}, publish_cropped=False)
-    one.start()
-    first, second = (
-        one.other.create_publisher(PoseMixtureMessage, f'/humans/bodies/{name}/pose_mixture', 100)
-        for name in 'ab'
-    )
-    one.spin_until(first.get_subscription_count, 'a subscription')
-    one.spin_until(lambda: one.warnings(), 'a warning')
-    (text,) = one.warnings()
-    assert text.startswith('2 topics are subscribed to, which is the limit')
-    assert 'mixtures in /humans/bodies/b are left out' in text
-    one.other.destroy_publisher(first)
-    one.spin_until(second.get_subscription_count, 'a subscription to the other')
-
-
 @pytest.fixture
 def without_hri(monkeypatch):
     """A node that publishes nothing, and needs no hri_msgs."""
@@ -166,27 +144,6 @@ def test_a_person_is_subscribed_to_once(without_hri, world_of, monkeypatch):
     one.spin_until(lambda: one.other.count_subscribers(TOPIC) == 0, 'an end')
     assert one.other.count_subscribers(TOPIC.replace('p1', 'p2')) == 1
     assert one.warnings() == []
-
-
-def test_namespaces_that_are_named(installed, world_of, likelihoods):
-    from hmt_msgs.msg import PoseMixture as PoseMixtureMessage
-    from hri_msgs.msg import IdsList
-
-    from hmt_ros.nodes.hri_node import HriNode
-
-    inputs = {'pose_mixture': PoseMixtureMessage, TOPIC[1:]: PoseMixtureMessage}
-    one = world_of(HriNode, 'hri_node', inputs, namespaces='/', publish_cropped=False)
-    one.node.start()
-    one.spin_until(one.publishers['pose_mixture'].get_subscription_count, 'a subscription')
-    ids = []
-    one.listen(IdsList, '/humans/bodies/tracked', ids)
-    one.spin_until(lambda: one.is_heard('/humans/bodies/tracked'))
-    one.spin_until(lambda: one.is_heard('hri_node/handled'))
-    one.send('pose_mixture of /', mixture(likelihoods, 0), 'pose_mixture')
-    one.spin_until(lambda: ids)
-    assert list(ids[0].ids) == ['body_1']
-    assert one.other.count_subscribers(TOPIC) == 0
-    one.assert_refused(({'namespaces': 'p1'}, "saw 'p1'"))
 
 
 def test_a_package_that_is_not_installed_is_told(world_of):

@@ -84,8 +84,7 @@ def test_people_of_yolo_msgs(world, small_camera, stub_tracker):
     assert (keypoints.names, keypoints.pixels[0, 0]) == (('head',), 9.0)
 
 
-@pytest.mark.parametrize('node', ['filter_node', 'bme_node'])
-@pytest.mark.parametrize('source', ['skeleton2d', 'yolo'])
+@pytest.mark.parametrize(('node', 'source'), [('filter_node', 'yolo'), ('bme_node', 'skeleton2d')])
 def test_a_package_that_is_not_installed_is_told(world_of, node, source):
     package = SOURCES[source].partition('/')[0]
     if find_spec(package) is not None:

@@ -16,7 +16,6 @@ from test.sessions.test_keypoints_session import STUB
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / 'hmt_ros' / 'config' / 'keypoints_node.yaml'
 CLIP = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video' / 'wander'
 
 
@@ -100,10 +99,3 @@ def test_mediapipe_pose_itself(world, mediapipe_pose):
     _, _, _, height = cv2.boundingRect(mask)
     seen = pixels[0]
     assert height == pytest.approx(np.ptp(seen[:, 1]), rel=0.3)
-
-
-def test_ends_cleanly(executable, mediapipe_pose):
-    node = executable('keypoints_node', '--params-file', str(CONFIG))
-    *others, _ = node.stop_at('images from /image')
-    # What runs the networks says that it does.
-    assert all(line.startswith('INFO: Created TensorFlow Lite') for line in others)

@@ -7,18 +7,6 @@ import pytest
 pytestmark = pytest.mark.ros
 
 
-def test_unknown_names_are_told_with_the_nearest():
-    from hmt_ros.nodes.node_parameters import unknown_parameters
-
-    known = ['max_hypotheses', 'dynamics.model', 'camera_height']
-    given = ['max_hypothesis', 'dynamic.model', 'camera_height', 'zzz']
-    assert unknown_parameters(given, known) == [
-        "unknown parameter 'dynamic.model'; did you mean 'dynamics.model'?",
-        "unknown parameter 'max_hypothesis'; did you mean 'max_hypotheses'?",
-        "unknown parameter 'zzz', it is ignored",
-    ]
-
-
 def test_unknown_names_from_command_line_and_file(world_of, stub_tracker, tmp_path):
     from hmt_ros.nodes.filter_node import FilterNode
 
@@ -69,26 +57,6 @@ def test_a_file_whose_sections_do_not_match(section, meant, tmp_path):
         assert texts[0].startswith(f'{file}: {wanted}: none is used; name the section ')
 
 
-def test_namespaces_of_a_file(tmp_path):
-    """The patterns match as those of ROS: a nested section, a namespace, wildcards for parts."""
-    from hmt_ros.nodes.node_parameters import files_for_others
-
-    file = tmp_path / 'own.yaml'
-    matching = {
-        'a/b/filter_node': ['/a/b/filter_node', '/**/filter_node', '/a/**', '/a/*/filter_node'],
-        'filter_node': ['filter_node', '/*', '/**/*'],
-    }
-    others = {'a/b/filter_node': ['/a/filter_node', '/*/filter_node', 'filter_node']}
-    for wanted, count in ((matching, 0), (others, 1)):
-        for node, sections in wanted.items():
-            for section in sections:
-                file.write_text(f'{section!r}: {{ros__parameters: {{use_mask: true}}}}\n')
-                texts = files_for_others(['--params-file', str(file)], f'/{node}')
-                assert len(texts) == count, (node, section)
-    file.write_text('a: {b: {filter_node: {ros__parameters: {use_mask: true}}}}\n')
-    assert files_for_others(['--params-file', str(file)], '/a/b/filter_node') == []
-
-
 def test_unknown_names_and_a_file_for_another_namespace_are_told_by_the_node(executable, tmp_path):
     file = tmp_path / 'own.yaml'
     file.write_text('/p1/filter_node:\n  ros__parameters:\n    use_mask: true\n')
@@ -105,7 +73,6 @@ def test_unknown_names_and_a_file_for_another_namespace_are_told_by_the_node(exe
         ({}, False),
         ({'use_sim_time': True}, True),
         ({'use_sim_time': True, 'reset_on_time_jump': False}, False),
-        ({'reset_on_time_jump': True}, True),
     ],
 )
 def test_a_jump_of_simulated_time_resets_unless_told_otherwise(world_of, values, resets):

@@ -10,7 +10,7 @@ import pytest
 
 from hmt_ros.sessions.image_inputs import PREDICTION
 from msg_tools.messages.cdr import serialise
-from test.nodes.conftest import PATIENCE, only_line
+from test.nodes.conftest import PATIENCE
 
 pytestmark = pytest.mark.ros
 
@@ -267,8 +267,3 @@ def test_the_command_line(words, text, ended):
     code, output, errors = ended('person_node', *words)
     assert code == (0 if '--help' in words else 2)
     assert text in output + errors
-
-
-def test_ros_arguments_that_are_wrong_end_it(ended):
-    code, output, errors = ended('person_node', 'smoother_node', '--ros-args', '-p', 'method:=7')
-    assert only_line(code, output + errors).startswith('person_node: ')

@@ -67,15 +67,6 @@ def test_the_reason_and_what_there_is_instead(transport, published, end):
     assert silent(transport, *published) == f'nothing on /image (sensor_msgs/Image){end}'
 
 
-def test_raw_images_instead_of_compressed_ones():
-    text = silent('compressed', ('/a/image', RAW), name='/a/image/compressed')
-    assert text == (
-        'nothing on /a/image/compressed (sensor_msgs/CompressedImage); nobody publishes it; '
-        'there is /a/image (sensor_msgs/Image): set image_transport to raw and remap with -r '
-        'image:=/a/image'
-    )
-
-
 @pytest.fixture
 def world(stub_tracker, subject_file, world_of):
     """A filter to which nobody publishes, and the warnings that a topic is named in."""
@@ -119,22 +110,6 @@ def test_nobody_publishes(world):
     one.other.destroy_publisher(elsewhere)
 
 
-def test_images_of_our_own_nodes_are_not_those_of_a_camera(world):
-    from hmt_msgs.msg import Handled
-    from sensor_msgs.msg import Image
-
-    one = world()
-    made = [
-        one.other.create_publisher(Handled, '/other/handled', 5),
-        one.other.create_publisher(Image, '/silhouette', 5),
-    ]
-    one.patience(0.5)
-    one.spin_until(lambda: of_topic(one, '/image'), 'the warning')
-    assert not any('silhouette' in text for text in of_topic(one, '/image'))
-    for publisher in made:
-        one.other.destroy_publisher(publisher)
-
-
 def test_what_arrives_is_not_told(world, small_camera):
     one = world({'image': RAW, 'camera_info': INFO})
     one.own_periods()
@@ -152,41 +127,3 @@ def test_what_arrives_is_not_told(world, small_camera):
     silent.arrived('image', long_ago)
     one.diagnosis()
     assert len(of_topic(one, '/image')) == 1
-
-
-def test_keypoints_that_are_wanted_and_do_not_come(world, small_camera):
-    one = world({'image': RAW, 'camera_info': INFO}, use_keypoints=True, input_timeout=0.05)
-    one.send('camera_info', small_camera.info())
-    one.patience(0.5)
-    index = 0
-    while not of_topic(one, '/keypoints'):
-        one.send('image', small_camera.image(index))
-        index += 1
-        assert index < 500
-        one.executor.spin_once(timeout_sec=0.05)
-    assert of_topic(one, '/keypoints')[0] == (
-        'nothing on /keypoints (hmt_msgs/Keypoints2D); nobody publishes it'
-    )
-    # Nobody wants masks.
-    assert of_topic(one, '/mask') == []
-
-
-def test_a_publisher_that_sends_nothing(world):
-    one = world({'image': RAW})
-    one.patience(0.5)
-    one.spin_until(
-        lambda: any(
-            '/other publishes it, but no message has come' in t for t in of_topic(one, '/image')
-        ),
-        'the warning',
-    )
-    assert one.diagnosis()[0] == 1
-
-
-def test_a_node_that_does_not_listen_misses_nothing(world):
-    one = world()
-    assert one.change_state('deactivate')
-    one.patience(0.0)
-    for _ in range(2):
-        one.diagnosis()
-    assert [text for text in one.warnings() if text.startswith('nothing on')] == []

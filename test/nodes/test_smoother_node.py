@@ -1,7 +1,6 @@
 """The smoother node itself, over DDS."""
 
 import time
-from pathlib import Path
 
 import pytest
 
@@ -13,8 +12,6 @@ from msg_tools.messages.headers import time_ns
 
 pytestmark = pytest.mark.ros
 
-ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / 'hmt_ros' / 'config' / 'smoother_node.yaml'
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 
 
@@ -95,18 +92,6 @@ def test_parameters_are_those_of_the_file(running):
     assert running.limit('likelihood_mixture') == 3
 
 
-def test_diagnostics(world, likelihoods):
-    one = world().start()
-    assert one.diagnosis()[:2] == (1, 'waits for likelihood_mixture')
-    one.send('likelihood_mixture', likelihoods.message(0))
-    one.spin_until(lambda: 'smoothing' in one.diagnostics[-1].status[0].message)
-    _, _, values = one.diagnosis()
-    assert one.diagnostics[-1].status[0].name == 'smoother_node: smoothing'
-    assert (values['lifecycle'], values['status']) == ('active', 'smoothing')
-    assert values['poses in the window'] == '1'
-    assert {'latency, mean, ms', 'mixtures smoothed a second', 'last fault'} <= values.keys()
-
-
 def test_windows_are_smoothed_on_demand(running, likelihoods, monkeypatch):
     from builtin_interfaces.msg import Time
     from hmt_msgs.srv import SmoothWindow
@@ -140,23 +125,6 @@ def test_windows_are_smoothed_on_demand(running, likelihoods, monkeypatch):
     assert running.session.state.counts['smoothed'] == 24
 
 
-def test_lifecycle(world, likelihoods):
-    from hmt_msgs.srv import SmoothWindow
-
-    one = world(autostart=False)
-    one.node.start()
-    assert one.state == 'unconfigured'
-    assert one.change_state('configure')
-    assert not one.call(SmoothWindow, 'smooth_window').success
-    assert one.change_state('activate')
-    one.connect()
-    assert one.send('likelihood_mixture', likelihoods.message(0)).faults == ()
-    assert one.change_state('deactivate')
-    assert one.change_state('cleanup')
-    assert one.session is None
-    assert one.state == 'unconfigured'
-
-
 def test_queue_holds_what_was_published(running, likelihoods):
     """Mixtures that come while one is smoothed wait."""
     data = serialise(likelihoods.message(0))
@@ -167,11 +135,3 @@ def test_queue_holds_what_was_published(running, likelihoods):
     first, second = running.handled[-2:]
     assert 'message of likelihood_mixture can not be read' in first.faults[0]
     assert second.faults == ()
-
-
-def test_parameter_file_reaches_the_node(tmp_path, executable):
-    path = tmp_path / 'smoother.yaml'
-    path.write_text(CONFIG.read_text().replace('fixed_lag: 0.5', 'fixed_lag: -7.0'))
-    line = executable('smoother_node', '--params-file', str(path)).refusal()
-    assert line.startswith('smoother_node: ')
-    assert 'fixed_lag' in line

@@ -274,11 +274,6 @@ class Somebody(SmallCamera):
         picture[12:36, left : left + 10] = 250
         return picture
 
-    def at_the_border(self, index):
-        picture = np.full((48, 64, 3), 90, np.uint8)
-        picture[12:36, :8] = 250
-        return image_message(self.messages, picture, self.stamp(index), 'lens')
-
     def empty(self, index):
         wall = np.full((48, 64, 3), 90, np.uint8)
         return image_message(self.messages, wall, self.stamp(index), 'lens')

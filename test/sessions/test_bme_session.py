@@ -8,7 +8,6 @@ import pytest
 from hmt_ros.body import Camera, load_body
 from hmt_ros.image.empty_scene import UNSEEN
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions import bme_session
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import SILHOUETTE, TOPICS, TRACK, BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
@@ -87,15 +86,6 @@ def test_nobody_is_a_prediction_without_components(session, outputs, somebody, s
     assert stub_predictor.asked == []
 
 
-def test_low_silhouettes_are_nobody(session, outputs, somebody, monkeypatch):
-    monkeypatch.setattr(bme_session, 'LEAST_HEIGHT', 25)
-    one = session()
-    one.take(CAMERA_INFO, somebody.info())
-    one.take(IMAGE, somebody.image(0))
-    assert len(predictions(outputs)[0].components) == 0
-    assert one.state.height == 24
-
-
 def test_background_is_learned_from_an_empty_scene(session, outputs, somebody):
     """Somebody who is in view from the first image on is not taken for it."""
     one = session(background_file='')
@@ -161,13 +151,6 @@ def test_rule_one_needs_a_model_of_it(session, stub_predictor):
         session(propagation='rule')
 
 
-def test_at_most_so_many_components(session, outputs, somebody):
-    one = session(max_hypotheses=1)
-    one.take(CAMERA_INFO, somebody.info())
-    one.take(IMAGE, somebody.image(0))
-    assert len(predictions(outputs)[0].components) == 1
-
-
 def test_known_stature_narrows_the_depth(session, somebody, stub_predictor):
     for values in ({}, {'stature': 1.9}):
         one = session(**values)
@@ -175,71 +158,6 @@ def test_known_stature_narrows_the_depth(session, somebody, stub_predictor):
         one.take(IMAGE, somebody.image(0))
     (_, _, unknown), (_, _, known) = stub_predictor.asked
     assert known < unknown / 2
-
-
-def test_what_is_strange_about_a_silhouette_is_told_once(session, somebody):
-    one = session()
-    one.take(CAMERA_INFO, somebody.info())
-    warnings = [one.take(IMAGE, somebody.at_the_border(index)).warnings for index in range(2)]
-    assert warnings == [(f'image of {somebody.stamp(0)} ns: cut at the left',), ()]
-    assert one.state.faults['silhouette'] == 2
-
-
-@pytest.mark.usefixtures('few_wait')
-def test_images_wait_for_the_camera(session, outputs, somebody):
-    one = session(queue_size=2)
-    handled = [one.take(IMAGE, somebody.image(index)) for index in range(3)]
-    assert [len(each.faults) for each in handled] == [0, 0, 1]
-    assert 'waited for a calibrated camera_info' in handled[2].faults[0]
-    assert one.state.wants == 'a calibrated camera_info'
-    assert len(one.take(CAMERA_INFO, somebody.info()).published) == 2
-    assert one.state.counts == {'received': 3, 'predicted': 2, 'dropped': 1}
-
-
-def test_time(session, outputs, somebody, stub_predictor):
-    one = session()
-    one.take(CAMERA_INFO, somebody.info())
-    one.take(IMAGE, somebody.image(3))
-    assert 'wanted stamps that increase' in one.take(IMAGE, somebody.image(3)).faults[0]
-    assert 'with reset_on_time_jump' in one.take(IMAGE, somebody.image(2)).faults[0]
-    assert len(outputs) == 1
-    again = session(reset_on_time_jump=True)
-    again.take(CAMERA_INFO, somebody.info())
-    again.take(IMAGE, somebody.image(3))
-    handled = again.take(IMAGE, somebody.image(2))
-    assert (handled.faults, len(handled.warnings)) == ((), 1)
-    assert stub_predictor.asked[-1][1] is None
-
-
-def test_another_calibration_begins_a_new_sequence(session, somebody, stub_predictor):
-    one = session()
-    one.take(CAMERA_INFO, somebody.info())
-    one.take(IMAGE, somebody.image(0))
-    other = Camera(70.0, 70.0, 31.5, 23.5, 64, 48)
-    (text,) = one.take(CAMERA_INFO, somebody.info(camera=other)).warnings
-    assert text == 'camera_info changes: the sequence starts anew'
-    one.take(IMAGE, somebody.image(1))
-    assert stub_predictor.asked[1][1] is None
-
-
-def test_bad_input_is_told_once_and_skipped(session, outputs, somebody):
-    one = session()
-    uncalibrated = one.take(CAMERA_INFO, somebody.uncalibrated())
-    assert len(uncalibrated.warnings) == 1
-    assert one.take(CAMERA_INFO, somebody.uncalibrated()).warnings == ()
-    one.take(CAMERA_INFO, somebody.info())
-    broken = somebody.messages.create(
-        'sensor_msgs/msg/CompressedImage', header=somebody.image(0).header, format='jpeg',
-        data=np.arange(9, dtype=np.uint8),
-    )  # fmt: skip
-    small = somebody.image(1, size=(32, 24))
-    for message in (broken, small):
-        assert len(one.take(IMAGE, message).faults) == 1
-    assert one.refuse(IMAGE, 'garbage').warnings == ('message of image can not be read: garbage',)
-    assert outputs == []
-    one.take(IMAGE, somebody.image(2))
-    assert len(outputs) == 1
-    assert one.state.counts == {'received': 3, 'skipped': 2, 'predicted': 1}
 
 
 def test_failed_prediction_skips_the_image(session, outputs, somebody, stub_predictor):
@@ -251,13 +169,6 @@ def test_failed_prediction_skips_the_image(session, outputs, somebody, stub_pred
     stub_predictor.fault = None
     one.take(IMAGE, somebody.image(1))
     assert len(outputs) == 1
-
-
-def test_what_nobody_wants_is_not_made(session, outputs, somebody):
-    one = session(wanted=lambda topic: False)
-    one.take(CAMERA_INFO, somebody.info())
-    assert one.take(IMAGE, somebody.image(0)).published == ()
-    assert one.state.counts['predicted'] == 1
 
 
 @pytest.mark.parametrize('made', [image_message, compressed_image_message])
@@ -283,19 +194,6 @@ def test_one_image_is_predicted_on_demand(session, somebody, stub_predictor, mad
         learning.predict_once(message)
 
 
-@pytest.mark.parametrize(
-    ('values', 'message'),
-    [
-        ({'background_file': 'nowhere.png'}, r'nowhere\.png: can not be read'),
-        ({'image_transport': 'pigeon'}, 'image_transport must be one of'),
-        ({'max_hypotheses': 0}, 'must lie between 1 and 64'),
-    ],
-)
-def test_parameters_that_can_not_be(session, values, message):
-    with pytest.raises(ValueError, match=message):
-        session(**values)
-
-
 def test_model_file_that_can_not_be(background_file, tmp_path):
     for name, content in (('nowhere.npz', None), ('garbage.npz', b'PK not a model')):
         path = tmp_path / name
@@ -304,27 +202,6 @@ def test_model_file_that_can_not_be(background_file, tmp_path):
         parameters = with_values(BmeParameters(), {'model_file': str(path)})
         with pytest.raises(ValueError, match=name):
             BmeSession(parameters, lambda output: None)
-
-
-def test_a_moved_camera_is_told_once(session, somebody):
-    """A pillar and the edge of a wall, which the background has 8 px further left."""
-    wall = np.full((48, 64, 3), 90, np.uint8)
-    wall[:, 40:] = 160
-    wall[30:, :] = 40
-    one = session(background_file='')
-    one.take(CAMERA_INFO, somebody.info())
-    told = []
-    for index in range(60):
-        picture = np.roll(wall, 8, axis=1) if index >= 20 else wall
-        message = image_message(somebody.messages, picture, somebody.stamp(index), 'lens')
-        texts = one.take(IMAGE, message).warnings
-        told.append([text for text in texts if 'camera' in text])
-    (first,) = (index for index, texts in enumerate(told) if texts)
-    assert 30 <= first <= 50
-    (text,) = told[first]
-    assert text.startswith('the camera has moved since the background was taken: at the image of')
-    assert text.endswith('or let the background be learned, and configure the node anew')
-    assert one.state.trouble() == 'the camera has moved since the background was taken'
 
 
 def track(likelihoods, index, state=TrackState.TRACKING):
@@ -404,15 +281,6 @@ def test_every_image_is_predicted_from_without_a_sure_track(
     assert looked_at(stub_predictor, one, somebody, [2, 3]) == 2
 
 
-def test_track_that_is_silent_is_not_relied_on(session, somebody, stub_predictor, likelihoods):
-    one = session(tracked_interval=100.0)
-    one.take(CAMERA_INFO, somebody.info())
-    looked_at(stub_predictor, one, somebody, [0])
-    one.take(TRACK, track(likelihoods, 0))
-    assert looked_at(stub_predictor, one, somebody, [5, 10]) == 0
-    assert looked_at(stub_predictor, one, somebody, [11, 12]) == 2
-
-
 def test_track_counts_no_more_after_time_has_jumped(session, somebody, stub_predictor, likelihoods):
     one = session(tracked_interval=100.0, reset_on_time_jump=True)
     one.take(CAMERA_INFO, somebody.info())
@@ -451,15 +319,6 @@ def test_every_image_has_a_silhouette_that_is_a_mask(
     other.take(IMAGE, somebody.image(0))
     other.take(MASK, messages[0])
     assert np.array_equal(stub_predictor.asked[1][0], asked)
-
-
-def test_silhouettes_are_empty_while_the_background_is_learned(session, outputs, somebody):
-    one = session(lambda topic: topic == SILHOUETTE, background_file='')
-    one.take(CAMERA_INFO, somebody.info())
-    for index in range(2):
-        one.take(IMAGE, somebody.empty(index))
-    messages = [deserialise(output.data, 'sensor_msgs/msg/Image') for output in outputs]
-    assert [decode_mask(message).any() for message in messages] == [False, False]
 
 
 # Keypoints.
@@ -505,27 +364,6 @@ def test_keypoints_have_predictions_without_images(outputs, walker):
     assert content.means[0, 2] == pytest.approx(pose[2], rel=0.15)
     assert one.state.status == 'predicting'
     assert one.state.counts['predicted'] == 3
-
-
-def test_few_keypoints_are_nobody(outputs, walker):
-    _, camera, _, seen = walker
-    messages, one = RosbagsMessages(), keypoint_session(outputs)
-    one.take(CAMERA_INFO, camera_info_message(messages, camera, 10, 'lens'))
-    few = seen[np.arange(3)]
-    one.take('keypoints', keypoints_message(messages, few, 20, 'lens'))
-    none = seen[np.arange(0)]
-    one.take('keypoints', keypoints_message(messages, none, 30, 'lens'))
-    assert [len(x.components) for x in predictions(outputs)] == [0, 0]
-    assert one.state.counts['empty'] == 2
-    late = one.take('keypoints', keypoints_message(messages, seen, 20, 'lens'))
-    assert 'comes after one of 30 ns' in late.faults[0]
-
-
-def test_a_lifter_that_is_not_there_is_told(outputs):
-    with pytest.raises(ValueError, match=r'none\.npz'):
-        keypoint_session(outputs, lifter='none.npz')
-    with pytest.raises(ValueError, match='keypoint_scheme must be one of'):
-        keypoint_session(outputs, keypoint_scheme='none')
 
 
 @pytest.fixture
@@ -581,26 +419,6 @@ def test_silhouettes_count_where_keypoints_show_nobody(both, outputs, somebody, 
     one.take(IMAGE, somebody.image(20))
     assert len(predictions(outputs)) == 4
     assert len(stub_predictor.asked) == 3
-
-
-def test_keypoints_that_come_late_are_left(both, outputs, somebody):
-    make, keypoints = both
-    one = make()
-    for index in (0, 1):
-        one.take(IMAGE, somebody.image(index))
-    # Those of the second image end the wait for those of the first.
-    one.take('keypoints', keypoints(1))
-    assert len(outputs) == 2
-    handled = one.take('keypoints', keypoints(0))
-    assert not handled.faults
-    one.take(IMAGE, somebody.image(2))
-    assert one.take('keypoints', keypoints(2)).published
-    twice = make()
-    for index in (0, 1, 2):
-        twice.take(IMAGE, somebody.image(index))
-        if index:
-            twice.take('keypoints', keypoints(index))
-    assert outputs[-1] == outputs[2]
 
 
 def test_the_background_is_learned_where_keypoints_show_nobody(both, outputs, somebody):

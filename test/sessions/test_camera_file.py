@@ -55,20 +55,6 @@ def test_horizontal_and_vertical_view():
     assert np.degrees(np.arccos(edges[0] @ edges[1])) == pytest.approx(45.0)
 
 
-def test_view_through_pixels_that_are_not_square():
-    # 720x576 shown as 1024x576: the same angles as in the picture of square pixels.
-    narrow, shown = (
-        camera_of_view((720, 576), 60.0, aspect=64 / 45),
-        camera_of_view((1024, 576), 60.0),
-    )
-    points = np.array([[0.3, -0.2, 2.0], [-0.5, 0.4, 2.0]])
-    scale = np.array([1024 / 720, 1.0])
-    assert np.allclose((narrow.project(points) + 0.5) * scale - 0.5, shown.project(points))
-    upright = camera_of_view((720, 576), vertical=40.0, aspect=64 / 45)
-    assert upright.fy / upright.fx == pytest.approx(64 / 45)
-    assert upright.fy == camera_of_view((1024, 576), vertical=40.0).fy
-
-
 @pytest.mark.parametrize('text', [ROS, ECHO])
 def test_files_of_ros(text, tmp_path):
     camera = read_camera(write(tmp_path / 'camera.yaml', text), SIZE)
@@ -177,16 +163,6 @@ def test_one_camera_of_several(tmp_path):
     assert read_camera(tmp_path / 'one.toml:left', SIZE).fy == 510.0
     with pytest.raises(ValueError, match=r'cam_0: name one, as .*one\.toml:cam_0$'):
         read_camera(tmp_path / 'one.toml:right', SIZE)
-
-
-def test_small_skew_is_dropped_and_told(tmp_path):
-    told = []
-    path = write(tmp_path / 'c.yaml', ROS.replace('[500, 0,', '[500, -4.9,'))
-    assert np.array_equal(read_camera(path, SIZE, told.append).matrix, K)
-    assert told == [f'{path}: camera info: the skew of K, -4.9 of 500 pixels, is taken for 0']
-    path = write(tmp_path / 'c.yaml', ROS.replace('[500, 0,', '[500, 5.1,'))
-    with pytest.raises(ValueError, match=r'a skew K\[1\] below 5; calibrate with the skew fixed'):
-        read_camera(path, SIZE)
 
 
 def test_calibration_for_another_size_is_scaled_and_told(tmp_path):

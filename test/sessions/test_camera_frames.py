@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.image_inputs import KEYPOINTS
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
@@ -57,21 +55,6 @@ def grounds(outputs):
     ]
 
 
-def test_gravity_of_the_parameters(session, stub_tracker, small_camera, outputs):
-    one = session(gravity_frame='', gravity=[0.0, 1.6, 1.2], camera_height=1.3)
-    one.take(CAMERA_INFO, small_camera.info())
-    for index in range(2):
-        # Nobody listens to transforms.
-        one.take(TF, at(small_camera, index))
-        one.take(IMAGE, small_camera.image(index))
-    (tracker,) = stub_tracker.made
-    np.testing.assert_allclose(tracker.known_ground.up, [0.0, -0.8, -0.6])
-    assert tracker.known_ground.camera_height == 1.3
-    assert tracker.gravities == []
-    assert len(grounds(outputs)) == 2
-    np.testing.assert_allclose(grounds(outputs)[0].plane, [0.0, -0.8, -0.6, 1.3])
-
-
 @pytest.mark.parametrize('first', [TF, IMAGE])
 def test_gravity_at_every_image(session, stub_tracker, small_camera, outputs, first):
     one = session(floor_in_gravity_frame=True, camera_height=3.0)
@@ -89,31 +72,6 @@ def test_gravity_at_every_image(session, stub_tracker, small_camera, outputs, fi
     found = [g.up for g in grounds(outputs)]
     np.testing.assert_allclose(found, [up_of(k) for k in range(3)], atol=1e-12)
     assert one.state.faults == {}
-
-
-def test_transforms_of_other_times_and_frames_are_joined(session, stub_tracker, small_camera):
-    """world - robot, which moves, - mast - lens, of a static transform."""
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(TF_STATIC, transforms(0, seen=view(0), frames=('mast', 'lens')))
-    one.take(IMAGE, small_camera.image(1))
-    for index in (0.0, 2.0):
-        turned = Rotation.from_euler('x', 0.2 * index).as_matrix()[None]
-        message = transforms_message(
-            RosbagsMessages(),
-            ['world', 'robot'],
-            ['robot', 'mast'],
-            np.concatenate([turned, np.eye(3)[None]]),
-            np.zeros((2, 3)),
-            small_camera.stamp(index),
-        )
-        assert stub_tracker.made == []
-        one.take(TF, message)
-    (tracker,) = stub_tracker.made
-    wanted = view(0).rotation @ Rotation.from_euler('x', -0.2).as_matrix() @ [0.0, 0.0, 1.0]
-    np.testing.assert_allclose(tracker.known_ground.up, wanted, atol=1e-12)
-    # The floor was not asked for.
-    assert tracker.known_ground.camera_height is None
 
 
 def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_camera, outputs):
@@ -143,26 +101,6 @@ def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_c
     np.testing.assert_allclose(tracker.gravities[-1], up_of(6), atol=1e-12)
 
 
-@pytest.mark.usefixtures('few_wait')
-def test_no_image_is_dropped_for_want_of_transforms(session, stub_tracker, small_camera, outputs):
-    one = session(queue_size=2, input_timeout=60.0)
-    one.take(CAMERA_INFO, small_camera.info())
-    for index in range(6):
-        one.take(IMAGE, small_camera.image(index))
-    assert len(grounds(outputs)) == 4
-    assert one.state.counts == {'received': 6, 'tracked': 4}
-
-
-def test_transforms_and_keypoints_are_waited_for_together(session, stub_tracker, small_camera):
-    one = session(use_keypoints=True)
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(IMAGE, small_camera.image(0))
-    one.take(TF, at(small_camera, 0))
-    assert stub_tracker.made == []
-    one.take(KEYPOINTS, small_camera.keypoints(0))
-    assert len(stub_tracker.made) == 1
-
-
 def test_a_camera_below_the_floor_has_no_height(session, stub_tracker, small_camera):
     one = session(floor_in_gravity_frame=True, camera_height=1.1)
     one.take(CAMERA_INFO, small_camera.info())
@@ -177,37 +115,20 @@ def test_a_camera_below_the_floor_has_no_height(session, stub_tracker, small_cam
     assert stub_tracker.made[0].known_ground.camera_height == 1.1
 
 
-@pytest.mark.parametrize(
-    ('spoil', 'why'),
-    [
-        (lambda t: setattr(t.transform.translation, 'x', np.nan), 'its numbers are not finite'),
-        (lambda t: setattr(t.transform.rotation, 'w', 7.0), 'its quaternion has length 7'),
-        (lambda t: setattr(t, 'child_frame_id', ''), 'a frame has no name'),
-    ],
-)
-def test_bad_transforms_are_counted(session, small_camera, outputs, spoil, why):
+def test_bad_transforms_are_counted(session, small_camera, outputs):
     one = session(input_timeout=0.0)
     one.take(CAMERA_INFO, small_camera.info())
     for index in range(2):
         bad = at(small_camera, index)
-        rotation = bad.transforms[0].transform.rotation
-        rotation.x, rotation.y, rotation.z, rotation.w = 0.0, 0.0, 0.0, 1.0
-        spoil(bad.transforms[0])
+        bad.transforms[0].transform.translation.x = np.nan
         handled = one.take(TF, bad)
         assert handled.faults == ()
         assert len(handled.warnings) == (index == 0)
-        assert why in one.state.last_fault
+        assert 'its numbers are not finite' in one.state.last_fault
         one.take(IMAGE, small_camera.image(index))
     one.take(IMAGE, small_camera.image(2))
     assert len(grounds(outputs)) == 2
     assert one.state.faults == {'transform': 2, 'no transform': 2}
-
-
-def test_an_empty_message(session, small_camera):
-    message = RosbagsMessages().create('tf2_msgs/msg/TFMessage')
-    for source in (TF, TF_STATIC):
-        handled = session().take(source, message)
-        assert (handled.faults, handled.warnings, handled.stamp_ns) == ((), (), 0)
 
 
 def test_time_that_jumps_back_gives_the_same_again(session, stub_tracker, small_camera, outputs):
@@ -243,17 +164,6 @@ def test_the_pose_of_the_camera_at_every_image(session, stub_tracker, small_came
         np.testing.assert_allclose(rotation, seen.rotation.T, atol=1e-12)
     assert len(tracker.poses) == 3
     assert one.state.faults == {}
-
-
-def test_height_of_a_camera_that_rises(session, stub_tracker, small_camera, outputs):
-    one = session(fixed_frame='world', floor_in_gravity_frame=True)
-    one.take(CAMERA_INFO, small_camera.info())
-    for index in range(3):
-        one.take(TF, at(small_camera, index, height=1.2 + 0.1 * index))
-        one.take(IMAGE, small_camera.image(index))
-    heights = [ground.height for ground in grounds(outputs)]
-    np.testing.assert_allclose(heights, [1.2, 1.3, 1.4], atol=1e-9)
-    assert len(stub_tracker.made[0].poses) == 3
 
 
 def test_a_missing_pose_is_told_once_and_loses_no_image(session, stub_tracker, small_camera):

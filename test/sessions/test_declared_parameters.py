@@ -1,8 +1,7 @@
 import math
 from array import array
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-import numpy as np
 import pytest
 
 from hmt_ros.sessions.bme_parameters import BmeParameters
@@ -13,7 +12,6 @@ from hmt_ros.sessions.declared_parameters import (
     NEXT_TRACK,
     ParameterError,
     declared_parameters,
-    described_fields,
     nested_parameters,
     parameter_field,
     values_of,
@@ -95,11 +93,6 @@ def test_values_replace_defaults():
     assert with_values(Outer(), {}) == Outer()
 
 
-def test_settings_that_are_no_parameters_stay():
-    settings = Outer(own=Term(weight=7.0), apart=Term(high=7))
-    assert with_values(settings, {'high': 4}) == replace(settings, own=Term(7.0, -1.0, 4))
-
-
 @pytest.mark.parametrize(
     ('values', 'message'),
     [
@@ -125,43 +118,6 @@ def test_values_that_do_not_go_together_are_refused():
     assert with_values(Outer(), {'low': 4.0, 'high': 5}).own == Term(2.0, 4.0, 5)
 
 
-def test_docstrings_without_attributes_describe_nothing():
-    class Bare:
-        """Nothing."""
-
-    assert described_fields(Bare) == {}
-    assert described_fields(Outer) == {
-        'shared': 'Shared by all.',
-        'on': 'More: with a colon.',
-        'own': 'A term.',
-    }
-
-
-def test_nodes_have_few_parameters():
-    declared = [[p.name for p in declared_parameters(settings)] for settings in ALL]
-    assert len(declared[0]) <= 35
-    assert len({name for names in declared for name in names}) <= 55
-    names = set(declared[0])
-    assert {'max_hypotheses', 'evaluation_budget', 'random_seed', 'gravity'} < names
-    parameters = with_values(FilterParameters(), {'camera_height': 7, 'max_hypotheses': 20})
-    assert parameters.camera_height == 7.0
-    assert parameters.tracker.max_hypotheses == 20
-
-
-@pytest.mark.parametrize(
-    'settings', [*ALL, PeopleParameters()], ids=lambda settings: type(settings).__name__
-)
-def test_descriptions_are_sentences_that_stand_alone(settings):
-    parameters = declared_parameters(settings)
-    names = [p.name for p in parameters]
-    assert len(set(names)) == len(names)
-    for parameter in parameters:
-        text = parameter.description
-        assert text[0].isupper(), parameter
-        assert text.endswith('.'), parameter
-        assert not text.lower().startswith(('of ', 'whether ', 'so many ', 'their ')), parameter
-
-
 @pytest.mark.parametrize(
     'settings', [*ALL, PeopleParameters()], ids=lambda settings: type(settings).__name__
 )
@@ -172,23 +128,6 @@ def test_defaults_lie_between_limits(settings):
             parameter
         )
         assert parameter.checked(parameter.default) == parameter.default
-
-
-@pytest.mark.parametrize(
-    ('values', 'message'),
-    [
-        ({'max_hypotheses': 0}, 'max_hypotheses must lie between 1 and 64, saw 0'),
-        ({'evaluation_budget': 0}, 'evaluation_budget must lie between 1 and 100000, saw 0'),
-        ({'camera_hieght': 2.0}, 'is camera_height meant'),
-        ({'surprise': 2.0}, 'there is no parameter surprise'),
-        ({'image_transport': 'theora'}, "image_transport must be one of .* saw 'theora'"),
-        ({'body_model': ''}, 'body_model must be a name or a file'),
-        ({'camera_height': -1.0}, 'camera_height must lie between 0 and 100'),
-    ],
-)
-def test_wrong_parameters_of_the_node(values, message):
-    with pytest.raises(ValueError, match=message):
-        with_values(FilterParameters(), values)
 
 
 @pytest.mark.parametrize(
@@ -230,13 +169,3 @@ def test_what_is_no_list_of_numbers(given):
 def test_what_is_no_ground(values, message):
     with pytest.raises(ValueError, match=message):
         with_values(FilterParameters(), values)
-
-
-def test_ground_that_parameters_tell():
-    assert FilterParameters().known_ground.up is None
-    assert FilterParameters().known_ground.camera_height is None
-    known = with_values(
-        FilterParameters(), {'gravity': [0, 3, 4], 'camera_height': 1.25}
-    ).known_ground
-    np.testing.assert_allclose(known.up, [0, -0.6, -0.8])
-    assert known.camera_height == 1.25

@@ -34,14 +34,6 @@ def depths(stub_tracker):
     ]
 
 
-def test_depth_is_not_used_unless_asked_for(session, small_camera, stub_tracker):
-    one = session(use_depth=False)
-    assert one.take(DEPTH, small_camera.mask(0)).faults == ()
-    one.take(DEPTH, small_camera.depth(0))
-    one.take(IMAGE, small_camera.image(0))
-    assert depths(stub_tracker) == [None]
-
-
 def test_depth_goes_with_the_image_of_its_stamp(session, small_camera, stub_tracker):
     """In whatever order they come, in mm or in m."""
     one = session()
@@ -54,31 +46,6 @@ def test_depth_goes_with_the_image_of_its_stamp(session, small_camera, stub_trac
     one.take(DEPTH, small_camera.depth(0, metres=4.0))
     one.take(IMAGE, small_camera.image(2))
     assert depths(stub_tracker)[1:] == [2.0, 3.0]
-
-
-def test_images_wait_for_depth(session, small_camera, stub_tracker):
-    one = session(input_timeout=0.25)
-    for index in range(3):
-        one.take(IMAGE, small_camera.image(index))
-    assert depths(stub_tracker) == []
-    handled = one.take(IMAGE, small_camera.image(3))
-    assert depths(stub_tracker) == [None]
-    assert f'no depth has come for the image of {small_camera.stamp(0)} ns' in handled.warnings
-    # The depth of a later image settles those before; it does not come back.
-    one.take(DEPTH, small_camera.depth(2))
-    one.take(DEPTH, small_camera.depth(1))
-    (warning,) = one.take(DEPTH, small_camera.depth(3)).warnings
-    assert f'depth of {small_camera.stamp(1)} ns belongs to no image' in warning
-    assert depths(stub_tracker) == [None, None, 3.0, 3.0]
-    assert one.state.faults == {'no depth': 2, 'depth without an image': 1}
-
-
-def test_a_full_queue_names_what_is_missing(session, small_camera):
-    one, index = session(input_timeout=60.0), iter(range(20))
-    faults = []
-    while not faults:
-        faults = one.take(IMAGE, small_camera.image(next(index))).faults
-    assert 'no depth of its stamp has come, and' in faults[0]
 
 
 @pytest.mark.parametrize(
@@ -101,16 +68,6 @@ def test_bad_depth_is_told_once_and_not_used(session, small_camera, stub_tracker
     one.take(IMAGE, small_camera.image(1))
     assert depths(stub_tracker) == [None, 3.0]
     assert one.state.faults == {'depth': 1}
-
-
-def test_a_jump_in_time_forgets_the_depth(session, small_camera, stub_tracker):
-    one = session(reset_on_time_jump=True, input_timeout=0.05)
-    one.take(DEPTH, small_camera.depth(9))
-    one.take(IMAGE, small_camera.image(9))
-    one.take(IMAGE, small_camera.image(2))
-    one.take(IMAGE, small_camera.image(3))
-    one.take(DEPTH, small_camera.depth(3))
-    assert depths(stub_tracker)[-1] == 3.0
 
 
 def test_depth_of_something_else_is_told_once(session, small_camera, stub_tracker):

@@ -56,14 +56,10 @@ def test_depths_alone_are_as_uncertain_as_the_focal_length(told):
     # Both ways 3.4 deviations: the 99 % of three axes.
     assert deep[1] - deep[0] == pytest.approx(2 * 3.4 * 0.8, rel=0.15)
     assert abs(wide[1] - wide[0]) < 0.2
-
-
-def test_a_smoother_counts_it_once(told):
-    """It comes beside the likelihood, as the error of the shape that all images share."""
-    known = told(forecast_rate=20.0)['likelihood_mixture']
-    guessed = told(forecast_rate=20.0, focal_length_sigma=SIGMA)['likelihood_mixture']
-    assert np.array_equal(known.mixture.covariances, guessed.mixture.covariances)
-    change = guessed.shape_covariance - known.shape_covariance
+    # A smoother counts it once: beside the likelihood, as the error that all images share.
+    before, after = (x['likelihood_mixture'] for x in (known, guessed))
+    assert np.array_equal(before.mixture.covariances, after.mixture.covariances)
+    change = after.shape_covariance - before.shape_covariance
     assert change[2, 2] == pytest.approx((SIGMA * 4.0) ** 2)
     assert np.count_nonzero(change) == 1
 

@@ -23,8 +23,6 @@ from hmt_ros.sessions.hri_session import (
     mixture_source,
     published_topic,
 )
-from hmt_ros.sessions.tracking_parameters import FilterParameters
-from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.detections import person_of_skeleton
 from msg_tools.messages.images import decode_image
@@ -129,39 +127,6 @@ def test_no_identity_is_used_twice(session, outputs, people):
     assert tracked(outputs) == [['p1_3'], [], ['p1_4'], ['p1_4'], ['p1_5']]
 
 
-def test_what_the_filter_publishes_is_a_body(
-    session, outputs, small_camera, stub_tracker, subject_file
-):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info())
-    parameters = with_values(FilterParameters(), {'subject_file': str(subject_file)})
-
-    def forward(output):
-        if output.topic == 'pose_mixture':
-            one.take(P1, deserialise(output.data, 'hmt_msgs/msg/PoseMixture'))
-
-    tracks = TrackingSession(parameters, forward)
-    tracks.take(CAMERA_INFO, small_camera.info())
-    stub_tracker.empty.add(small_camera.stamp(2))
-    for index in range(3):
-        one.take(IMAGE, small_camera.image(index))
-        tracks.take(IMAGE, small_camera.image(index))
-    assert tracked(outputs) == [['p1_1'], ['p1_1'], []]
-    for name in ('roi', 'skeleton2d', 'cropped', 'joint_states'):
-        stamps = [o.stamp_ns for o in outputs if o.topic == body_topic('p1_1', name)]
-        assert stamps == [small_camera.stamp(i) for i in (0, 1)]
-
-
-def test_several_people(session, outputs, people):
-    one = session()
-    one.take(P2, people(0, 4))
-    one.take(P1, people(0, 1))
-    one.take(mixture_source('/lab/anna'), people(0, 3))
-    assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1', 'p2_4']
-    one.take(P2, people(1, 4, TrackState.NOBODY))
-    assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1']
-
-
 def test_people_who_are_gone_are_forgotten(session, outputs, people, monkeypatch):
     monkeypatch.setattr(hri_session, '_REMEMBERED', 3)
     one = session()
@@ -183,14 +148,6 @@ def test_who_is_silent_is_not_tracked(session, outputs, people, small_camera, mo
     one.take(CAMERA_INFO, small_camera.info(6))
     assert tracked(outputs) == [['p1_1'], []]
     assert one.identities == set()
-
-
-def test_the_end_of_the_stream(session, outputs, people, likelihoods):
-    one = session()
-    one.take(P1, people(0))
-    assert one.finish().published == ((TRACKED, likelihoods.stamp(0)),)
-    assert tracked(outputs) == [['p1_1'], []]
-    assert one.finish().published == ()
 
 
 def test_joint_states_and_frames_are_those_of_the_urdf(session, outputs, people, likelihoods):
@@ -301,30 +258,6 @@ def test_region_and_landmarks(session, outputs, people, small_camera, likelihood
     assert crop.header == small_camera.image(1).header
 
 
-def test_landmarks_of_the_head_are_those_of_the_body(session, outputs, human37, random_poses):
-    """Nose and ears are where `keypoint_schemes.yaml` has them on a body."""
-    from hmt_ros.body.kinematics import forward
-    from hmt_ros.body.reference_human import fit_reference_human
-    from msg_tools.messages.humans import landmarks_in_space
-
-    body = human37
-    poses = random_poses(body, 20, 5)
-    # Neither model turns the head about its own axis; together the two angles of ours do a little.
-    poses[:, body.dof_names.index('neck_y')] = 0.0
-    positions = body.joint_positions(poses)
-    head = body.skeleton.segment_names.index('head')
-    turned = forward(body.skeleton, poses).rotations()[:, head]
-    scheme = schemes()['skeleton2d']
-    for pose, places in enumerate(positions):
-        human = fit_reference_human(body.joint_names, places)
-        found = landmarks_in_space(body.joint_names, places[None], human)[0]
-        for name in ('nose', 'left_ear', 'right_ear'):
-            mark = scheme.landmark(name)
-            at_head = places[body.joint_names.index('head')]
-            wanted = at_head + turned[pose] @ mark.offset
-            np.testing.assert_allclose(found[scheme.names.index(name)], wanted, atol=2e-3)
-
-
 def test_a_body_beyond_the_image_has_no_region(session, outputs, people, small_camera):
     one = session()
     one.take(CAMERA_INFO, small_camera.info(0))
@@ -356,26 +289,6 @@ def test_a_mode_is_shown_as_long_as_it_counts(session, outputs, people):
     np.testing.assert_allclose(elbows, wanted, atol=1e-3)
 
 
-def test_an_image_that_has_not_come_is_told(session, outputs, people, small_camera):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info(0))
-    handled = one.take(P1, people(0))
-    assert 'no image of' in handled.warnings[0]
-    assert one.state.faults == {'no image': 1}
-    quiet = session(publish_cropped=False)
-    quiet.take(CAMERA_INFO, small_camera.info(0))
-    assert quiet.take(P1, people(0)).warnings == ()
-
-
-def test_another_camera_is_told(session, outputs, people, small_camera):
-    one = session()
-    one.take(CAMERA_INFO, small_camera.info(0, frame_id='left'))
-    handled = one.take(P1, people(0))
-    assert 'of p1 are in the frame lens, camera_info is that of left' in handled.warnings[0]
-    assert not any(o.topic.endswith(('roi', 'skeleton2d', 'cropped')) for o in outputs)
-    assert tracked(outputs) == [['p1_1']]
-
-
 def test_what_can_not_be_used_is_told(session, outputs, people, small_camera):
     one = session()
     one.take(CAMERA_INFO, small_camera.uncalibrated())
@@ -394,15 +307,6 @@ def test_what_can_not_be_used_is_told(session, outputs, people, small_camera):
     broken.components[0].weight = 2.0
     assert one.take(P1, broken).faults
     assert one.state.counts == {'received': 5, 'converted': 1, 'skipped': 4}
-
-
-def test_time_that_jumps_back(session, outputs, people):
-    one = session(reset_on_time_jump=True)
-    one.take(P2, people(9))
-    one.take(P1, people(9))
-    one.take(P1, people(0))
-    # Another body, as the track before has ended.
-    assert tracked(outputs)[-1] == ['p1_2']
 
 
 def test_the_same_messages_give_the_same_bytes(session, outputs, people, small_camera):

@@ -1,7 +1,5 @@
 """Keypoints in the plane and in space that come to the filter, and what their names mean."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -34,11 +32,6 @@ def seen(stub_tracker):
     return [keypoints for _, keypoints in stub_tracker.made[0].seen]
 
 
-def tracked(outputs):
-    """Stamps of the images that were tracked."""
-    return [output.stamp_ns for output in outputs if output.topic == 'pose_mixture']
-
-
 @pytest.mark.parametrize(
     ('scheme', 'names', 'unknown', 'used'),
     [
@@ -60,35 +53,6 @@ def test_what_names_mean(session, small_camera, stub_tracker, scheme, names, unk
     assert [each.names for each in seen(stub_tracker)] == [used]
 
 
-def test_unknown_names_are_told_once_for_each_set(session, small_camera):
-    one = session()
-    sets = [('tail', 'head'), ('wing', 'head'), ('tail', 'head')]
-    warnings = [
-        one.take(KEYPOINTS, small_camera.keypoints(index, names=names)).warnings
-        for index, names in enumerate(sets)
-    ]
-    assert [len(each) for each in warnings] == [1, 1, 0]
-    assert one.state.faults['names of keypoints'] == 3
-    # Twenty of them in all.
-    more = [
-        one.take(KEYPOINTS, small_camera.keypoints(3 + index, names=(f'tail_{index}',))).warnings
-        for index in range(100)
-    ]
-    assert [len(each) for each in more] == [1] * 18 + [0] * 82
-
-
-def test_what_was_not_seen_does_not_reach_the_tracker(session, small_camera, stub_tracker):
-    one = session()
-    place = np.array([0.0, 3.0, 4.0, np.nan, 6.0])
-    sure = np.array([1.0, 0.0, 1.0, 1.0, 0.5])
-    message = small_camera.keypoints(0, u=place, v=place, confidence=sure)
-    assert one.take(KEYPOINTS, message).warnings == ()
-    one.take(IMAGE, small_camera.image(0))
-    (keypoints,) = seen(stub_tracker)
-    assert keypoints.names == (JOINTS[2], JOINTS[4])
-    np.testing.assert_array_equal(keypoints.confidences, [1.0, 0.5])
-
-
 @pytest.mark.parametrize('order', [(0, 1, 2), (2, 1, 0), (1, 2, 0), (2, 0, 1)])
 def test_positions_in_space_join_the_keypoints_by_name(session, small_camera, stub_tracker, order):
     inputs = [
@@ -102,34 +66,6 @@ def test_positions_in_space_join_the_keypoints_by_name(session, small_camera, st
     (keypoints,) = seen(stub_tracker)
     assert keypoints.names == ('head', 'pelvis', 'left_elbow')
     np.testing.assert_array_equal(keypoints.positions, [[2, 0, 0], [1, 0, 0], [np.nan] * 3])
-
-
-def test_positions_in_space_are_not_used_unless_asked_for(session, small_camera, stub_tracker):
-    one = session()
-    one.take(KEYPOINTS_3D, small_camera.keypoints_3d(0))
-    one.take(KEYPOINTS, small_camera.keypoints(0))
-    one.take(IMAGE, small_camera.image(0))
-    (keypoints,) = seen(stub_tracker)
-    assert keypoints.positions is None
-
-
-@pytest.mark.usefixtures('few_wait')
-def test_images_wait_for_positions_in_space(session, small_camera, stub_tracker, outputs):
-    one = session(use_keypoints_3d=True, input_timeout=0.25, queue_size=3)
-    for index in range(2):
-        one.take(KEYPOINTS, small_camera.keypoints(index))
-        one.take(IMAGE, small_camera.image(index))
-    assert tracked(outputs) == []
-    # Positions of nobody are an answer, and those of a later image are one for all before.
-    one.take(KEYPOINTS_3D, small_camera.keypoints_3d(1, names=()))
-    assert tracked(outputs) == [small_camera.stamp(0), small_camera.stamp(1)]
-    assert [keypoints.positions for keypoints in seen(stub_tracker)] == [None, None]
-    one.parameters = replace(one.parameters, input_timeout=60.0)
-    handled = []
-    for index in range(2, 6):
-        one.take(KEYPOINTS, small_camera.keypoints(index))
-        handled.append(one.take(IMAGE, small_camera.image(index)))
-    assert 'no keypoints_3d of its stamp has come' in handled[-1].faults[0]
 
 
 def test_positions_that_can_not_be_used_are_told(session, small_camera, stub_tracker):

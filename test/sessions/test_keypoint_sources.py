@@ -5,17 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hmt_ros.image.keypoint_schemes import schemes
-from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.image_inputs import DETECTIONS
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.messages.headers import header_message
-
-COCO = schemes()['coco17'].names
 
 
 @pytest.fixture
@@ -102,20 +97,6 @@ def people(one, camera, *detections):
         one.take(IMAGE, camera.image(index))
 
 
-def test_a_person_by_nearness(session, seen, small_camera):
-    people(
-        session('yolo'), small_camera,
-        {'a': (10.0, 20.0), 'b': (100.0, 30.0)},
-        {'b': (10.0, 40.0), 'a': (101.0, 20.0)},
-        {'b': (10.0, 40.0)},
-    )  # fmt: skip
-    first, second, third = seen()
-    assert set(first.values()) == {100.0}
-    assert set(second.values()) == {101.0}
-    # The detector does not see the person: that is an answer.
-    assert third == {}
-
-
 def test_a_person_by_identity(session, seen, small_camera):
     people(
         session('yolo', person_id='a'), small_camera,
@@ -146,34 +127,3 @@ def test_detections_that_can_not_be_used_are_told(session, small_camera):
     # It counts as none: the image need not wait for it.
     one.take(IMAGE, small_camera.image(0))
     assert one.state.counts['tracked'] == 1
-
-
-@pytest.mark.parametrize('kind', [FilterParameters, BmeParameters])
-def test_parameters(kind):
-    with pytest.raises(ValueError, match=r"source must be one of .* saw 'pigeon'"):
-        kind(source='pigeon')
-    with pytest.raises(ValueError, match=r"keypoint_scheme must be one of .* saw 'coco'"):
-        kind(keypoint_scheme='coco')
-
-
-def test_where_time_begins_again_a_person_is_chosen_anew(session, seen, small_camera, stub_tracker):
-    one = session('yolo', reset_on_time_jump=True)
-    one.take(CAMERA_INFO, small_camera.info())
-    one.take(DETECTIONS, yolo(small_camera, 9, a=(10.0, 20.0)))
-    one.take(IMAGE, small_camera.image(9))
-    one.take(IMAGE, small_camera.image(1))
-    one.take(DETECTIONS, yolo(small_camera, 1, b=(500.0, 20.0)))
-    (_, keypoints) = stub_tracker.made[-1].seen[-1]
-    assert set(keypoints.pixels[:, 0]) == {500.0}
-
-
-def test_the_experts_read_them_as_well(small_camera, outputs):
-    values = {'source': 'floats', 'predict_from': 'keypoints'}
-    one = BmeSession(with_values(BmeParameters(), values), outputs.append)
-    assert [each.sources for each in one.needed_inputs()] == [(DETECTIONS,), (CAMERA_INFO,)]
-    one.take(CAMERA_INFO, small_camera.info(0))
-    label = str(small_camera.stamp(0))
-    assert one.take(DETECTIONS, floats(small_camera, np.zeros((17, 2)), label)).faults == ()
-    (output,) = outputs
-    # Landmarks at the corner were not seen: nobody was.
-    assert (output.topic, output.stamp_ns) == ('pose_prediction', small_camera.stamp(0))

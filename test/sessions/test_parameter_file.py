@@ -3,8 +3,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from docs.generate import parameter_file_text
 from hmt_ros.sessions.declared_parameters import ParameterError, values_of, with_values
-from hmt_ros.sessions.parameter_file import parameter_file_text, read_parameter_file, yaml_scalar
+from hmt_ros.sessions.parameter_file import read_parameter_file, yaml_scalar
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions import track_start
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
@@ -18,7 +17,6 @@ from hmt_ros.tracking import Status
 from hmt_ros.tracking.beginning import Source
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.detections import (
-    NO_KEYPOINTS,
     PEOPLE_2D,
     DetectedPerson,
     people_message,
@@ -182,16 +180,6 @@ def test_an_identity_of_the_detector_is_kept(session, outputs, small_camera):
     assert columns[0] > 0 > columns[1]
 
 
-def test_somebody_whom_the_detector_gives_another_identity_stays_the_same(
-    session, outputs, small_camera
-):
-    one = started(session(), small_camera)
-    show(one, small_camera, 0, somebody_at(15, '7'), somebody_at(50, 'anna'))
-    show(one, small_camera, 1, somebody_at(16, '9'), somebody_at(50, 'anna'))
-    show(one, small_camera, 2, somebody_at(17, '9'), somebody_at(50, 'anna'))
-    assert listed(outputs) == [['p7', 'anna']] * 3
-
-
 def test_who_leaves_ends_and_who_comes_begins(session, outputs, small_camera):
     one = started(session(), small_camera)
     show(one, small_camera, 0, somebody_at(12), somebody_at(50))
@@ -257,19 +245,6 @@ def test_detections_without_an_image_and_images_without_detections(session, smal
     assert one.state.counts['tracked'] == 4
 
 
-def test_a_few_joints_start_nobody(session, small_camera):
-    one = started(session(), small_camera)
-    show(one, small_camera, 0, somebody_at(15, names=NAMES[:4]))
-    assert one.state.followed == ()
-
-
-def test_the_same_person_twice_is_one(session, small_camera):
-    one = started(session(), small_camera)
-    show(one, small_camera, 0, somebody_at(15))
-    show(one, small_camera, 1, somebody_at(15), somebody_at(16))
-    assert one.state.followed == ('p1',)
-
-
 def test_boxes_start_tracks(session, monkeypatch, small_camera):
     boxes = []
     monkeypatch.setattr(Follower, 'reset', lambda self, start=None, box=None: boxes.append(box))
@@ -296,26 +271,6 @@ def test_boxes_start_tracks(session, monkeypatch, small_camera):
     assert 'wanted a box of px' in fault
 
 
-def test_arrays_of_people(session, small_camera):
-    one = started(session(source='floats'), small_camera)
-    coco = schemes()['coco17'].names
-    rows = np.zeros((2, 17, 3), np.float32)
-    for number, column in enumerate((15, 50)):
-        for name, place in zip(NAMES, SHAPE + np.array([column, 24.0]), strict=True):
-            rows[number, coco.index(name)] = *place, 0.9
-    sizes = zip((str(small_camera.stamp(0)), '', ''), rows.shape, strict=True)
-    layout = small_camera.messages.create(
-        'std_msgs/msg/MultiArrayLayout',
-        dim=[
-            small_camera.messages.create('std_msgs/msg/MultiArrayDimension', label=label, size=size)
-            for label, size in sizes
-        ],
-    )
-    one.take(DETECTIONS, SimpleNamespace(layout=layout, data=rows.ravel()))
-    one.take(IMAGE, small_camera.image(0))
-    assert one.state.people == ('p1', 'p2')
-
-
 def test_an_empty_scene_is_learned_until_somebody_comes(session, small_camera):
     one = started(session(), small_camera)
     for i in range(6):
@@ -323,23 +278,6 @@ def test_an_empty_scene_is_learned_until_somebody_comes(session, small_camera):
     show(one, small_camera, 6, somebody_at(15))
     show(one, small_camera, 7, somebody_at(15))
     assert StubTracker.made[0].silhouettes.background.frames == 6
-
-
-def test_a_scene_that_was_hardly_seen_is_not_used(session, small_camera):
-    one = started(session(), small_camera)
-    show(one, small_camera, 0)
-    show(one, small_camera, 1, somebody_at(15))
-    show(one, small_camera, 2, somebody_at(15))
-    assert StubTracker.made[0].silhouettes.background.frames == 0
-
-
-def test_somebody_at_the_border(session, small_camera):
-    one = started(session(use_keypoints=False), small_camera)
-    show(one, small_camera, 0, somebody_at(-5, box=(-10.0, 5.0, 3.0, 40.0)))
-    assert one.state.followed == ()
-    told = show(one, small_camera, 1, somebody_at(2, box=(-10.0, 5.0, 9.0, 40.0)))
-    assert one.state.followed == ('p1',)
-    assert told == []
 
 
 def test_a_jump_back_and_a_reset_begin_anew(session, outputs, small_camera):
@@ -351,13 +289,6 @@ def test_a_jump_back_and_a_reset_begin_anew(session, outputs, small_camera):
     assert len(StubTracker.made) == 4
     one.restart()
     assert one.state.people == ()
-
-
-def test_the_end_of_a_bag_waits_for_nothing(session, small_camera):
-    one = started(session(), small_camera)
-    show(one, small_camera, 0, somebody_at(15))
-    one.take(IMAGE, small_camera.image(1))
-    assert 'pose_mixture' in str(one.finish().published)
 
 
 @pytest.mark.parametrize(
@@ -373,32 +304,6 @@ def test_parameters_of_one_person_are_refused(values, text):
     with pytest.raises(ValueError, match=r'.') as error:
         with_values(PeopleParameters(), values)
     assert text in str(error.value)
-
-
-def test_a_message_and_its_people():
-    from msg_tools import RosbagsMessages
-
-    people = [somebody_at(15, 'a', box=(1.0, 2.0, 30.0, 40.0)), DetectedPerson('b', NO_KEYPOINTS)]
-    message = people_message(RosbagsMessages(), people, 5, 'lens')
-    again = people_of_message(message, 0.0)
-    assert [x.name for x in again] == ['a', 'b']
-    assert again[0].box == (1.0, 2.0, 30.0, 40.0)
-    np.testing.assert_array_equal(again[0].keypoints.pixels, people[0].keypoints.pixels)
-    assert again[1].box is None
-    assert again[1].extent is None
-
-
-def test_what_is_needed(session, small_camera):
-    one = session(fixed_frame='odom')
-    needed = [(each.sources, each.with_each) for each in one.needed_inputs()]
-    assert needed == [
-        (('image',), False),
-        (('camera_info',), False),
-        (('detections',), True),
-        (('tf', 'tf_static'), False),
-    ]
-    started(one, small_camera)
-    assert ('camera_info',) not in [each.sources for each in one.needed_inputs()]
 
 
 def test_a_moved_camera_is_told_once_for_all(session, small_camera, tmp_path):

@@ -1,12 +1,8 @@
 """What all sessions have in common, and those that take images."""
 
-import math
-
-import numpy as np
 import pytest
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.session import entropy
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 
@@ -47,35 +43,3 @@ def test_two_publishers_of_images_are_told_once(one, small_camera):
         "image on /cam/image has messages of the frames 'lens' and 'other': wanted those of one "
         'camera; stop or remap one of the publishers',
     )
-
-
-def test_frames_that_agree_or_are_not_named_are_no_warning(one, small_camera):
-    named = (('lens', ''), ('', 'lens'), ('lens', 'lens'))
-    for index, (info, image) in enumerate(named):
-        one.take(CAMERA_INFO, small_camera.info(frame_id=info))
-        assert one.take(IMAGE, small_camera.image(index, frame_id=image)).warnings == ()
-    assert one.state.faults == {}
-
-
-def test_frames_without_end_are_not_remembered(one, small_camera):
-    one.take(CAMERA_INFO, small_camera.info())
-    handled = [
-        one.take(IMAGE, small_camera.image(index, frame_id=f'lens{index}')) for index in range(30)
-    ]
-    assert sum(len(each.warnings) for each in handled) == 8
-
-
-def test_an_uncalibrated_camera_is_named_with_its_topic(one, small_camera):
-    (text,) = one.take(CAMERA_INFO, small_camera.uncalibrated()).warnings
-    assert text.startswith('camera_info on /cam/camera_info has k[0] = 0: uncalibrated; ')
-    assert one.state.wants == f'a calibrated camera_info; {text}'
-    one.take(CAMERA_INFO, small_camera.info())
-    assert 'uncalibrated' not in one.state.wants
-
-
-@pytest.mark.parametrize(
-    ('weights', 'nats'),
-    [([1.0], 0.0), ([0.25] * 4, math.log(4)), ([0.5, 0.5, 0.0], math.log(2)), ([], math.nan)],
-)
-def test_entropy_of_weights(weights, nats):
-    assert np.isclose(entropy(np.array(weights)), nats, rtol=1e-15, atol=0, equal_nan=True)

@@ -108,22 +108,3 @@ def test_mixtures_go_before_the_subject(subject_file, body):
     # The present body is of another model: it says nothing about this one.
     other = prepare_start(parameters(body_model='human34')).body
     assert prepare_start(given, mixture(body), other).body.name == 'human37'
-
-
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'body_model': 'human34'}, 'mixture is of the body human34, wanted one of human37'),
-        ({'dof_names': ['x']}, 'component 0: mean has 37 values, wanted 1'),
-    ],
-)
-def test_mixtures_of_other_bodies(body, changes, message):
-    with pytest.raises(ValueError, match=message):
-        prepare_start(FilterParameters(), mixture(body, **changes))
-
-
-def test_a_lifter_that_is_not_there_is_told():
-    """At once, and not when the camera is known."""
-    with pytest.raises(ValueError, match=r'lifter none\.npz: .*[Nn]o such file'):
-        prepare_start(parameters(lifter='none.npz'))
-    assert prepare_start(parameters(lifter='')).parameters.tracker.lifter == ''

@@ -182,11 +182,3 @@ def test_frames_in_a_loop(buffer):
     buffer.put(message('world', 'd'), static=True)
     with pytest.raises(TransformError, match='the frames c, b, a, c form a loop'):
         buffer.lookup('c', 'world', START)
-
-
-def test_what_lies_above_the_common_frame_does_not_matter(buffer):
-    buffer.put(message('world', 'base', stamp=START), static=False)
-    buffer.put(message('base', 'camera'), static=True)
-    buffer.put(message('base', 'imu'), static=True)
-    found = buffer.lookup('camera', 'imu', START + 100 * SECOND)
-    assert np.allclose(found.rotation @ found.rotation.T, np.eye(3))

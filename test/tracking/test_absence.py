@@ -121,21 +121,6 @@ def test_after_hours_somebody_else_comes(film, tracked, human32, keypoints_of, e
         assert kept == (wanted == 1)
 
 
-def test_lengths_of_somebody_who_left_hours_ago(film, tracked, human32, keypoints_of):
-    long = dict(human32.segment_lengths) | {'thigh': 0.52}
-    subject = Subject(0, keypoints_of(human32, film[0][0]), long)
-    images = [*film[1][:3], *nothing(film, 'empty', 8), *film[1][:6]]
-    for hours in (0.0, 3.0):
-        stamps = [0.1 * i + (3600.0 * hours if i > 10 else 0.0) for i in range(len(images))]
-        statuses, tracks, _, tracker = tracked(images, start=subject, stamps=stamps)
-        assert statuses[10] is NOBODY
-        assert (statuses[-1], tracks[-1]) == (TRACKING, 2)
-        kept = (
-            tracker.estimate.body.segment_lengths['thigh'] > human32.segment_lengths['thigh'] + 0.04
-        )
-        assert kept == (hours == 0.0)
-
-
 @pytest.mark.parametrize('kind', ['black', 'noise', 'white'])
 def test_images_of_nothing_are_no_empty_scene(film, tracked, kind):
     """A covered lens, noise and a flash, each for two seconds: the same person afterwards."""
@@ -149,20 +134,6 @@ def test_images_of_nothing_are_no_empty_scene(film, tracked, kind):
     assert set(tracks) == {1}
     assert min(components) > 0
     assert np.abs(tracker.estimate.posterior.means[0, :3] - film[0][9][:3]).max() < 0.3
-
-
-def test_nobody_from_the_start(film, tracked):
-    """A start says once that somebody is there; the images say that nobody is."""
-    statuses, tracks, components, tracker = tracked(nothing(film, 'empty', 7))
-    assert statuses == [LOST] * 2 + [NOBODY] * 5
-    assert tracks == [1] * 7
-    assert components[2:] == [0] * 5
-    assert len(tracker.estimate.posterior) == 0
-    # A reset starts as it did the first time.
-    tracker.reset()
-    assert tracker.estimate.status is Status.WAITING
-    assert tracker.step(film[1][0], 0)[0] is not None
-    assert (tracker.estimate.status, tracker.track_id) == (Status.TRACKING, 2)
 
 
 def test_what_is_not_seen_moves_on_and_gets_wider(film, tracked):
@@ -187,23 +158,6 @@ def test_what_is_not_seen_moves_on_and_gets_wider(film, tracked):
     again, _ = tracker.step(film[1][6], 7 * FRAME)
     assert (tracker.estimate.status, tracker.track_id) == (TRACKING, 1)
     assert np.abs(again.means[0, :3] - film[0][6][:3]).max() < 0.2
-
-
-@pytest.mark.parametrize('rate', [30.0, 10.0, 5.0, 2.7, 1.0])
-def test_the_rate_of_the_images_does_not_matter(film, tracked, rate):
-    """The person stands for 2 s, is away for 3 s, and is back for 2 s."""
-    stamps = np.arange(0.0, 7.0, 1 / rate)
-    here = (stamps < 2.0) | (stamps >= 5.0)
-    empty = nothing(film, 'empty', 5)
-    images = [film[1][0] if x else empty[i % 5] for i, x in enumerate(here)]
-    statuses, tracks, *_ = tracked(images, settings=QUICK, stamps=stamps)
-    assert NOBODY not in statuses[: np.argmin(here)]
-    late = max(0.5, 1.5 / rate)
-    away = [x for x, t in zip(statuses, stamps, strict=True) if 2.0 + late <= t < 5.0]
-    assert set(away) == {NOBODY}
-    back = [x for x, t in zip(statuses, stamps, strict=True) if t >= 5.0 + late]
-    assert set(back) <= {TRACKING}
-    assert tracks[-1] == 2
 
 
 @pytest.mark.parametrize('gap', [0.1, 1.0, 10.0, 1000.0])
@@ -286,13 +240,6 @@ def test_a_detector_sees_nobody(film, tracked, human32, keypoints_of):
     assert np.linalg.norm(gaps, axis=2).mean(1).min() < 0.08
 
 
-def test_a_detector_that_fails_ends_nothing(film, tracked, human32, keypoints_of):
-    inputs = keypoint_inputs(film, human32, keypoints_of, lambda i: i < 2)
-    statuses, tracks, *_ = tracked(film[1][:9], inputs)
-    assert statuses == [Status.TRACKING] * 9
-    assert tracks == [1] * 9
-
-
 def test_no_keypoints_are_not_the_same_as_no_answer(film, tracked, human32, keypoints_of):
     grey = [np.full(film[2].shape, 90, np.uint8)] * 9
 
@@ -316,14 +263,6 @@ def test_a_predictor_sees_nobody_and_then_somebody(film, tracked, human32):
     assert statuses[10:] == [NOBODY] * 6 + [TRACKING] * 4
     assert tracks == [1] * 16 + [2] * 4
     assert components[10:16] == [0] * 6
-
-
-def test_a_prediction_does_not_start_a_track_in_an_empty_scene(film, tracked, human32):
-    prediction = PosePrediction(near(film[0][0]), human32)
-    statuses, *_ = tracked(
-        nothing(film, 'empty', 10), lambda i: {'prediction': prediction}, start=False
-    )
-    assert statuses == [LOST] * 2 + [NOBODY] * 8
 
 
 def test_somebody_at_the_border_is_waited_for(film, tracked):

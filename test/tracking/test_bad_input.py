@@ -86,12 +86,6 @@ def usual(run, film):
     return run(len(film[0]))
 
 
-@pytest.fixture(scope='module')
-def unaided(run):
-    """The same by images alone, of all cases without keypoints."""
-    return run(BAD + 2 * RATE, lambda i, inputs: inputs.update(keypoints=None))
-
-
 def check(tracker, pair):
     for mixture in pair:
         assert mixture.weights.sum() == pytest.approx(1.0)
@@ -258,16 +252,6 @@ def test_without_keypoints_the_place_is_found_again(altered, name):
     assert np.median(altered(name, keypoints=False).place[-JUDGED:]) < 0.3
 
 
-@MAY_ERR
-@pytest.mark.parametrize('name', WITHOUT_KEYPOINTS)
-def test_so_is_the_pose(altered, unaided, name):
-    """Images alone hardly tell which way a person faces: the heaviest mode may turn round."""
-    errors = altered(name, keypoints=False).best
-    last = slice(len(errors) - JUDGED, len(errors))
-    assert np.array_equal(errors[:BAD], unaided.best[:BAD])
-    assert errors[last].mean() < unaided.best[last].mean() + MORE
-
-
 @pytest.mark.parametrize(
     ('name', 'cues'),
     [
@@ -288,13 +272,6 @@ def test_a_wrong_cue_is_doubted(altered, name, cues):
     assert least < (0.8 if cues == ['depth'] else 0.55)
     # Depths are given in bad images only.
     assert cues == ['depth'] or believed[-JUDGED:].min() > 0.7
-
-
-def test_a_wrong_mask_does_not_lead_away_from_keypoints(altered, usual):
-    """After half a second of it the pose is as good as without it."""
-    errors = altered('mask from left to right').heaviest
-    last = slice(len(errors) - SECOND - JUDGED, len(errors) - SECOND)
-    assert np.median(errors[last]) < usual.heaviest[last].mean() + 1.25 * MORE
 
 
 @pytest.mark.parametrize('gap', [0.1, 1.0, 10.0, 1000.0])
@@ -333,21 +310,6 @@ def test_at_the_lower_rate_the_pose_stays_known(slowed, usual):
     which, errors = slowed
     late = np.median([one[-JUDGED:].mean() for one in errors])
     assert late < usual.heaviest[which[-JUDGED:]].mean() + 1.5 * MORE
-
-
-@pytest.fixture(scope='module')
-def hastened(run, film):
-    """Errors where the rate rises to the threefold in the middle."""
-    which = [*range(0, 3 * BAD, 3), *range(3 * BAD, len(film[0]))]
-    return run(len(which), stamps=[i / RATE for i in which], which=which)
-
-
-def test_a_rate_that_rises_in_the_middle(hastened, usual):
-    assert hastened.best[-JUDGED:].mean() < usual.best[-JUDGED:].mean() + MORE
-
-
-def test_at_the_higher_rate_it_turns_back(hastened, usual):
-    assert hastened.heaviest[-JUDGED:].mean() < usual.heaviest[-JUDGED:].mean() + MORE
 
 
 def test_stamps_that_do_not_increase_are_refused_and_change_nothing(

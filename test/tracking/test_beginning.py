@@ -15,12 +15,11 @@ from hmt_ros.body.mirror import left_directions
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.empty_scene import UNSEEN
-from hmt_ros.image.keypoint_evidence import suffices
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import Status, Tracker, TrackerSettings
-from hmt_ros.tracking.beginning import STARTS, Source, with_reversals
+from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.hypotheses import PosePrediction
 from test.clips import read_clip
 
@@ -117,33 +116,6 @@ def test_depth_is_as_uncertain_as_the_stature(start, human37, walk, stature):
     )
 
 
-def test_without_legs_it_takes_longer(start, human37, walk):
-    names = tuple(x for x in NAMES if not x.endswith(('hip', 'knee', 'ankle')))
-    assert start(images=4, names=names).estimate.status is Status.WAITING
-    tracker = start(images=8, names=names)
-    assert tracker.estimate.status is Status.TRACKING
-    rows = [human37.joint_names.index(x) for x in names]
-    joints = tracker.estimate.body.joint_positions(tracker.estimate.posterior.means)[:, rows]
-    truth = human37.joint_positions(walk[7:8])[:, rows]
-    wrong = (joints - joints.mean(1, keepdims=True)) - (truth - truth.mean(1, keepdims=True))
-    # From the side arms and shoulders alone hardly tell which way the person faces.
-    assert np.abs(wrong[0, :, :2]).mean() < 0.05
-    assert np.linalg.norm(wrong, axis=2).mean(1).min() < 0.15
-
-
-def test_what_suffices(human37, keypoints_of, walk):
-    seen = detected(keypoints_of, human37, walk[0])
-    assert suffices(seen, human37)
-    assert not suffices(None, human37)
-    doubtful = replace(seen, confidences=np.full(len(NAMES), 0.4))
-    assert not suffices(doubtful, human37)
-    # One hip may be hidden, both may not.
-    for hidden, enough in ((1, True), (2, False)):
-        confidences = seen.confidences.copy()
-        confidences[[NAMES.index(f'{side}_hip') for side in ('left', 'right')][:hidden]] = 0.0
-        assert suffices(replace(seen, confidences=confidences), human37) is enough
-
-
 def test_a_detector_that_begins_with_sides_exchanged(human37, camera, black, keypoints_of, walk):
     """Exchanged in the first images: the person is the right way round within a second."""
     tracker = Tracker(human37, camera, FAST)
@@ -155,14 +127,6 @@ def test_a_detector_that_begins_with_sides_exchanged(human37, camera, black, key
             left = left_directions(tracker.estimate.body, posterior.means[:1])[0]
             back.append(left @ left_directions(human37, walk[i : i + 1])[0] < 0)
     assert not any(back[8:])
-
-
-def test_reversals_explain_exchanged_sides(human37, camera, walk):
-    poses = with_reversals(human37, walk[:2])
-    assert len(poses) == 4
-    pixels = camera.project(human37.joint_positions(poses))
-    hips = [human37.joint_names.index(x) for x in ('left_hip', 'right_hip')]
-    assert np.abs(pixels[2, hips] - pixels[0, hips[::-1]]).max() < 3.0
 
 
 def test_the_same_keypoints_give_the_same_track(start):
@@ -202,19 +166,6 @@ def test_a_box_starts_a_track(human37, camera, black, walk):
     assert tracker.step(black, FRAME) == (None, None)
 
 
-@pytest.mark.parametrize(
-    ('box', 'message'),
-    [
-        ((10, 10, 10, 50), 'with an area, saw'),
-        ((400, 10, 500, 50), 'must lie in the image of 320x240 pixels'),
-        ((float('nan'), 10, 500, 50), 'with an area, saw'),
-    ],
-)
-def test_boxes_that_are_none(human37, camera, box, message):
-    with pytest.raises(ValueError, match=message):
-        Tracker(human37, camera).reset(box=box)
-
-
 @pytest.mark.parametrize('name', ['wander', 'follow'])
 def test_keypoints_of_a_detector_start_a_track(human37, name):
     folder = SHARED / 'video' / name
@@ -236,10 +187,6 @@ def test_keypoints_of_a_detector_start_a_track(human37, name):
     sigma = np.sqrt(tracker.estimate.posterior.covariances[0, 2, 2])
     depth = found[hips].mean(0)[2] - true[hips].mean(0)[2]
     assert abs(depth) < 2.5 * sigma
-
-
-def test_no_start_is_less_sure_than_existence():
-    assert all(sure >= 0.0 for _, _, sure, _ in STARTS)
 
 
 def test_why_no_track_starts_is_said(camera, human37, filmed):

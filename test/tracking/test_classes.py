@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import expit, logit
+from scipy.special import logit
 
 from hmt_ros.body import load_body
 from hmt_ros.body.mirror import (
@@ -19,7 +19,6 @@ from hmt_ros.body.mirror import (
 from hmt_ros.tracking.classes import (
     believed,
     first_facing,
-    log_turns,
     ways,
     weigh_ways,
 )
@@ -125,29 +124,6 @@ def test_hypotheses_that_were_not_followed_are_no_evidence(human32, both, weigh)
     assert log_odds_of(modes) == pytest.approx(REVERSALS.after(-4.0, DT))
 
 
-def test_the_best_motion_stands_for_its_way(human32, both, weigh):
-    """The number of the modes of a way says nothing of it, nor do its bad ones."""
-    many = np.concatenate([both[:1], np.repeat(both[1:], 3, axis=0)])
-    modes = begun(human32, both, log_odds=-2.0)
-    log_weights, modes = weigh(modes, [20.0, 20.0, 30.0, 40.0], np.ones(4, dtype=bool), poses=many)
-    wanted = expit(REVERSALS.after(-2.0, DT))
-    assert np.exp(log_weights[1:]).sum() == pytest.approx(wanted)
-    assert log_odds_of(modes) == pytest.approx(REVERSALS.after(-2.0, DT))
-
-
-def test_within_a_way_weights_keep_their_ratios(human32, both, weigh):
-    poses = both[[0, 0, 1]]
-    before = np.log([0.3, 0.1, 0.6]) - 7.0
-    modes = begun(human32, both, log_odds=-3.0)
-    found, _ = weigh(modes, np.zeros(3), np.ones(3, dtype=bool), before, poses)
-    assert found[0] - found[1] == pytest.approx(np.log(3.0))
-    assert np.exp(found).sum() == pytest.approx(1.0)
-    assert np.exp(found[2]) == pytest.approx(expit(REVERSALS.after(-3.0, DT)))
-    # Where all face one way, there is nothing to share.
-    one_way, _ = weigh(modes, np.zeros(2), KNOWN, before[:2], poses[:2])
-    assert np.array_equal(one_way, before[:2])
-
-
 def test_one_image_says_only_as_much_as_it_may_be_believed():
     """Either it speaks of the person, with the probability v, or it says the opposite by chance."""
     for evidence in (-5.0, -0.3, 0.0, 0.3, 2.0):
@@ -162,23 +138,6 @@ def test_one_image_says_only_as_much_as_it_may_be_believed():
     assert believed(-np.inf) == pytest.approx(-logit(FACING_VALID))
 
 
-def test_a_flash_does_not_turn_a_track_about(human32, both, weigh):
-    log_weights, _ = weigh(begun(human32, both, log_odds=-4.0), [1e6, 0.0])
-    assert log_weights[0] > log_weights[1]
-
-
-def test_odds_are_bounded(human32, both, weigh):
-    modes = begun(human32, both)
-    for _ in range(20):
-        log_weights, modes = weigh(modes, [0.0, 1e6])
-        assert -MAX_FACING_NATS <= log_odds_of(modes) <= MAX_FACING_NATS
-    # The chain forgets as fast as images tell, where they are certain.
-    assert log_odds_of(modes) == pytest.approx(
-        REVERSALS.after(log_odds_of(modes), DT) - logit(FACING_VALID), abs=0.1
-    )
-    assert np.isfinite(log_weights).all()
-
-
 def test_seen_from_the_side_either_way_may_go_on(human32, both):
     """Where a way is near the other one, what was known of the ways is gone."""
     modes, near = begun(human32, both[:1], log_odds=-8.0), np.array([[0.0, -0.01]])
@@ -186,19 +145,6 @@ def test_seen_from_the_side_either_way_may_go_on(human32, both):
     log_weights, modes = weighed(human32, modes, both[1:], both, near, nothing, nothing, KNOWN, DT)
     assert np.exp(log_weights) == pytest.approx(0.5, abs=0.01)
     assert log_odds_of(modes) == pytest.approx(-0.01)
-
-
-def test_nobody_turns_about_between_two_images(human32, both, turned):
-    """However near the joints of the two ways are."""
-    near, nothing = np.zeros((1, 2)), np.zeros(2)
-    for dt, known in ((0.03, True), (0.3, True), (30.0, False)):
-        modes = begun(human32, both[:1], log_odds=-5.0)
-        _, modes = weighed(human32, modes, both[:1], both, near, nothing, nothing, KNOWN, dt)
-        assert (log_odds_of(modes) < -4.0) == known
-    for angle in (0.1, 0.5, 3.0):
-        (found,) = log_turns(human32, both[:1], turned(both[0], angle), 0.5)[0]
-        variance = 0.5 * human32.rates[root_rotation_dofs(human32.skeleton)[0]]
-        assert found == pytest.approx(-0.5 * angle**2 / variance, rel=1e-3)
 
 
 def test_a_person_who_turns_away_leads_the_track_along(human32, both, turned):
@@ -233,13 +179,6 @@ def test_a_start_says_which_way(human32, both):
     assert first_facing(human32, both, np.array([0.0, -1e9])) == pytest.approx(
         [MAX_FACING_NATS, -MAX_FACING_NATS]
     )
-
-
-def test_the_only_way_that_is_left_leads(human32, both, weigh):
-    before = np.array([-1.0])
-    found, modes = weigh(begun(human32, both, log_odds=-3.0), [5.0], [True], before, both[1:])
-    assert np.array_equal(found, before)
-    assert log_odds_of(modes) == pytest.approx(REVERSALS.after(-3.0, DT))
 
 
 def test_a_body_without_a_trunk_is_left_alone(both):

@@ -13,7 +13,6 @@ from hmt_ros.tracking import Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.optimisation import is_surprising
 from hmt_ros.tracking.settings import (
     ACCURATE_BUDGET,
-    SURPRISING_FACTOR,
     SURPRISING_RATIO,
 )
 
@@ -26,26 +25,6 @@ def test_more_budget_is_never_less_of_anything():
         plan = astuple(TrackerSettings(evaluation_budget=budget).plan)
         assert all(a >= b for a, b in zip(plan, before, strict=True)), budget
         before = plan
-
-
-def test_settings_bound_the_plan():
-    settings = TrackerSettings(
-        evaluation_budget=10_000, max_hypotheses=5, candidates=7, combinations=11, alternatives=3,
-        searched_chains=2, iterations=4,
-    )  # fmt: skip
-    plan = settings.plan
-    assert (plan.hypotheses, plan.candidates, plan.combinations) == (5, 7, 11)
-    assert (plan.alternatives, plan.searched_chains, plan.iterations) == (3, 2, 4)
-    # Every mode may have a candidate of its own.
-    assert TrackerSettings(max_hypotheses=30, candidates=7).plan.candidates >= 7
-
-
-def test_the_least_budget_still_follows_one_mode():
-    plan = TrackerSettings(evaluation_budget=1).plan
-    assert (plan.hypotheses, plan.candidates, plan.iterations, plan.searched_chains) == (1, 1, 1, 0)
-    least = ACCURATE_BUDGET // SURPRISING_FACTOR
-    assert TrackerSettings(evaluation_budget=least - 1).plan.searched_chains == 0
-    assert TrackerSettings(evaluation_budget=least).plan.searched_chains == 1
 
 
 @pytest.mark.parametrize('seconds', [0.03, 0.3])

@@ -14,7 +14,6 @@ from hmt_ros.image.terms.keypoints import KEYPOINTS
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking import Tracker, TrackerSettings
 from hmt_ros.tracking.classes import known_exchanges, predicted_exchanges, seen_exchanges
-from hmt_ros.tracking.hypotheses import new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
 from test.image.test_keypoints import BODY, CAMERA, exchanged, seen
 
@@ -53,24 +52,6 @@ def test_an_exchange_is_expected_to_stay_and_is_forgotten():
     assert np.exp(known[0, 1]) > 0.9
     assert np.exp(predicted_exchanges(known, 1.0 / 30.0)[0, 1]) > 0.6
     assert np.exp(predicted_exchanges(known, 60.0)[0, 1]) < 0.1
-
-
-def test_images_without_keypoints_only_let_time_pass():
-    known = after(Observation(keypoints=exchanged(seen(standing()), LIMBS)), 3)
-    later = after(Observation(), 1, exchanges=known)
-    np.testing.assert_array_equal(later, predicted_exchanges(known, 1.0 / 30.0))
-    assert later[0, 1] < known[0, 1]
-
-
-def test_who_contradicts_the_track_knows_nothing_of_the_detector():
-    known = after(Observation(keypoints=exchanged(seen(standing()), LIMBS)), 3)
-    expected = new_hypotheses(standing()[None], np.zeros(1), predicted_exchanges(known, 1.0 / 30.0))
-    poses = np.repeat(standing()[None], 2, axis=0)
-    jumped = np.repeat([[False], [True]], BODY.dimension, axis=1)
-    own = known_exchanges(expected.proposed(np.zeros(2, dtype=np.intp), poses, jumped).exchanges)
-    np.testing.assert_array_equal(own[1], usual_exchanges()[0])
-    assert own[0, 1] > own[0, 0]
-    np.testing.assert_allclose(np.exp(own).sum(1), 1.0, rtol=1e-3)
 
 
 def test_what_is_known_of_the_detector_counts_whole_beside_energies_that_last():

@@ -10,12 +10,9 @@ import pytest
 
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.inference.markov_chain import update
-from hmt_ros.tracking.appearance import Motion
 from hmt_ros.tracking.existence import (
     CHAIN,
-    CLEAR,
     GIVEN,
     Existence,
 )
@@ -138,30 +135,6 @@ def test_an_empty_scene_ends_it_within_half_a_second(film, watched, rate):
     assert 0.1 <= np.argmax(found > PRESENT_PROBABILITY) / rate <= 0.34
 
 
-@pytest.mark.parametrize('rate', [2.7, 1.0])
-def test_at_low_rates_one_image_or_two_suffice(film, watched, rate):
-    _, _, watching = watched(full_views(film), rate)
-    found, *_ = watched(empty_views(film, 2), rate, watching=watching, first=6)
-    assert found[-1] < ABSENT_PROBABILITY
-    found, *_ = watched(full_views(film, 2), rate, watching=watching, first=8)
-    assert found[-1] > PRESENT_PROBABILITY
-
-
-@pytest.mark.parametrize('share', [0.36, 0.2])
-def test_clothes_in_the_colours_of_the_room(film, watched, share):
-    """Most of the person is missing in the silhouette, as usual for this one."""
-    rng = np.random.default_rng(0)
-    views = [
-        view_of(view.image, view.silhouette & (rng.random(view.silhouette.shape) < share))
-        for view in full_views(film, 10)
-    ]
-    found, seen, watching = watched(views)
-    assert all(seen)
-    assert found.min() > PRESENT_PROBABILITY
-    _, seen, _ = watched(empty_views(film, 3), watching=watching, first=10)
-    assert not any(seen)
-
-
 def test_a_wrong_pose_is_not_an_absent_person(film, watched):
     """The silhouette is as large as usual, beside the model: the track has to search."""
 
@@ -180,18 +153,6 @@ def test_a_wrong_pose_is_not_an_absent_person(film, watched):
     ]
     found, *_ = watched(remnant, watching=watching, first=11)
     assert watching.last.llr < 0
-
-
-def test_a_part_of_the_person_is_a_person(film, watched):
-    """A table hides the person from the hips down."""
-    _, _, watching = watched(full_views(film, 10))
-    upper = [
-        view_of(view.image, view.silhouette & (np.arange(240) < 130)[:, None])
-        for view in full_views(film, 10)
-    ]
-    found, seen, _ = watched(upper, watching=watching, first=10)
-    assert all(seen)
-    assert found.min() > 0.99
 
 
 @pytest.mark.parametrize('kind', ['black', 'noise', 'white'])
@@ -239,22 +200,6 @@ def test_colours_decide_where_there_is_no_background(film, watched):
     assert 0.4 < 0.1 * (1 + np.argmax(found < ABSENT_PROBABILITY)) < 2.0
 
 
-def test_colours_say_nothing_against_somebody_in_another_scene(film, watched):
-    """Somebody has moved through the image in a gap; then the camera turns."""
-    _, images, _, empty = film
-    _, _, watching = watched([View(image) for image in images[:8]])
-    aside = [View(np.roll(image, 90, axis=1)) for image in images[:5]]
-    found, *_ = watched(
-        aside, watching=watching, first=60,
-        pose_of=lambda pose, _: pose + 90 / 330 * pose[2] * (np.arange(len(pose)) == 0),
-    )  # fmt: skip
-    assert found[-1] > PRESENT_PROBABILITY
-    found, seen, _ = watched([View(empty)] * 50, watching=watching, first=65)
-    assert not any(seen)
-    assert watching.last.llr == 0.0
-    assert found.min() > 5 * ABSENT_PROBABILITY
-
-
 @pytest.mark.parametrize('rate', [10.0, 5.0, 2.7])
 def test_a_thing_that_was_taken_for_somebody_leaves_the_image(film, watched, rate):
     """A track is on a thing and the camera turns: the person is in view as before."""
@@ -279,24 +224,6 @@ def test_a_thing_that_was_taken_for_somebody_leaves_the_image(film, watched, rat
     assert found.min() > 5 * ABSENT_PROBABILITY
 
 
-def test_who_turns_about_may_have_other_colours(film, watched):
-    """The back is blue, which nothing was so far."""
-    _, images, masks, _ = film
-    _, _, watching = watched([View(image) for image in images[:8]])
-    back = images[7].copy()
-    back[masks[7]] = 255, 40, 10
-    found, *_ = watched([View(back)] * 30, watching=watching, first=8)
-    assert not watching.nobody
-    assert found.min() > 5 * ABSENT_PROBABILITY
-
-
-def test_colours_that_are_the_same_everywhere_say_nothing(film, watched):
-    grey = np.full(film[3].shape, 90, np.uint8)
-    _, seen, watching = watched([View(grey)] * 20)
-    assert all(seen)
-    assert watching.last.llr == 0.0
-
-
 def keypoints(count, confidence, at=(100.0, 100.0)):
     return Keypoints(
         tuple(f'joint_{i}' for i in range(count)),
@@ -304,14 +231,6 @@ def keypoints(count, confidence, at=(100.0, 100.0)):
         np.tile(np.eye(2), (count, 1, 1)),
         np.full(count, confidence),
     )
-
-
-def test_a_failed_detector_does_not_end_a_track_with_a_silhouette(film, watched):
-    for rate in (30.0, 10.0, 2.7, 1.0):
-        views = full_views(film, 10, keypoints=NO_KEYPOINTS)
-        found, seen, _ = watched(views, rate)
-        assert all(seen)
-        assert found.min() > PRESENT_PROBABILITY
 
 
 @pytest.mark.parametrize('fields', [{'keypoints': NO_KEYPOINTS}, {'predicted': False}])
@@ -323,12 +242,6 @@ def test_a_detector_alone_can_end_a_track(film, watched, fields):
         found, seen, _ = watched(views, rate, watching=watching, first=2)
         assert not any(seen)
         assert 0.5 <= (1 + np.argmax(found < ABSENT_PROBABILITY)) / rate <= 1.1
-
-
-def test_a_detector_that_does_not_answer_says_nothing(film, watched):
-    grey = np.full(film[3].shape, 90, np.uint8)
-    _, _, watching = watched([View(grey), *[View(grey)] * 20])
-    assert watching.last.llr == 0.0
 
 
 def test_keypoints_far_from_the_model_are_somebody_elsewhere(film, watched):
@@ -358,49 +271,6 @@ def test_who_is_hidden_has_not_left(film, watched, hidden):
     assert not watching.nobody
     assert np.all(np.diff(found) < 0)
     assert found[-1] > 0.3
-
-
-def test_a_part_that_others_hide_is_not_missed(film, watched):
-    """Some of the model is hidden: the share of the rest counts."""
-    views, others = full_views(film, 10), np.zeros(film[3].shape[:2], dtype=np.bool_)
-    others[:100] = True
-    part = [view_of(view.image, view.silhouette & ~others, others=others) for view in views]
-    found, seen, watching = watched(part)
-    assert all(seen)
-    assert not watching.last.hidden
-    assert found.min() > 0.99
-
-
-def test_the_first_image_of_somebody_leaves_it_open(film, watched):
-    """A second one shortly after does not."""
-    found, *_ = watched(full_views(film, 3), watching=Existence())
-    assert found[0] == pytest.approx(0.5)
-    assert found[1] > PRESENT_PROBABILITY
-
-
-def test_a_silhouette_at_the_side_of_the_image_takes_longer(film, watched):
-    times = []
-    for shift in (0, -155):
-        views = []
-        for i in range(12):
-            mask = np.roll(film[2][i % 10], shift, axis=1)
-            mask[:, 250:] = False
-            views.append(view_of(film[1][0], mask))
-        watching = Existence()
-        watched(empty_views(film, 5), watching=watching)
-        stamps = range(5, 17)
-        found = []
-        for i, view in zip(stamps, views, strict=True):
-            watching.look(view._replace(stamp=i * SECOND // 10), None)
-            found.append(watching.somebody)
-        times.append(0.1 * np.argmax(found))
-    assert times[0] == pytest.approx(0.3)
-    assert 0.4 <= times[1] <= 0.7
-
-
-def test_llr_has_the_share_of_the_time(film, watched):
-    _, _, watching = watched(full_views(film, 3), 10.0)
-    assert watching.last.llr == pytest.approx(CLEAR.nats * share_of_time(0.1, CLEAR.tau))
 
 
 # What stands still.
@@ -444,35 +314,3 @@ def test_a_person_who_moves_is_there(film, watched):
     assert all(seen)
     assert found.min() > 0.95
     assert 'motion' in watching.last.said
-
-
-def test_where_nothing_moves_nobody_leaves(film, watched):
-    found, _, watching = watched(bare_views(film, [0] * 10), 0.5)
-    assert found.min() >= GIVEN
-    assert 'motion' not in watching.last.said
-    appearance = watching.appearance
-    assert appearance.motion(View(film[1][0])) == Motion(moved=False, still=True)
-    # What moves elsewhere may be who has left; what moves everywhere is the camera.
-    other = film[1][0].copy()
-    other[:60, :60] = 255 - other[:60, :60]
-    for image in (other, np.roll(film[1][0], 9, axis=1), 255 - film[1][0]):
-        assert appearance.motion(View(image)) == Motion(moved=False, still=False)
-    assert appearance.motion(View(film[1][6])) == Motion(moved=True, still=False)
-
-
-def test_a_black_image_is_no_still_one(film, watched):
-    black = View(np.zeros_like(film[1][0]))
-    found, *_ = watched([View(film[1][0]), *[black] * 5], 1.0)
-    assert found[-1] < PRESENT_PROBABILITY
-
-
-def test_before_anything_has_spoken_nothing_is_told(film, human32):
-    existence = Existence()
-    existence.look(View(film[1][0]), human32, waiting=True)
-    assert not existence.told
-    empty = View(film[1][0], keypoints=NO_KEYPOINTS, stamp=SECOND)
-    existence.look(empty, human32, waiting=True)
-    assert existence.told
-    assert existence.log_odds == pytest.approx(
-        math.log(existence.probability / (1 - existence.probability))
-    )

@@ -18,11 +18,10 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.settings import AXIS_SIGMA, UP_SIGMA
+from hmt_ros.tracking.settings import AXIS_SIGMA
 from test.image.drawn_rooms import ROOM_CAMERA, drawn, room, turn
 
 RATE = 30.0
@@ -110,14 +109,6 @@ def test_what_is_known_is_the_estimate():
     assert ground.plane @ [*PITCHED.translation, 1.0] == pytest.approx(0.0)
 
 
-def test_nothing_known_before_the_first_image():
-    ground = GroundEstimator().estimate
-    assert ground.up == pytest.approx([0.0, -1.0, 0.0])
-    assert ground.up_sigma == UP_SIGMA
-    assert ground.height is None
-    assert ground.plane is None
-
-
 @pytest.mark.parametrize('name', ['reaching', 'walking'])
 def test_the_height_of_the_camera_is_found(name, body, request):
     poses = request.getfixturevalue(name)
@@ -137,13 +128,6 @@ def test_a_floor_is_measured_where_its_height_was_given(body, reaching):
     assert not after(GroundEstimator(KnownGround(None, 1.4)), body, reaching[:5]).plane.measured
 
 
-def test_a_jump_does_not_lift_the_floor(body, reaching):
-    poses = reaching.copy()
-    poses[60:75, :3] += 0.3 * up_of(PITCHED)
-    found = after(GroundEstimator(KnownGround(up_of(PITCHED))), body, poses[:75]).estimate
-    assert found.height == pytest.approx(1.4, abs=0.05)
-
-
 def test_the_vertical_is_found_slowly_and_never_surely(body, reaching):
     estimator = GroundEstimator()
     truth = up_of(PITCHED)
@@ -161,25 +145,6 @@ def test_the_vertical_is_found_slowly_and_never_surely(body, reaching):
     assert (points @ plane.up + plane.height).min() == pytest.approx(
         0.0, abs=2 * plane.height_sigma
     )
-
-
-def test_a_vertical_far_from_that_of_the_image_is_not_believed(body, reaching):
-    tilted = Viewpoint(distance=3.5, height=1.4, pitch=np.radians(60.0))
-    poses = procedural_motion('reach', body, 3.0, RATE, 1, viewpoint=tilted)
-    found = after(GroundEstimator(), body, np.tile(poses, (5, 1))).estimate
-    assert degrees_between(found.up, np.array([0.0, -1.0, 0.0])) <= 35.0 + 1e-6
-
-
-def test_newer_directions_replace_the_known_one():
-    estimator = GroundEstimator(KnownGround(up_of(PITCHED), 1.4))
-    assert not estimator.turning
-    other = up_of(Viewpoint(pitch=np.radians(25.0)))
-    estimator.set_gravity(other)
-    assert estimator.estimate.up == pytest.approx(other)
-    assert estimator.estimate.height == 1.4
-    assert estimator.turning
-    with pytest.raises(ValueError, match='up must be a unit vector'):
-        estimator.set_gravity([0.0, 0.0, 0.0])
 
 
 def looked(estimator: GroundEstimator, *pitches: float | None) -> GroundEstimator:
@@ -237,12 +202,6 @@ def test_a_given_vertical_is_refined_by_lines_that_agree():
             between * degrees_between(alone.up, pitched(13.5).up), abs=0.3
         )
         assert found.up_sigma == pytest.approx(precise.sum() ** -0.5, rel=0.1)
-
-
-def test_lines_move_a_given_vertical_by_its_deviation_at_most():
-    for given in (6.0, 8.0, 10.0):
-        found = looked(GroundEstimator(pitched(given)), 15.0).estimate
-        assert degrees_between(found.up, pitched(given).up) < 2.01
 
 
 @pytest.mark.parametrize(('given', 'seen'), [(40.0, (None, None)), (-30.0, (0.0,))])
@@ -318,13 +277,6 @@ def test_a_person_who_lies_by_the_given_vertical_contradicts_an_unusual_one(body
     assert not usual.contradicted
 
 
-def test_what_the_lines_showed_is_carried_with_the_camera():
-    estimator = looked(GroundEstimator(), 10.0)
-    turned = turn(np.radians(12.0), 0.0)
-    estimator.carry(CameraMotion(turned, np.zeros(3)))
-    assert pitch_of(estimator) == pytest.approx(22.0, abs=1.0)
-
-
 @pytest.mark.parametrize('rate', [10.0, 30.0, 60.0])
 def test_contacts_are_those_of_a_walker(body, rate):
     """Points of the soles that rest in the motion rest, and those that swing do not."""
@@ -370,28 +322,6 @@ def test_before_a_camera_that_moves_only_heights_tell_of_contact(body, reaching)
     assert rests['slides', True] < 0.5 < rests['stays', True]
     assert rests['slides', False] == pytest.approx(rests['stays', False])
     assert rests['rises', False] < 0.5 < rests['slides', False]
-
-
-def test_weights_of_zero_leave_the_terms_out(body, camera, reaching):
-    estimator = GroundEstimator(KnownGround(up_of(PITCHED), 1.4))
-    settings = TrackerSettings(ground=OFF)
-    without = Posterior(body, camera, settings)
-    with_it = Posterior(body, camera, settings, ground=estimator)
-    assert with_it.body is body
-    assert with_it.known == ()
-    energies = [
-        x.of_image(Observation()).energy(reaching[:4], np.arange(4)) for x in (without, with_it)
-    ]
-    for a, b in zip(*energies, strict=True):
-        assert np.array_equal(a, b)
-    on = Posterior(body, camera, TrackerSettings(), ground=estimator)
-    assert len(on.known) == 1
-    # Also of a body that has lost the prior of its root before.
-    again = Posterior(on.body, camera, TrackerSettings(), ground=estimator)
-    costs = [
-        x.of_image(Observation()).energy(reaching[:1], np.arange(1)).value for x in (on, again)
-    ]
-    assert costs[0] == costs[1]
 
 
 def test_the_lean_is_measured_against_gravity_and_not_against_the_camera(body, camera, reaching):

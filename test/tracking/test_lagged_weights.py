@@ -87,22 +87,6 @@ def test_weights_are_the_sum_over_all_histories(seed):
     assert np.abs(found[1].posterior.weights - recursion[1][0]).max() > 0.01
 
 
-def test_without_a_lag_it_is_what_was_published():
-    lagged = LaggedWeights(0)
-    for t, (weights, origins, _) in enumerate(forward(4, 0)):
-        (one,) = lagged.update(t, mixture(weights), origins)
-        assert (one.stamp, one.posterior) == (t, mixture(weights).normalised())
-    assert lagged.finish() == []
-
-
-def test_a_track_that_begins_ends_the_one_before():
-    lagged = LaggedWeights(10)
-    a, b = forward(3, 0), forward(2, 1)
-    found = [lagged.update(t, mixture(x[0]), x[1]) for t, x in enumerate([*a, *b])]
-    assert [[one.stamp for one in each] for each in found] == [[], [], [], [0, 1, 2], []]
-    assert found[3][0].posterior.weights == pytest.approx(by_all_histories(a, 0), abs=1e-12)
-
-
 def test_what_is_kept_is_bounded_by_the_lag():
     lagged, keep = LaggedWeights(4), np.eye(2)
     for t in range(50):
@@ -117,11 +101,6 @@ def test_origins_of_other_modes_are_refused(origins):
     lagged.update(0, mixture([0.5, 0.5]), np.empty((2, 0)))
     with pytest.raises(ValueError, match=r'wanted origins \(2, 2\), saw'):
         lagged.update(1, mixture([0.5, 0.5]), origins)
-
-
-def test_a_negative_lag_is_refused():
-    with pytest.raises(ValueError, match='lag must not be negative, saw -1'):
-        LaggedWeights(-1)
 
 
 def test_the_weights_of_a_tracker(filmed, camera, human32, keypoints_of):

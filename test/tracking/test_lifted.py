@@ -61,34 +61,6 @@ def test_keypoints_get_what_experts_say(walk, monkeypatch):
     assert len(given[0].lifted.log_weights) == 5
 
 
-def test_experts_can_be_switched_off(walk, monkeypatch):
-    _, _, seen = walk
-    tracker = Tracker(BODY, CAMERA, settings(lifter=''), seed=0)
-    given = observed(tracker, monkeypatch)
-    tracker.step(BLANK, 0, seen[0])
-    assert given[0].lifted is None
-    with pytest.raises((OSError, ValueError), match=r'none\.npz'):
-        Tracker(BODY, CAMERA, settings(lifter='none.npz'))
-
-
-def test_keypoints_that_may_be_anywhere_are_none(walk, monkeypatch):
-    _, _, seen = walk
-    faint = replace(seen[0], covariances=1e10 * np.ones_like(seen[0].covariances) * np.eye(2))
-    tracker = Tracker(BODY, CAMERA, settings(), seed=0)
-    given = observed(tracker, monkeypatch)
-    tracker.step(BLANK, 0, faint)
-    assert given[0].lifted is None
-
-
-def test_without_keypoints_nothing_changes(monkeypatch):
-    nobody = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
-    tracker = Tracker(BODY, CAMERA, settings(), seed=0)
-    given = observed(tracker, monkeypatch)
-    tracker.step(BLANK, 0, None)
-    tracker.step(BLANK, STEP, nobody)
-    assert given == [None, nobody]
-
-
 def test_a_guess_in_space_is_pooled_with_them(walk, monkeypatch):
     _, joints, seen = walk
     hips = BODY.skeleton.joint_index(HIPS)

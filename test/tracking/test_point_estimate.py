@@ -108,15 +108,6 @@ def test_it_keeps_its_way_until_no_image_may_be_wrong_by_so_much(human37, pose, 
         assert estimate.pose == pytest.approx(both[wanted], abs=1e-6)
 
 
-def test_a_limb_that_two_modes_dispute_is_between_them(human37, pose, dynamics):
-    elbow = human37.dof_names.index('left_elbow')
-    both = np.stack([pose, pose])
-    both[1, elbow] -= 0.5
-    estimate = PointEstimate()
-    estimate.update(human37, dynamics, mixture(both, (0.6, 0.4)), None)
-    assert estimate.pose[elbow] == pytest.approx(pose[elbow] - 0.2)
-
-
 def test_a_turn_over_half_a_circle_is_the_short_way(human37, pose, dynamics):
     estimate = PointEstimate()
     root_z = human37.dof_names.index('root_z')
@@ -128,14 +119,6 @@ def test_a_turn_over_half_a_circle_is_the_short_way(human37, pose, dynamics):
     assert ways[1] @ ways[0] > ways[2] @ ways[0] - 1e-6
     # Turns are counted as the modes count them.
     assert abs(estimate.pose[root_z] - second[root_z]) < 0.1
-
-
-def test_modes_that_begin_are_taken_at_once(human37, pose, dynamics):
-    estimate = PointEstimate()
-    elsewhere = pose + 0.1
-    for one, dt in ((pose, None), (pose, DT), (elsewhere, None)):
-        estimate.update(human37, dynamics, mixture(one), dt)
-    assert estimate.pose == pytest.approx(np.clip(elsewhere, human37.lower, human37.upper))
 
 
 def test_while_nothing_is_seen_the_motion_goes_on(human37, pose, dynamics):

@@ -9,7 +9,7 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.tracking.hypotheses import Modes
-from hmt_ros.tracking.prediction import dynamics_of, predict
+from hmt_ros.tracking.prediction import predict
 
 K = 3
 
@@ -87,16 +87,3 @@ def test_two_predictions_are_one_over_the_sum_of_times(human37):
     _, once = predict(modes, human37, motion_prior(human37), 0.4)
     np.testing.assert_allclose(twice.means, once.means, atol=1e-11)
     np.testing.assert_allclose(twice.covariances, once.covariances, atol=1e-11)
-
-
-def test_predictions_stay_within_the_limits(human37):
-    modes = modes_of(human37)
-    fast = replace(modes, velocities=np.full_like(modes.poses, 1e9))
-    predicted, _ = predict(fast, human37, motion_prior(human37), 1.0)
-    assert np.array_equal(predicted.poses, np.tile(human37.upper, (K, 1)))
-
-
-def test_the_setting_chooses_the_dynamics(human37):
-    assert dynamics_of(human37, 'learned') is motion_prior(human37)
-    walk = dynamics_of(human37, 'random_walk')
-    np.testing.assert_array_equal(walk.diffusion, np.diag(human37.rates))

@@ -13,7 +13,7 @@ from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.shape import GROWTH_SIGMAS, MIN_LENGTH_SIGMA, ShapeSpace
+from hmt_ros.body.shape import GROWTH_SIGMAS, ShapeSpace
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.image_term import TermSettings
@@ -148,21 +148,6 @@ def test_an_update_is_joint_least_squares_of_shape_and_pose(human37, trust, star
     assert np.allclose(estimate.covariance, covariance, rtol=1e-6, atol=1e-12)
 
 
-def test_modes_count_by_their_weights(human37):
-    """Two modes that linearise a linear energy at different poses say the same."""
-    both, one = (toy(human37, 1)[0] for _ in range(2))
-    poses = np.array([np.full(6, 0.05), np.full(6, -0.02)])
-    covariance = np.linalg.inv(both.hessian())
-    gradients = np.array([both.by_pose.T @ both.error(pose) + pose for pose in poses])
-    both.update(
-        None, None, poses, np.array([0.3, 0.7]), gradients, np.array([covariance] * 2),
-        trust=0.5,
-    )  # fmt: skip
-    update(one, poses[0], trust=0.5)
-    assert np.allclose(both.theta(), one.theta(), atol=1e-12)
-    assert np.allclose(both.covariance, one.covariance)
-
-
 def test_information_only_shrinks_what_is_not_known(human37):
     estimate, _ = toy(human37, 2)
     for _ in range(3):
@@ -189,18 +174,6 @@ def test_many_images_tell_no_more_than_their_common_error_lets_them(human37):
     assert wanted[-1] < 1.0 / c
 
 
-def test_nothing_is_learned_where_nothing_is_seen(human37):
-    estimate = ShapeEstimate(human37)
-    empty = np.zeros((1, human37.dimension))
-    before = estimate.covariance.copy()
-    estimate.update(
-        ImageLikelihood(human37, CAMERA), Observation(), empty, np.ones(1), empty,
-        np.eye(human37.dimension)[None], trust=0.35,
-    )  # fmt: skip
-    assert np.allclose(estimate.covariance, before)
-    assert estimate.body.segment_lengths == pytest.approx(human37.segment_lengths)
-
-
 def test_steps_and_shapes_have_limits(human37):
     estimate, _ = toy(human37, 3, pose_size=human37.dimension)
     estimate.measured = 1e3 * estimate.measured
@@ -212,14 +185,6 @@ def test_steps_and_shapes_have_limits(human37):
     furthest = np.abs(estimate.theta() / spread)
     assert furthest.max() == pytest.approx(MAX_SHAPE_CHANGE)
     assert all(min(part.radii) > 0 for part in estimate.body.flesh.parts)
-
-
-def test_what_people_differ_by_is_where_an_estimate_begins(human37):
-    known = replace(human37, length_covariance=np.zeros_like(human37.length_covariance))
-    deviations = deviations_of(ShapeEstimate(known))
-    assert deviations['thigh'] == (0.0, pytest.approx(MIN_LENGTH_SIGMA))
-    assert deviations['trunk_depth'] == (0.0, pytest.approx(GROWTH_SIGMAS['depth']))
-    assert deviations['foot_end'] == (0.0, pytest.approx(GROWTH_SIGMAS['end']))
 
 
 # What an image says of shape and pose.
@@ -369,15 +334,6 @@ def test_flesh_comes_nearer_to_the_true_one(human37, stout, poses):
     lengths = estimate.body.segment_lengths
     for name, true in stout.segment_lengths.items():
         assert abs(lengths[name] - true) < 0.03
-
-
-def test_the_own_shape_stays(human37, poses):
-    estimate = fitted(human37, human37, poses[:2], rounds=1)
-    sigmas = np.array([moved / sigma for moved, sigma in deviations_of(estimate).values()])
-    assert np.sqrt((sigmas**2).mean()) < 0.5
-    again = fitted(human37, human37, poses[:2], rounds=1)
-    assert np.array_equal(again.covariance, estimate.covariance)
-    assert deviations_of(again) == deviations_of(estimate)
 
 
 def test_lengths_come_nearer_to_the_true_ones_with_keypoints(human37, poses):

@@ -69,20 +69,6 @@ def test_a_mask_without_a_person_is_no_silhouette(film, subject, human32, camera
     assert in_bytes(runs[0]) == in_bytes(runs[1])
 
 
-def test_no_background_is_learned_from_what_a_mask_shows_a_person_in(film, human32, camera):
-    _, images, _ = film
-    mask = np.zeros(images[0].shape[:2], dtype=bool)
-    tracker = Tracker(human32, camera)
-    tracker.step(images[0], 0, mask=mask)
-    assert tracker.silhouettes.background.frames == 1
-    mask[50:60, 50:60] = True
-    tracker.step(images[1], 1, mask=mask)
-    assert tracker.silhouettes.background.frames == 1
-    assert not tracker.silhouettes.scene.known
-    with pytest.raises(ValueError, match=r'images of \(240, 320\), saw a mask of \(120, 320\)'):
-        tracker.step(images[1], 2, mask=mask[::2])
-
-
 @pytest.fixture(scope='module')
 def crossing(human32, camera):
     """Poses and images of a person who stands and then walks aside, and the empty scene."""
@@ -118,31 +104,6 @@ def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, huma
     wanted = BackgroundModel.from_image(empty).silhouette(images[-1])
     for one in (found, wanted):
         assert (one & mask).sum() / (one | mask).sum() > 0.8
-
-
-def test_backgrounds_that_are_not_doubted(crossing, human32, camera):
-    """An empty scene; nothing learned; nobody in view."""
-    poses, images, empty = crossing
-    given = Silhouettes(BackgroundModel.from_image(empty))
-    given.learn(images[0], 0)
-    assert given.background.frames == 1
-    # Nobody is before an empty scene that was given.
-    given.check(empty, human32, camera, poses[:1])
-    assert not given.doubted
-    known = Silhouettes(BackgroundModel())
-    for i in range(21):
-        known.learn(empty, i * FRAME)
-    known.check(images[0], human32, camera, poses[:1])
-    assert known.silhouette(images[0], 21 * FRAME, None, None).foreground.any()
-    far = poses[:1].copy()
-    far[:, 2] = -3.0
-    known.check(empty, human32, camera, far)
-    assert not known.doubted
-    nothing = Silhouettes(BackgroundModel())
-    nothing.check(images[0], human32, camera, poses[:1])
-    nothing.complete(images[0], human32, camera, poses[:1])
-    assert (nothing.doubted, nothing.known) == (False, 'unknown')
-    assert nothing.silhouette(images[0], 0, None, None) is None
 
 
 def test_tracking_where_the_background_was_learned_with_the_person_in_it(

@@ -11,8 +11,7 @@ from hmt_learning.rendering.renderer import render_frames, sensed_depth
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import load_body
 from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.joint_depths import depths_of, joint_depths, moved_to_depth
-from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.joint_depths import depths_of, joint_depths
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.tracking import Subject, Tracker
 from hmt_ros.tracking.beginning import Shown, Source, first_start
@@ -50,21 +49,6 @@ def best(start):
     return start.poses[0], start.body.stature
 
 
-def test_joints_lie_behind_the_skin(tall, keypoints_of):
-    body, poses, _, depths, _ = tall
-    found = joint_depths(body, keypoints_of(body, poses[0], 1.0), depths_of(depths[0]))
-    true = body.joint_positions(poses[:1])[0, found.joints, 2]
-    error = (found.depths - true) / found.sigma
-    assert len(true) > 15
-    assert np.median(np.abs(error)) < 1.0
-    assert np.median(np.abs(found.depths - true)) < 0.06
-    # The kernel bounds the cost of what is elsewhere.
-    cost, pull, curvature = found.residuals(found.depths + 2.0)
-    assert (cost <= 8.0).all()
-    assert (np.abs(pull) < 1.0).all()
-    assert (curvature > 0).all()
-
-
 def test_the_pull_is_the_derivative_of_the_energy(tall, keypoints_of):
     body, poses, _, depths, _ = tall
     found = joint_depths(body, keypoints_of(body, poses[0], 1.0), depths_of(depths[0]))
@@ -84,17 +68,6 @@ def test_a_start_from_keypoints_finds_distance_and_stature(tall, camera, keypoin
     assert stature == pytest.approx(STATURE, abs=0.05)
 
 
-def test_a_start_without_measured_depth_is_the_start_without_depth(tall, camera, keypoints_of):
-    body, poses, _, depths, _ = tall
-    assert depths_of(None) is None
-    assert depths_of(np.full_like(depths[0], np.nan)) is None
-    assert depths_of(np.zeros_like(depths[0])) is None
-    model, seen = load_body('human37'), subject_of(keypoints_of(body, poses[0], 1.0))
-    window = ImageMap(np.zeros((1, 4, 4), np.float32))
-    one, other = (start_from_keypoints(model, camera, seen, depths=x) for x in (None, window))
-    assert np.allclose(one.poses[0], other.poses[0], atol=0.02)
-
-
 @pytest.mark.parametrize('wall', [0.5, 1.0, 9.0])
 def test_depth_of_something_else_does_not_spoil_a_start(tall, camera, keypoints_of, wall):
     """A person of the size that such a depth says does not exist."""
@@ -105,19 +78,6 @@ def test_depth_of_something_else_does_not_spoil_a_start(tall, camera, keypoints_
     spoilt = start_from_keypoints(model, camera, seen, depths=flat)
     assert spoilt.poses[0, 2] == pytest.approx(plain.poses[0, 2], rel=0.02)
     assert spoilt.body.stature == pytest.approx(plain.body.stature, abs=0.02)
-
-
-def test_poses_move_along_their_rays(tall, camera):
-    body, poses, _, depths, _ = tall
-    wrong = np.tile(poses[0], (3, 1))
-    wrong[:, :3] *= np.array([[0.8], [1.0], [1.3]])
-    moved = moved_to_depth(body, camera, wrong, depths_of(depths[0]))
-    assert np.allclose(moved[:, 2], poses[0, 2], atol=0.08)
-    assert np.allclose(moved[:, 0] / moved[:, 2], poses[0, 0] / poses[0, 2])
-    assert np.array_equal(moved[:, 3:], wrong[:, 3:])
-    assert np.array_equal(moved_to_depth(body, camera, wrong, None), wrong)
-    beside = wrong + np.array([50.0, *np.zeros(body.dimension - 1)])
-    assert np.array_equal(moved_to_depth(body, camera, beside, depths_of(depths[0])), beside)
 
 
 def shown(view, stamp, model, camera, given=None, box=None):
@@ -138,20 +98,6 @@ def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
         assert source is Source.BOX
         found[name] = np.abs(start.expected.means[:, 2] - poses[0, 2]).max()
     assert found['with'] < 0.18 < found['without']
-
-
-def test_the_joints_of_an_older_image_are_not_looked_up_in_this_depth(tall, camera, keypoints_of):
-    """A person who was clicked in another image is elsewhere by now."""
-    body, poses, images, depths, _ = tall
-    model = load_body('human37')
-    given = subject_of(keypoints_of(body, poses[0], 1.0))
-    # A wall stands where the person was.
-    view = View(images[0], depth=np.full_like(depths[0], 1.5))
-    late, plain = (
-        first_start(shown(x, 900 * MS, model, camera, given=given), Existence())[1]
-        for x in (view, View(images[0]))
-    )
-    assert np.array_equal(late.best, plain.best)
 
 
 @pytest.fixture(scope='module')
@@ -181,20 +127,9 @@ def test_a_track_is_nearer_with_depth(tracked):
     assert tracked['depth'][0].max() < 0.08
 
 
-def test_holes_alone_are_as_no_depth(tracked):
-    assert np.array_equal(tracked['holes'][0], tracked['no depth'][0])
-    assert np.array_equal(tracked['holes'][1].weights, tracked['no depth'][1].weights)
-
-
 def test_depth_makes_the_distance_more_certain(tracked):
     sigma = {name: np.sqrt(mixture.covariance()[2, 2]) for name, (_, mixture) in tracked.items()}
     assert sigma['depth'] < 0.7 * sigma['no depth']
-
-
-def test_depth_of_another_size_is_refused(tall, camera):
-    tracker = Tracker(load_body('human37'), camera)
-    with pytest.raises(ValueError, match=r'images of \(240, 320\), saw depths of \(24, 32\)'):
-        tracker.step(tall[2][0], 0, depth=np.ones((24, 32)))
 
 
 def test_depth_that_is_not_registered_does_no_harm(tracked):

@@ -46,19 +46,6 @@ def lean(body, pose: np.ndarray, true: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(spine[0] @ spine[1], -1.0, 1.0))))
 
 
-def test_the_shortest_turn_takes_one_direction_to_another():
-    rng = np.random.default_rng(0)
-    for start, end in rng.normal(size=(5, 2, 3)):
-        start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
-        turn = shortest_turn(start, end)
-        assert np.allclose(turn @ start, end)
-        assert np.allclose(turn @ turn.T, np.eye(3))
-        assert np.trace(turn) == pytest.approx(1.0 + 2.0 * start @ end)
-    upside_down = shortest_turn(np.array([0.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0]))
-    assert np.allclose(upside_down @ [0.0, -1.0, 0.0], [0.0, 1.0, 0.0])
-    assert np.linalg.det(upside_down) == pytest.approx(1.0)
-
-
 def test_poses_are_turned_upright(body):
     poses = np.tile(body.prior_mean, (4, 1))
     poses[:, body.dof_names.index('root_z')] = [-2.0, 0.0, 1.0, 3.0]

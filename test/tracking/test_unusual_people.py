@@ -116,14 +116,3 @@ def test_a_camera_that_rolls_and_a_bump(human37, camera, keypoints_of):
         )
         relative = [x - x[0] for x in (found, true)]
         assert np.linalg.norm(relative[0] - relative[1], axis=1).mean() < 0.2
-
-
-@pytest.mark.parametrize('gravity', [[0.0, 0.0, 0.0], [np.nan, 1.0, 0.0], [1.0, 0.0]])
-def test_what_is_no_direction_is_refused_and_the_track_goes_on(
-    gravity, human37, camera, keypoints_of
-):
-    poses = np.tile(pose_of(human37, {}), (2, 1))
-    tracker, _ = followed(human37, camera, keypoints_of, poses)
-    with pytest.raises(ValueError, match='up must be a unit vector'):
-        tracker.set_gravity(gravity)
-    assert np.array_equal(tracker.estimate.ground.up, UP)

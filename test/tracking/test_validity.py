@@ -83,17 +83,6 @@ def test_images_are_those_of_a_hidden_markov_model():
         assert validity.cues[KEYPOINTS] == pytest.approx(p @ cues[:, 1:])
 
 
-def test_a_search_leaves_what_is_known_of_the_cues():
-    validity = Validity()
-    for _ in range(9):
-        validity.predict(0.1)
-        validity.update({SILHOUETTE: whole(0.9), OUTLINE: whole(0.0)}, 0.1)
-    before = validity.cues[SILHOUETTE].copy()
-    validity.search()
-    assert validity.track == pytest.approx(USUAL)
-    assert validity.cues[SILHOUETTE] == pytest.approx(before)
-
-
 def test_what_measurements_say():
     few = Misfit(np.array([0.0, 1.0, 1.0]), np.array([0, 1, 100]))
     undecided = UNDECIDED[KEYPOINTS]
@@ -105,23 +94,6 @@ def test_what_measurements_say():
         counts, share = np.array([VALIDITY_COUNT]), undecided - e / VALIDITY_NATS
         found = evidence_of(KEYPOINTS, Misfit(np.array([share]), counts))
         assert found == pytest.approx(np.sign(e) * most)
-
-
-def test_depths_follow_given_the_track():
-    validity = Validity()
-    p, q, dt = USUAL, USUAL, 0.1
-    e = share_of_time(dt, MISFIT_TIME) * VALIDITY_NATS * (UNDECIDED[DEPTH] - 0.3)
-    validity.update({DEPTH: whole(0.3)}, dt)
-    valid = p * (q * np.exp(e) + 1 - q)
-    assert validity.cues[DEPTH] == pytest.approx(valid / (valid + 1 - p))
-    assert validity.track == pytest.approx(q)
-
-
-def test_one_image_says_no_more_than_it_can():
-    validity = Validity()
-    validity.update({OUTLINE: whole(0.0)}, np.inf)
-    odds = validity.track / (1 - validity.track)
-    assert np.log(odds) == pytest.approx(np.log(RECOVERS / FAILS) + MAX_CUE_NATS)
 
 
 @pytest.mark.parametrize('rate', [60.0, 15.0, 5.0])
@@ -272,9 +244,3 @@ def test_points_that_are_no_foreground():
     shares, counts = of_points(seen(points), 0, foreground)
     assert shares.tolist() == [0.25]
     assert counts.tolist() == [20.0]
-
-
-def test_points_outside_the_image_say_nothing():
-    for points in ([(-3, 0), (7, 0)], np.zeros((0, 2))):
-        shares, counts = of_points(seen(points), 0, np.zeros((4, 4), dtype=bool))
-        assert shares.tolist() == counts.tolist() == [0.0]

@@ -9,9 +9,7 @@ import pytest
 
 from hmt_ros.body.mirror import reverse_depth
 from hmt_ros.tracking.settings import END_NATS, TRANSITION_SPREAD, TRANSITION_TAILS
-from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_origins
-
-DT = 0.1
+from hmt_ros.tracking.weighting import Continuity, normalised, pooled_origins
 
 
 @pytest.fixture(scope='module')
@@ -58,14 +56,6 @@ def test_transitions_are_a_student_density_of_the_joints(human32, poses_near, dt
     assert found == pytest.approx(np.array(wanted), abs=1e-9)
 
 
-def test_where_the_person_stands_is_no_part_of_a_transition(human32, poses_near):
-    before = poses_near(1)
-    aside = before.copy()
-    aside[:, :3] += 1.0
-    found = Continuity(human32, before, np.zeros(1), DT).log_transitions(aside)
-    assert found == pytest.approx(0.0, abs=1e-9)
-
-
 def test_weights_are_the_sum_over_all_paths(human32, poses_near):
     """Three modes in each of four images: the recursion against all 3^4 ways through them."""
     images, count = 4, 3
@@ -89,15 +79,6 @@ def test_weights_are_the_sum_over_all_paths(human32, poses_near):
         wanted[path[-1]] += share
     assert np.exp(log_weights) == pytest.approx(wanted / wanted.sum(), rel=1e-10)
     assert np.ptp(log_weights) > 0.5
-
-
-def test_what_a_pose_alone_goes_on_from(human32, poses_near):
-    before, poses = poses_near(3, 1), poses_near(4, 2)
-    log_weights = normalised(np.array([0.0, -1.0, -3.0]))
-    found = Continuity(human32, before, log_weights, DT).rated(poses)
-    for n, pose in enumerate(poses):
-        logs = [w + log_transition(human32, pose, b, DT) for w, b in zip(log_weights, before)]
-        assert found[n] == pytest.approx(np.log(np.exp(logs).sum()), abs=1e-9)
 
 
 def test_a_mode_without_continuation_ends(human32, poses_near):
@@ -147,18 +128,6 @@ def test_gaps_of_any_length_give_finite_numbers(human32, poses_near, dt):
         assert np.exp(log_priors(continuity, poses)) == pytest.approx(0.25, rel=0.02)
 
 
-def test_weights_are_normalised():
-    found = normalised(np.array([-1000.0, -1001.0]))
-    assert np.exp(found) == pytest.approx([np.e / (1 + np.e), 1 / (1 + np.e)], rel=1e-12)
-
-
-def test_no_mode_falls_below_the_least_weight():
-    raised = at_least(normalised(np.array([0.0, -5.0, -1000.0])), -10.0)
-    assert np.exp(raised).sum() == pytest.approx(1.0, abs=1e-15)
-    assert raised[2] == pytest.approx(-10.0, abs=1e-3)
-    assert raised[0] - raised[1] == pytest.approx(5.0, abs=1e-12)
-
-
 def test_origins_of_modes_that_stand_for_several():
     rng = np.random.default_rng(0)
     histories, log_weights = rng.normal(size=(3, 6)), rng.normal(size=6)
@@ -171,8 +140,3 @@ def test_origins_of_modes_that_stand_for_several():
             wanted += np.exp(log_weights[n]) * own
             total += np.exp(log_weights[n])
         assert found[m] == pytest.approx(wanted / total, abs=1e-12)
-
-
-def test_modes_that_begin_have_no_origins():
-    found = pooled_origins(np.empty((0, 3)), np.zeros(3), np.array([0, 1, 1]))
-    assert found.shape == (2, 0)

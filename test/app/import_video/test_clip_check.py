@@ -8,7 +8,6 @@ import pytest
 from hmt_learning.training.training_set import procedural_sequence
 from hmt_ros.app.import_video.frames import FrameSource
 from hmt_ros.app.import_video.keypoint_files.choice import Choice
-from hmt_ros.app.import_video.keypoint_files.clip_check import bone_deviation, check_clip
 from hmt_ros.app.import_video.keypoint_files.reading import (
     ClipReading,
     keypoints_of_person,
@@ -89,20 +88,6 @@ def test_points_in_no_order_are_refused(tmp_path):
     assert len(read(tmp_path, points[:9])[0]) == 9
 
 
-def test_bones_of_people_have_small_deviations():
-    """z of the right order is small at any scale of the image, and large in a wrong one."""
-    points = walker('coco17')[..., :2]
-    points[points == 0.0] = np.nan
-    names = schemes()['coco17'].names
-    right = bone_deviation(names, points)
-    assert right < 2.2
-    assert bone_deviation(names, 0.1 * points) == pytest.approx(right)
-    assert bone_deviation(names, points[:, ::-1]) > 4.0
-    # Of few images, or of few bones, one can not tell.
-    assert np.isnan(bone_deviation(names, points[:9]))
-    assert np.isnan(bone_deviation(names, np.where(np.arange(17)[:, None] < 7, points, np.nan)))
-
-
 @pytest.mark.parametrize('scheme', ['coco17', 'body25', 'halpe26'])
 @pytest.mark.parametrize('hidden', [('ankle', 'heel', 'toe'), ('knee', 'ankle', 'heel', 'toe')])
 def test_half_a_person_keeps_the_usual_order(scheme, hidden, tmp_path):
@@ -132,19 +117,6 @@ def test_percent(scale, said, tmp_path):
     chosen, told = read(tmp_path, points * (1, 1, scale))
     assert said in told
     assert chosen[0].confidences[5:] == pytest.approx(points[0, 5:, 2])
-
-
-def test_other_confidences(tmp_path):
-    points = walker('coco17')
-    points[..., 2] = 0.4
-    chosen, told = read(tmp_path, points)
-    assert 'all confidences are 0.4: they tell nothing' in told
-    assert (chosen[0].confidences[5:] == 1.0).all()
-    # Those of some detectors are a little above 1.
-    points[:, 7, 2] = 1.1
-    chosen, told = read(tmp_path, points)
-    assert told == ''
-    assert chosen[0].confidences[7] == 1.0
 
 
 def test_points_of_smaller_images(tmp_path):
@@ -188,10 +160,3 @@ def test_mirror_images(tmp_path):
     assert again.names == plain[0].names
     np.testing.assert_allclose(again.pixels, plain[0].pixels)
     assert chosen[0].names[right] == 'left_wrist'
-
-
-def test_a_clip_without_anybody_is_no_fault(tmp_path):
-    (tmp_path / 'walk.json').write_text('[]', 'utf-8')
-    found = read_keypoints(tmp_path / 'walk.json', Numbered(tmp_path), 0)
-    check_clip(found, SIZE, print)
-    assert keypoints_of_person(found, ClipReading(), SIZE, print) == {}

@@ -74,8 +74,3 @@ def test_boxes_with_long_sizes_are_passed(told):
 )
 def test_files_that_do_not_tell(told, boxes):
     assert told(*boxes) is None
-
-
-def test_an_empty_file(tmp_path):
-    (tmp_path / 'empty.mp4').touch()
-    assert told_fov(tmp_path / 'empty.mp4') is None

@@ -20,19 +20,6 @@ def chosen(text, frames, numbers=None, **about):
     return [float(there[i].box[0, 0]) if i in there else None for i in numbers]
 
 
-def test_what_was_not_seen():
-    pixels = [[1.0, 2.0], [0.0, 0.0], [5.0, 6.0], [7.0, 8.0], [np.nan, 1.0]]
-    seen = person('abcde', pixels, [0.5, 0.9, 0.0, 1.2, 0.9]).keypoints
-    assert seen.names == tuple('abcde')
-    assert list(seen.seen) == [True, False, False, True, False]
-    assert np.isnan(seen.pixels[~seen.seen]).all()
-    assert list(seen.confidences) == [0.5, 0.0, 0.0, 1.2, 0.0]
-    assert person('ab', np.zeros((2, 2)), [1.0, 1.0]) is None
-    assert person('ab', np.ones((2, 2)), [0.0, np.nan]) is None
-    # An axis at zero alone is the border of the image.
-    assert person('a', [[0.0, 3.0]], [1.0]).keypoints.seen.all()
-
-
 def test_largest_in_each_frame():
     frames = [[at(10.0), at(50.0, size=12.0)], [at(11.0, size=15.0), at(51.0)], []]
     assert chosen('largest', frames) == [50.0, 11.0, None]
@@ -88,12 +75,6 @@ def test_the_longest_tracks():
     assert chosen('track:3', frames) == [None] * 49 + [11.0] * 2
     with pytest.raises(ValueError, match='no track 4: the clip has 3, of 9, 4, 2 frames; --person'):
         chosen('track:4', frames)
-
-
-def test_names_keep_persons_apart_where_they_meet():
-    frames = [[at(10.0 + 5 * i, track='a'), at(60.0 - 5 * i, track='b')] for i in range(11)]
-    assert chosen('track:1', frames) == [10.0 + 5 * i for i in range(11)]
-    assert chosen('at:61,110', frames) == [60.0 - 5 * i for i in range(11)]
 
 
 def test_an_id_that_does_not_exist():

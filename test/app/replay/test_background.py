@@ -73,23 +73,3 @@ def test_an_error_ends_the_calls():
         with pytest.raises(OSError, match='No space left'):
             write_all(count)
         assert found == list(range(50))
-
-
-def test_an_error_of_the_caller_drops_what_waits():
-    begun, go_on, found = threading.Event(), threading.Event(), []
-
-    def wait():
-        begun.set()
-        go_on.wait(10)
-
-    def fail():
-        with WriteBehind() as behind:
-            behind.call(wait)
-            behind.call(found.append, 1)
-            assert begun.wait(10)
-            threading.Timer(0.1, go_on.set).start()
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fail()
-    assert found == []

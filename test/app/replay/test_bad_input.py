@@ -103,29 +103,9 @@ IMAGE, INFO = ('image', image(0)), ('camera_info', info(0))
             id='uncalibrated',
         ),
         pytest.param(
-            [('camera_info', info(0, distortion_model='curved', d=np.ones(5))), IMAGE],
-            "unknown distortion model 'curved'",
-            id='unknown distortion',
-        ),
-        pytest.param(
             [INFO, ('image', image(0, encoding='yuv9'))],
             "image encoding 'yuv9' is not known, wanted one of mono8",
             id='unknown encoding',
-        ),
-        pytest.param(
-            [INFO, ('image', image(0, width=0))],
-            'image has size 0x48, wanted at least one pixel',
-            id='no pixels',
-        ),
-        pytest.param(
-            [INFO, ('image', image(0, data=np.zeros(5, np.uint8)))],
-            'image has 5 bytes, wanted 9216',
-            id='bytes missing',
-        ),
-        pytest.param(
-            [INFO, ('image/compressed', compressed(0, b''))],
-            'wanted jpeg or png',
-            id='empty picture',
         ),
         pytest.param(
             [INFO, ('image/compressed', compressed(0, bytes(compressed(0).data)[:-200]))],
@@ -141,17 +121,6 @@ IMAGE, INFO = ('image', image(0)), ('camera_info', info(0))
             [INFO, ('keypoints', keypoints(0, [np.nan, 1.0])), IMAGE],
             'keypoint head lies at (nan, 1.0), wanted numbers, or NaN',
             id='nan in keypoints',
-        ),
-        pytest.param(
-            [INFO, ('keypoints', keypoints(0, [0.0, 1.0], covariance=np.full(8, np.nan))), IMAGE],
-            'covariance of keypoint head has values that are not finite',
-            id='nan in covariance',
-        ),
-        pytest.param(
-            [INFO, ('image', image(-2)), ('image', image(-2))],
-            f'image of {stamp(-2)} ns comes after one of {stamp(-2)} ns, wanted stamps that '
-            'increase',
-            id='time stands still',
         ),
         pytest.param(
             [INFO, ('image', image(-2)), ('image', image(-3))],
@@ -253,15 +222,8 @@ def good(tmp_path):
     ('subject', 'message'),
     [
         (None, 'subject.yaml: can not be read (No such file'),
-        ('a: [', 'subject.yaml: not YAML'),
-        ('[]', "wanted entries ['stamp_ns', 'sigma_px', 'keypoints'"),
-        (SUBJECT.replace('stamp_ns', 'stamp'), "unknown entries ['stamp']"),
-        (SUBJECT.partition('\n')[2], "no entry 'stamp_ns'"),
         (SUBJECT.replace('head', 'haed'), "human37 has no joint ['haed']; it has ["),
         (SUBJECT + 'segment_lengths_m: {tigh: 0.4}\n', "human37 has no length ['tigh']"),
-        (SUBJECT.replace('[30, 30]', '[30, .nan]'), 'left_hip must be [u, v] in pixels'),
-        (SUBJECT.replace('head: [32, 15]', ''), 'at least four joints'),
-        (SUBJECT + 'stature_m: -1\n', 'stature_m must be a number above 0'),
     ],
 )
 def test_subject_files(good, subject, message, tmp_path, capsys):
@@ -287,7 +249,6 @@ def test_nobody_is_seen_without_a_start(tmp_path, capsys):
         (['--bme', 'nowhere.npz'], 'nowhere.npz: no such model; wanted a file, or one of'),
         (['--bme', str(REACH / 'metadata.yaml')], 'metadata.yaml: '),
         (['--set', 'bme.magic=1'], 'there is no parameter magic'),
-        (['--set', 'bme.max_hypotheses=0'], 'max_hypotheses must lie between'),
         (['--set', 'bme.image_transport=raw'], 'is decided by replay'),
         (
             ['--set', 'bme.stature=1.8', '--subject', str(REACH / 'subject.yaml')],
@@ -319,18 +280,13 @@ def test_start_that_nothing_explains(good, tmp_path, capsys):
         (['--background', str(REACH / 'subject.yaml')], 'subject.yaml: not a picture'),
         (['--background', str(REACH / 'background.png')], 'has 480x360 pixels, but the camera'),
         (['--config', 'nowhere.yaml'], 'nowhere.yaml: can not be read (No such file'),
-        (['--body', 'nobody'], "no body 'nobody'"),
         (['--seed', 'x'], 'argument --seed: invalid int value'),
-        (['--seed', '-1'], 'random_seed must lie between 0 and'),
         (['--set', 'max_hypotheses'], '--set max_hypotheses: wanted NAME=VALUE'),
         (['--set', 'max_hypothesis=3'], 'there is no parameter max_hypothesis; is max_hypotheses'),
-        (['--set', 'max_hypotheses=many'], "max_hypotheses must be a whole number, saw 'many'"),
-        (['--set', 'max_hypotheses=99'], 'max_hypotheses must lie between 1 and 64, saw 99'),
         (['--set', 'image_transport=raw'], 'image_transport is decided by replay'),
         (['--set', 'body_model=['], '--set body_model=['),
         (['--image-topic', 'imag'], 'has no topic imag; it has /camera_info, /image'),
         (['--image-topic', 'camera_info'], 'CameraInfo, wanted CompressedImage or Image'),
-        (['--camera-info-topic', 'image'], 'wanted CameraInfo'),
         (['--liev'], 'unrecognized arguments: --liev; see --help'),
     ],
 )

@@ -2,15 +2,12 @@
 
 import copy
 import sys
-from operator import itemgetter
 from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.inputs import recorded_input
@@ -28,8 +25,8 @@ from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags.bag_metadata import absolute_name
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.camera_info import camera_from_info, camera_info_message
-from msg_tools.messages.headers import header_message, time_message, time_ns
-from msg_tools.messages.images import decode_image, depth_message, image_message
+from msg_tools.messages.headers import header_message, time_message
+from msg_tools.messages.images import decode_image, depth_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from test.msg_tools.conftest import limited_file_size
 
@@ -219,14 +216,6 @@ def test_mixtures_explain_the_images(replayed):
         assert decode_image(overlay.message).shape == (360, 480, 3)
 
 
-def test_log_likelihoods_of_both_mixtures_are_known(replayed):
-    found = read(replayed)
-    for topic in ('/pose_mixture', '/likelihood_mixture'):
-        for stored in found[topic]:
-            values = [component.log_likelihood for component in stored.message.components]
-            assert np.isfinite(values).all(), topic
-
-
 def test_results_in_a_namespace(still, entries, tmp_path, capsys):
     """Inputs keep their names; those in the namespace are preferred to those in the root."""
     place = '/humans/bodies/anna'
@@ -266,35 +255,6 @@ def test_results_in_a_namespace(still, entries, tmp_path, capsys):
     )
 
 
-def test_bag_with_relative_names(still, entries, short, tmp_path):
-    """Bags of earlier versions are read as before."""
-    old = tmp_path / 'old.mcap'
-    relative_names(short / 'short.mcap', old)
-    with BagReader(old) as bag:
-        assert set(bag.topics) == {'image/compressed', 'camera_info', 'ground_truth'}
-    for source, name in ((old, 'a'), (short, 'b')):
-        assert main([str(source), '-o', str(tmp_path / name / 'out'), *SUBJECT, '--quiet']) == 0
-    assert content(tmp_path / 'a' / 'out') == content(tmp_path / 'b' / 'out')
-
-
-def relative_names(source, target):
-    """Copies an MCAP file; names of topics lose their slash."""
-    with source.open('rb') as file, target.open('wb') as copy:
-        writer = Writer(copy)
-        writer.start(profile='ros2')
-        channels = {}
-        for schema, channel, message in make_reader(file).iter_messages():
-            if channel.id not in channels:
-                known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(
-                    channel.topic[1:], 'cdr', known, channel.metadata
-                )
-            writer.add_message(
-                channels[channel.id], message.log_time, message.data, message.publish_time
-            )
-        writer.finish()
-
-
 def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys):
     out = tmp_path / 'out'
     command = [str(short), '-o', str(out), '--background', str(REACH / 'background.png')]
@@ -320,34 +280,10 @@ def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys
     assert content(again) == content(out)
 
 
-def test_predictions_beside_a_subject(still, short, tmp_path):
-    out = tmp_path / 'out'
-    assert main([str(short), '-o', str(out), *PERSON, '--bme', '--quiet']) == 0
-    assert len(read(out)['/pose_prediction']) == IMAGES
-    assert [prediction is None for prediction in still[0].predictions] == [False] * IMAGES
-
-
-def test_ground_truth_is_copied(replayed, entries):
-    copied = [stored.message for stored in read(replayed)['/ground_truth']]
-    given = [message for topic, _, message in entries if topic == 'ground_truth']
-    for one, other in zip(copied, given, strict=True):
-        assert one.header == other.header
-        assert np.array_equal(one.components[0].mean, other.components[0].mean)
-
-
 def test_same_command_same_bytes(replayed, short, tmp_path):
     again = tmp_path / 'tracked'
     assert main([str(short), '-o', str(again), *PERSON, '--quiet']) == 0
     assert content(again) == content(replayed)
-
-
-def test_file_instead_of_folder_and_summary(still, short, tmp_path, capsys):
-    out = tmp_path / 'out'
-    assert main([str(short / 'short.mcap'), '-o', str(out), *SUBJECT]) == 0
-    assert capsys.readouterr().out == f'{out}: {IMAGES} of {IMAGES} images tracked\n'
-    assert main([str(short), '-o', str(tmp_path / 'quiet'), *SUBJECT, '--quiet']) == 0
-    streams = capsys.readouterr()
-    assert (streams.out, streams.err) == ('', '')
 
 
 def test_images_are_copied_on_demand(still, short, tmp_path, entries):
@@ -400,144 +336,57 @@ def keypoints(stamp, names=('head', 'left_hip', 'right_hip')):
     )
 
 
-def test_keypoints_of_the_bag_are_used(still, entries, tmp_path):
-    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
-    # The detector is late, and says nothing of the last image.
-    extra = [('/keypoints', stamps[0] + 1000, keypoints(stamps[0]))]
-    bag = write(tmp_path / 'bag', sorted(entries + extra, key=lambda entry: entry[1]))
-    options = [*SUBJECT, '--quiet', '-o']
-    assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
-    assert still[-1].keypoints == [('head', 'left_hip', 'right_hip'), None]
-    assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
-    assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_keypoints=false']) == 0
-    assert still[-1].keypoints == [None] * IMAGES
-
-
-def test_predictions_from_the_keypoints_of_the_bag(still, entries, tmp_path):
-    """Also where the filter does not use them."""
-    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
-    names = [f'{side}_{x}' for x in ('shoulder', 'hip', 'knee') for side in ('left', 'right')]
-    seen = keypoints(stamps[0], names)
-    seen.u, seen.v = 100.0 + 10.0 * np.array([(0, 2) * 3, np.repeat((0, 4, 8), 2)])
-    entries = [*entries, ('/keypoints', stamps[0] + 1000, seen)]
-    bag = write(tmp_path / 'bag', sorted(entries, key=lambda entry: entry[1]))
-    options = [*SUBJECT, '--quiet', '--bme', '--set', 'use_keypoints=false']
-    counts = {'silhouettes': IMAGES, 'keypoints': 1, 'both': IMAGES}
-    for cue, count in counts.items():
-        out = tmp_path / cue
-        cues = ['--set', f'bme.predict_from={cue}', '--set', 'input_timeout=0.0']
-        assert main([str(bag), *options, *cues, '-o', str(out)]) == 0
-        found = [pose_mixture_of(x.message) for x in read(out)['/pose_prediction']]
-        assert len(found) == count
-        assert (len(found[0].weights) > 0) == (cue != 'silhouettes')
-
-
-def keypoints_3d(stamp, names):
-    return MESSAGES.create(
-        'hmt_msgs/msg/Keypoints3D',
-        header=header_message(MESSAGES, stamp, ''),
-        names=list(names),
-        **{axis: np.arange(1.0, 1 + len(names)) for axis in 'xyz'},
-    )
-
-
-def test_positions_in_space_of_the_bag_are_used_and_kept(still, entries, tmp_path):
-    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
-    # Positions of the first image alone, and late.
-    extra = [
-        ('/keypoints', stamps[0] + 1000, keypoints(stamps[0])),
-        ('/keypoints_3d', stamps[0] + 2000, keypoints_3d(stamps[0], ('head', 'nose'))),
-        ('/keypoints', stamps[1] + 1000, keypoints(stamps[1], ('head',))),
-    ]
-    bag = write(tmp_path / 'bag', sorted(entries + extra, key=lambda entry: entry[1]))
-    options = [*SUBJECT, '--quiet', '-o']
-    assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
-    found, *later = still[-1].positions
-    np.testing.assert_array_equal(found, [[1, 1, 1], [np.nan] * 3, [np.nan] * 3])
-    assert later == [None] * (IMAGES - 1)
-    kept = read(tmp_path / 'out')
-    assert [len(kept[topic]) for topic in ('/keypoints', '/keypoints_3d')] == [2, 1]
-    for given in ('use_keypoints', 'use_keypoints_3d'):
-        target = tmp_path / f'without_{given}'
-        assert main([str(bag), *options, str(target), '--set', f'{given}=false']) == 0
-        assert still[-1].positions == [None] * IMAGES
-        assert '/keypoints_3d' not in read(target)
-
-
-def mask(picture, stamp):
-    pixels = np.zeros(picture.shape[:2], np.uint8)
-    pixels[50:150, 100:140] = 255
-    return image_message(MESSAGES, pixels, stamp, '')
-
-
-def packed(message):
-    pixels = message.data.reshape(message.height, message.width)
+def packed(pixels, stamp):
+    """A mask as PNG."""
     done, data = cv2.imencode('.png', pixels)
     assert done
     return MESSAGES.create(
-        'sensor_msgs/msg/CompressedImage', header=message.header, format='png', data=data.ravel()
+        'sensor_msgs/msg/CompressedImage',
+        header=header_message(MESSAGES, stamp, ''),
+        format='png',
+        data=data.ravel(),
     )
 
 
-@pytest.mark.parametrize('topic', ['mask', 'mask/compressed'])
-def test_masks_of_the_bag_are_used(still, entries, tmp_path, topic):
-    """The segmenter is late, and drops the last image; the images are not named as usual."""
-    pictures = [entry for entry in entries if entry[0] == 'image/compressed']
-    stamp = pictures[0][1]
-    message = mask(decode_image(pictures[0][2]), stamp)
-    extra = [(topic, stamp + 1000, message if topic == 'mask' else packed(message))]
-    names = {'image/compressed': '/cam/image_raw/compressed'}
-    given = renamed(entries, names) + extra
-    bag = write(tmp_path / 'bag', sorted(given, key=lambda entry: entry[1]))
-    options = [*SUBJECT, '--quiet', '-o']
-    assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
-    assert still[-1].masks == [4000, None]
-    assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
-    assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_mask=false']) == 0
-    assert still[-1].masks == [None] * IMAGES
-
-
-@pytest.mark.parametrize('kind', [np.uint16, np.float32])
-def test_depth_of_the_bag_is_used(still, entries, tmp_path, capsys, kind):
-    """The depth camera drops the last image; --set switches it off."""
-    pictures = [entry for entry in entries if entry[0] == 'image/compressed']
-    stamp = pictures[0][1]
-    unit = 1000 if kind is np.uint16 else 1
-    depth = np.full(decode_image(pictures[0][2]).shape[:2], 3 * unit, kind)
-    extra = [('depth', stamp + 1000, depth_message(MESSAGES, depth, stamp, ''))]
-    at = itemgetter(1)
-    bag = write(tmp_path / 'bag', sorted(entries + extra, key=at))
-    options = [*SUBJECT, '--quiet', '-o']
-    assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
-    assert still[-1].depths == [3.0, *[None] * (IMAGES - 1)]
-    assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
-    assert 'no depth has come for the image of' in capsys.readouterr().err
-    aligned = '/camera/aligned_depth_to_color/image_raw'
-    bag = write(tmp_path / 'robot', renamed(sorted(entries + extra, key=at), {'depth': aligned}))
-    assert main([str(bag), *options, str(tmp_path / 'named'), '--depth-topic', aligned]) == 0
-    assert still[-1].depths == [3.0, *[None] * (IMAGES - 1)]
-    assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_depth=false']) == 0
-    assert still[-1].depths == [None] * IMAGES
+@pytest.mark.parametrize(
+    'parameter', ['use_keypoints', 'use_keypoints_3d', 'use_mask', 'use_depth']
+)
+def test_inputs_of_the_bag_are_used(still, entries, tmp_path, parameter):
+    """They are late, and come with the first image alone; --set switches each of them off."""
+    _, stamp, image = next(entry for entry in entries if entry[0] == 'image/compressed')
+    shape = decode_image(image).shape[:2]
+    person = np.zeros(shape, np.uint8)
+    person[50:150, 100:140] = 255
+    depth = np.full(shape, 3000, np.uint16)
+    places = MESSAGES.create(
+        'hmt_msgs/msg/Keypoints3D',
+        header=header_message(MESSAGES, stamp, ''),
+        names=['head', 'nose'],
+        **{axis: np.arange(1.0, 3.0) for axis in 'xyz'},
+    )
+    both = {'keypoints': keypoints(stamp), 'keypoints_3d': places}
+    topics, attribute, wanted = {
+        'use_keypoints': (both, 'keypoints', ('head', 'left_hip', 'right_hip')),
+        'use_keypoints_3d': (both, 'positions', [[1, 1, 1], [np.nan] * 3, [np.nan] * 3]),
+        'use_mask': ({'mask/compressed': packed(person, stamp)}, 'masks', 4000),
+        'use_depth': ({'depth': depth_message(MESSAGES, depth, stamp, '')}, 'depths', 3.0),
+    }[parameter]
+    extra = [(topic, stamp + 1000, message) for topic, message in topics.items()]
+    bag = write(tmp_path / 'bag', sorted(entries + extra, key=lambda entry: entry[1]))
+    options = [str(bag), *SUBJECT, '--quiet', '-o']
+    assert main([*options, str(tmp_path / 'out')]) == 0
+    found, *later = getattr(still[-1], attribute)
+    np.testing.assert_equal(found, wanted)
+    assert later == [None] * (IMAGES - 1)
+    kept = read(tmp_path / 'out')
+    assert len(kept['/pose_mixture']) == IMAGES
+    assert {f'/{topic}' for topic in topics if 'keypoints' in topic} <= kept.keys()
+    assert main([*options, str(tmp_path / 'off'), '--set', f'{parameter}=false']) == 0
+    assert getattr(still[-1], attribute) == [None] * IMAGES
 
 
 def renamed(entries, names):
     return [(names.get(topic, topic), time, message) for topic, time, message in entries]
-
-
-def test_raw_images(still, entries, tmp_path):
-    def raw(message):
-        stamp = time_ns(message.header.stamp)
-        return image_message(MESSAGES, decode_image(message), stamp, message.header.frame_id)
-
-    changed = [
-        ('/image', time, raw(message)) if topic == 'image/compressed' else (topic, time, message)
-        for topic, time, message in entries
-    ]
-    both = [tmp_path / name / 'out' for name in ('raw', 'compressed')]
-    for out, given in zip(both, (changed, entries), strict=True):
-        bag = write(out.parent / 'bag', given)
-        assert main([str(bag), '-o', str(out), *SUBJECT, '--quiet']) == 0
-    assert content(both[0]) == content(both[1])
 
 
 def test_calibration_of_larger_images_is_scaled(still, entries, tmp_path, capsys):
@@ -598,40 +447,6 @@ def test_times_of_recording_replace_missing_stamps(still, entries, tmp_path, cap
     assert found[0] == found[1] == found[2]
 
 
-def test_images_of_a_video(still, entries, tmp_path, monkeypatch):
-    """A stand-in for the library of videos, whose pictures are JPEG files."""
-
-    class Decoder:
-        def decode(self, packet):
-            if packet is None:
-                return []
-            picture = cv2.imdecode(np.frombuffer(packet.data, np.uint8), cv2.IMREAD_COLOR)
-            frame = SimpleNamespace(pts=packet.pts, key_frame=True)
-            frame.to_ndarray = lambda format: picture  # noqa: A006
-            return [frame]
-
-    av = SimpleNamespace(
-        CodecContext=SimpleNamespace(create=lambda codec, mode: Decoder()),
-        Packet=lambda data: SimpleNamespace(data=data, pts=None),
-        error=SimpleNamespace(FFmpegError=ValueError),
-    )
-    monkeypatch.setitem(sys.modules, 'av', av)
-    changed = copy.deepcopy(entries)
-    for topic, _, message in changed:
-        if topic == 'image/compressed':
-            message.format = 'h264'
-    both = [tmp_path / name / 'out' for name in ('video', 'plain')]
-    for out, given in zip(both, (changed, entries), strict=True):
-        bag = write(out.parent / 'bag', given)
-        assert main([str(bag), '-o', str(out), *SUBJECT, '--quiet']) == 0
-    assert content(both[0]) == content(both[1])
-    # Whoever has no library is told by one line.
-    monkeypatch.setitem(sys.modules, 'av', None)
-    bag = both[0].parent / 'bag'
-    with BagReader(bag) as opened, pytest.raises(BagError, match='needs PyAV'):
-        recorded_input(opened)
-
-
 def test_topics_are_found_by_their_names(entries, tmp_path):
     names = {'image/compressed': '/cam/image_raw/compressed', 'camera_info': '/cam/camera_info'}
     others = {'image/compressed': '/other/image/compressed', 'camera_info': '/other/camera_info'}
@@ -657,16 +472,6 @@ def test_topics_are_found_by_their_names(entries, tmp_path):
     with BagReader(usual) as bag:
         assert recorded_input(bag).image.name == '/image/compressed'
         assert recorded_input(bag).camera_info.name == '/camera_info'
-
-
-def test_learned_background_needs_images_before_the_track(still, short, tmp_path, entries):
-    subject = tmp_path / 'late.yaml'
-    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
-    text = (REACH / 'subject.yaml').read_text()
-    subject.write_text(text.replace(str(stamps[0]), str(stamps[1])))
-    out = tmp_path / 'out'
-    assert main([str(short), '-o', str(out), '--subject', str(subject), '--quiet']) == 0
-    assert [stored.log_time_ns for stored in read(out)['/pose_mixture']] == stamps[1:]
 
 
 def test_nothing_is_overwritten_unasked(still, short, tmp_path, capsys):

@@ -1,7 +1,5 @@
 """replay --live: the real nodes give the bag that the offline run gives, byte for byte."""
 
-import os
-import socket
 import sys
 from functools import partial
 from pathlib import Path
@@ -15,15 +13,11 @@ from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.options import NodeParameters
 from hmt_ros.app.replay.player import (
     LiveNodeError,
-    changed_environment,
-    environment,
-    reserved_domain,
 )
 from hmt_ros.app.replay.tracks import LiveTrack
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.image_inputs import KEYPOINTS
-from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.headers import header_message, time_ns
@@ -228,21 +222,6 @@ def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
     assert content(offline) == content(live)
 
 
-@pytest.mark.usefixtures('in_one_process')
-def test_bad_input_ends_both_in_the_same_way(tmp_path, capsys):
-    entries = recorded(2)
-    entries[3] = (*entries[3][:2], entries[3][2])
-    broken = next(m for topic, _, m in entries if topic == 'image/compressed')
-    broken.data = broken.data[:100]
-    bag = write(tmp_path / 'bag', entries)
-    folders, (one, other) = both_ways(bag, tmp_path, capsys, '--no-smoother')
-    assert one == other
-    assert one[0] == 1
-    assert 'breaks off or is damaged' in one[2]
-    assert len(one[2].splitlines()) == 1
-    assert not any(folder.parent.exists() for folder in folders)
-
-
 @pytest.fixture
 def parameters():
     values = {'subject_file': str(REACH / 'subject.yaml'), 'image_transport': 'compressed'}
@@ -274,15 +253,6 @@ def test_node_that_is_silent_or_dies_is_told(parameters, monkeypatch):
         monkeypatch.setattr(running, 'stop', lambda: 0)
 
 
-def test_node_that_does_not_start_is_told(parameters, monkeypatch):
-    monkeypatch.setattr(sys, 'executable', '/bin/false')
-    with (
-        pytest.raises(LiveNodeError, match='ended with code 1: it has written nothing'),
-        LiveTrack(NodeParameters(parameters, SmootherParameters()), lambda *output: None),
-    ):
-        raise AssertionError('it has started')
-
-
 def test_without_ros_it_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'rclpy', None)
     out = tmp_path / 'out'
@@ -290,24 +260,3 @@ def test_without_ros_it_is_one_line(tmp_path, monkeypatch, capsys):
     *_, line = capsys.readouterr().err.splitlines()
     assert line.startswith('replay: --live needs a sourced ROS 2 workspace')
     assert list(tmp_path.iterdir()) == []
-
-
-def test_every_replay_has_a_domain_of_its_own():
-    with reserved_domain() as one, reserved_domain() as other:
-        assert one != other
-        assert 1 <= min(one, other) <= max(one, other) <= 100
-        for domain in (one, other):
-            with socket.socket() as taken, pytest.raises(OSError, match='in use'):
-                taken.bind(('', 32768 + domain))
-    with reserved_domain() as again:
-        assert again == one
-
-
-def test_environment_is_left_as_it_was(monkeypatch):
-    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
-    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
-    before = dict(os.environ)
-    with changed_environment(environment(3)):
-        assert os.environ['ROS_DOMAIN_ID'] == '3'
-        assert os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
-    assert dict(os.environ) == before

@@ -8,7 +8,6 @@ from contextlib import redirect_stderr, redirect_stdout
 import pytest
 
 from hmt_learning.app.make_bag import main as make_bag
-from hmt_ros.app import progress
 from hmt_ros.app.replay import many_bags
 from hmt_ros.app.replay.command import main
 from msg_tools import BagReader
@@ -89,24 +88,6 @@ def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
     (tracked / 'b.replay.json').unlink()
 
 
-def test_progress_of_all_and_of_each(archive, tracked, tmp_path, monkeypatch, capsys):
-    """Lines on stderr; on stdout what there is without them."""
-    monkeypatch.setattr(progress, 'INTERVAL', 1e-3)
-    out = tmp_path / 'out'
-    assert main([str(archive), '-o', str(out), *PERSON]) == 0
-    streams = capsys.readouterr()
-    assert streams.out.splitlines() == [
-        'a: 2 of 2 images tracked',
-        'day/b: 2 of 2 images tracked',
-        f'{out}: 2 replayed, 0 done before, 0 failed',
-    ]
-    lines = streams.err.splitlines()
-    assert any(line.startswith(f'{out}:   0% 0/2 [00:00<?, ') for line in lines)
-    assert lines[-1].startswith(f'{out}: 100% 2/2 [')
-    for name in ('a', 'day/b'):
-        assert any(line.startswith(f'{out / name}: 100% 2/2 [') for line in lines)
-
-
 def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkeypatch, capsys):
     wanted = content(tracked)
     command = [str(archive), '-o', str(tmp_path / 'out'), *PERSON]
@@ -183,18 +164,6 @@ def test_what_can_not_be_begun(archive, tmp_path, monkeypatch, capsys):
         assert 'another replay writes into' in fails(a, b, '-o', out)
 
 
-def test_bags_in_a_folder(archive, tmp_path):
-    bags_in = many_bags._bags_in
-    found = dict(bags_in(archive, None))
-    assert found == {'a': archive / 'a', 'day/b': archive / 'day' / 'b'}
-    assert list(bags_in(archive, archive / 'day')) == [('a', archive / 'a')]
-    for name in ('x.mcap', 'y.db3.zstd', '.hidden.mcap', 'z.txt'):
-        (tmp_path / name).write_bytes(b'')
-    (tmp_path / '.partial').mkdir()
-    (tmp_path / '.partial' / 'metadata.yaml').write_text('')
-    assert [name for name, _ in bags_in(tmp_path, None)] == ['x', 'y']
-
-
 def test_through_dask_the_bags_are_the_same(archive, tracked, tmp_path, capfd):
     pytest.importorskip('distributed', reason='Dask is not installed (pip install distributed)')
     out = tmp_path / 'out'
@@ -212,13 +181,3 @@ def test_through_dask_the_bags_are_the_same(archive, tracked, tmp_path, capfd):
     # What one way has done the other way need not do.
     assert main([*command[:1], *command[2:]]) == 0
     assert 'day/b: done before' in capfd.readouterr().out
-
-
-def test_a_scheduler_that_does_not_answer(archive, tmp_path, monkeypatch, capfd):
-    pytest.importorskip('distributed', reason='Dask is not installed (pip install distributed)')
-    monkeypatch.setattr('hmt_ros.app.replay.many_bags._PATIENCE', 0.2)
-    command = [str(archive), '-o', str(tmp_path / 'out'), *PERSON]
-    for address in ('tcp://127.0.0.1:1', 'nonsense://x'):
-        assert main([*command, '--scheduler', address]) == 1
-        line = capfd.readouterr().err.splitlines()[-1]
-        assert line.startswith(f'replay: --scheduler {address}: ')

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from hmt_learning.app.make_bag import main as make_bag
-from hmt_learning.app.rendered_bag import PEOPLE, crossing_takes
-from hmt_learning.motion.viewpoint import Viewpoint
+from hmt_learning.app.rendered_bag import PEOPLE
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.truth import read_truth
-from hmt_ros.body import load_body
 from msg_tools import BagReader
 from msg_tools.messages.detections import people_of_message
 from msg_tools.messages.pose_mixtures import pose_mixture_of
@@ -44,15 +42,6 @@ def test_a_bag_of_two_people(crossing):
     assert np.ptp(first) > 60
     hidden = min(person.keypoints.seen.sum() for found in people for person in found)
     assert hidden < 15
-
-
-def test_two_people_pass_at_half_the_time():
-    takes = crossing_takes(load_body('human37'), 2.0, 10.0, 3, Viewpoint())
-    paths = [take.poses[:, :3] for take in takes]
-    assert paths[0][10, 2] < paths[1][10, 2] - 0.5
-    apart = paths[0][:, 0] - paths[1][:, 0]
-    assert apart[0] * apart[-1] < 0
-    assert abs(apart[10]) < 0.3
 
 
 def nearest_person(truths, bag, name, chosen):
@@ -115,9 +104,3 @@ def test_a_bag_without_detections(tmp_path, capsys, monkeypatch):
 
     assert main([str(ROOT / 'bags' / 'reach'), '-o', str(tmp_path / 'x'), '--people']) == 1
     assert '--people needs the topic detections' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize('option', ['--heading', '--stature'])
-def test_what_does_not_go_with_a_crossing(tmp_path, capsys, option):
-    assert make_bag(['crossing', '-o', str(tmp_path / 'x'), option, '1.7']) == 1
-    assert 'does not go with crossing' in capsys.readouterr().err

@@ -157,55 +157,6 @@ def test_new_bag_has_what_was_used(replayed, moving, tmp_path):
         assert data(out, topic) == data(replayed, topic)
 
 
-def test_bag_without_transforms(entries, tmp_path, capsys):
-    bag = write(tmp_path / 'bag', entries)
-    out = tmp_path / 'out'
-    assert main([str(bag), '-o', str(out), *PERSON, *SMALL, *FRAME, '--no-smoother']) == 0
-    streams = capsys.readouterr()
-    assert '2 of 2 images tracked' in streams.out
-    lines = [line for line in streams.err.splitlines() if 'gravity_frame' in line]
-    assert len(lines) == 1
-    assert "no transform from gravity_frame 'world' to" in lines[0]
-    assert "there is no frame 'world'; there are: " in lines[0]
-    (first, _) = read(out)['/ground']
-    # The lines of the scene tell it.
-    assert ground_of(first.message).up == pytest.approx([0.0, -1.0, 0.0], abs=0.03)
-
-
-def test_damaged_transforms_are_told_and_left_out(entries, tmp_path, capsys):
-    spoilt = with_transforms(entries)
-    for topic, _, message in spoilt:
-        if topic == '/tf':
-            rotation = message.transforms[0].transform.rotation
-            rotation.x = rotation.y = rotation.z = rotation.w = 0.0
-    bag = write(tmp_path / 'bag', spoilt)
-    out = tmp_path / 'out'
-    assert main([str(bag), '-o', str(out), *PERSON, *SMALL, *FRAME, '--no-smoother']) == 0
-    streams = capsys.readouterr()
-    assert "transform from 'robot' to 'world': its quaternion has length 0, wanted 1" in streams.err
-    assert "there is no frame 'world'" in streams.err
-    assert len(read(out)['/ground']) == 2
-
-
-@pytest.mark.parametrize(
-    ('settings', 'line'),
-    [
-        (['gravity=[0, 0, 0]'], 'gravity must be three finite numbers, not all zero'),
-        (['gravity=down'], "gravity must be a list of numbers, saw 'down'"),
-        (
-            ['floor_in_gravity_frame=true', 'gravity_frame='],
-            'floor_in_gravity_frame needs the name of gravity_frame',
-        ),
-    ],
-)
-def test_bad_settings(moving, tmp_path, capsys, settings, line):
-    given = [x for setting in settings for x in ('--set', setting)]
-    arguments = [str(moving), '-o', str(tmp_path / 'out'), *PERSON, *given]
-    assert main(arguments) == 1
-    assert line in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_fixed_frame_of_a_camera_that_stands_still(replayed, moving, tmp_path):
     """A camera that does not move in the fixed frame is as one of which nothing is told."""
     out = tmp_path / 'out'
@@ -214,14 +165,3 @@ def test_fixed_frame_of_a_camera_that_stands_still(replayed, moving, tmp_path):
     for topic in ESTIMATES[:-1]:
         assert data(out, topic) == data(replayed, topic)
     assert data(out, '/tf_static') == data(moving, '/tf_static')
-
-
-def test_fixed_frame_alone_reads_transforms(entries, tmp_path, capsys):
-    bag, out = write(tmp_path / 'bag', entries), tmp_path / 'out'
-    arguments = [str(bag), '-o', str(out), *PERSON, *SMALL, '--set', 'fixed_frame=odom']
-    assert main([*arguments, '--no-smoother']) == 0
-    streams = capsys.readouterr()
-    assert '2 of 2 images tracked' in streams.out
-    lines = [line for line in streams.err.splitlines() if 'to fixed_frame' in line]
-    assert len(lines) == 1
-    assert "to fixed_frame 'odom' at the image of" in lines[0]

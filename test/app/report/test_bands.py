@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from hmt_ros.app.report.mixtures import PROBABILITIES, ground_at, intervals, marginals_of
+from hmt_ros.app.report.mixtures import PROBABILITIES, intervals, marginals_of
 from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.ground import GroundState
 from msg_tools.messages.headers import FRAME_ID
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
-from test.app.conftest import FRAMES, STAMPS, data_of, make, write_out
+from test.app.conftest import FRAMES, STAMPS, data_of, make
 from test.app.report.test_command import UP, with_ground
 
 pytestmark = pytest.mark.usefixtures('no_pictures')
@@ -75,16 +75,6 @@ def test_angles_lie_around_those_of_the_heaviest_component(body, poses):
     np.testing.assert_allclose(sigmas[0, joints:], wanted)
 
 
-def test_nothing_is_known_without_covariances(body, poses):
-    nothing = {'covariances': None, 'joint_covariances': None, 'joint_covariances_relative': None}
-    assert marginals_of(content_of(body, poses[:2], **nothing), body, None).shape == (2, 2, 0)
-
-
-def test_the_floor_of_another_time_stands_in():
-    assert ground_at({}, 5) is None
-    assert ground_at({STAMPS[0]: GROUND}, STAMPS[3]) is GROUND
-
-
 def numbers(text, shape):
     return np.frombuffer(base64.b64decode(text), '<i2').reshape(shape)
 
@@ -103,36 +93,3 @@ def test_the_page_has_the_bands_of_filter_and_smoother(made, body, poses, tmp_pa
     assert np.abs(found - true).mean() < 0.15
     known = numbers(data['truth']['heights'], true.shape)
     np.testing.assert_allclose(1e-3 * known, true, atol=6e-4)
-
-
-def test_angles_over_time_go_on_beyond_a_turn(body, poses, tmp_path):
-    turning, heading = poses.copy(), body.dof_names.index('root_z')
-    turning[:, heading] = np.linspace(2.0, 5.0, FRAMES)
-
-    def change(message):
-        """Whole turns are taken off, as a publisher may."""
-        for component in message.components:
-            mean = np.array(component.mean)
-            mean[heading] = (mean[heading] + np.pi) % (2.0 * np.pi) - np.pi
-            component.mean = mean
-        return message
-
-    out = write_out(tmp_path / 'out', body, turning, change=change)
-    bands = data_of(make(out, tmp_path / 'report'))['layers'][0]['bands']
-    width = len(bands['joints']) + len(bands['angles'])
-    found = numbers(bands['values'], (FRAMES, width, 3))[:, len(bands['joints']), 1]
-    assert np.abs(0.1 * found - np.degrees(np.linspace(2.0, 5.0, FRAMES))).max() < 15.0
-
-
-def test_pages_without_covariances_have_no_bands(body, poses, tmp_path):
-    def change(message):
-        for component in message.components:
-            component.covariance = np.empty(0)
-            component.joint_covariances = np.empty(0)
-            component.joint_covariances_relative = np.empty(0)
-        return message
-
-    out = write_out(tmp_path / 'out', body, poses, change=change, truth=False)
-    data = data_of(make(out, tmp_path / 'report'))
-    assert [layer['bands'] for layer in data['layers']] == [None, None]
-    assert [layer['identities'] for layer in data['layers']] == [None, None]

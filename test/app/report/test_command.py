@@ -12,17 +12,12 @@ from hmt_ros.app.report import command as report
 from hmt_ros.app.report.images import ImageSource, film_strip
 from hmt_ros.app.report.mixtures import ENDS, KEPT_TRAJECTORIES, read_mixtures
 from hmt_ros.app.report.page import data_size
-from hmt_ros.app.report.skeletons import BONES
 from hmt_ros.app.truth import read_truth
-from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter
-from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.ground import GroundState, ground_message
-from msg_tools.messages.headers import FRAME_ID, START_NS, time_message, time_ns
-from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.headers import FRAME_ID, time_ns
 from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
-from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
 from test.app.conftest import (
     CAMERA,
     FRAMES,
@@ -30,8 +25,6 @@ from test.app.conftest import (
     STAMPS,
     data_of,
     make,
-    mixture_of,
-    pose_message,
     write_images,
     write_out,
 )
@@ -89,16 +82,6 @@ def test_beliefs_are_those_of_the_bag(data, body, poses, tmp_path):
     assert posterior['cues']['depth'] == [*[0.25] * (FRAMES - 1), None]
 
 
-def test_bones_connect_the_joints_of_the_pictures(data):
-    layer = data['layers'][0]
-    named = {(layer['joints'][a], layer['joints'][b]) for a, b, _ in layer['bones']}
-    assert named == {(a, b) for a, b, _ in BONES}
-    sides = {layer['joints'][b]: side for _, b, side in layer['bones']}
-    assert sides['left_wrist'] == 'left'
-    assert sides['right_wrist'] == 'right'
-    assert sides['neck'] == 'trunk'
-
-
 def test_trajectories_are_those_of_the_bag(made, data, body):
     (topic,) = data['trajectories']
     assert topic['ends'] == list(ENDS)
@@ -139,23 +122,6 @@ def test_truth_errors_and_calibration(made, data, body, poses):
     assert any(note.startswith('/trajectory_mixture') for note in data['notes'])
 
 
-def test_truth_without_pelvis_is_aligned_at_the_hips(made, body, poses, tmp_path):
-    names = body.joint_names[1:]
-    joints = body.joint_positions(poses)[:, 1:]
-    np.savez(tmp_path / 'truth.npz', stamps=STAMPS, joint_names=names, joints=joints)
-    found = data_of(make(made.out, tmp_path / 'report', '--truth', tmp_path / 'truth.npz'))
-    scores = score_bag(made.out, read_truth(tmp_path / 'truth.npz'))
-    for layer in found['layers']:
-        assert [layer['joints'][i] for i in layer['roots']] == ['left_hip', 'right_hip']
-        own = scores[layer['topic']].scores
-        assert np.allclose([e[0] for e in layer['errors_mm']], 1e3 * own.heaviest.mean(1), atol=0.1)
-    truth = found['truth']
-    assert [truth['joints'][i] for i in truth['roots']] == ['left_hip', 'right_hip']
-    drawn = {(truth['joints'][a], truth['joints'][b]) for a, b, _ in truth['bones']}
-    assert {('left_hip', 'right_hip'), ('neck', 'left_hip'), ('left_hip', 'left_knee')} <= drawn
-    assert (tmp_path / 'report' / 'side_views.png').stat().st_size > 10_000
-
-
 def test_images_are_those_of_the_bag(data):
     images = data['images']
     assert (images['width'], images['height'], images['drawn_on']) == (320, 240, False)
@@ -189,49 +155,12 @@ def test_the_same_bag_gives_the_same_page(made, page, tmp_path):
     )
 
 
-@pytest.mark.usefixtures('no_pictures')
-def test_ground_truth_of_the_bag_is_used(body, poses, data, tmp_path):
-    found = data_of(make(write_out(tmp_path / 'out', body, poses), tmp_path / 'report'))
-    assert found['truth']['source'].endswith('(/ground_truth)')
-    assert [layer['topic'] for layer in found['layers']] == [
-        '/pose_mixture',
-        '/smoothed_pose_mixture',
-    ]
-    assert found['truth']['known'] == data['truth']['known']
-    assert found['images'] is None
-
-
 def test_without_images_and_truth(made, tmp_path):
     found = data_of(make(made.out, tmp_path / 'report'))
     assert (found['images'], found['truth'], found['scores']) == (None, None, None)
     assert found['layers'][0]['pixels'] is None
     names = {path.name for path in (tmp_path / 'report').iterdir()}
     assert names == {'report.html', 'side_views.png', 'weights.png', 'free_energy.png'}
-
-
-@pytest.mark.usefixtures('no_pictures')
-def test_images_that_the_bag_has_itself(body, poses, made, tmp_path):
-    out = tmp_path / 'out'
-    with BagWriter(out) as bag, BagReader(made.images) as images, BagReader(made.out) as mixtures:
-        for reader in (images, mixtures):
-            for stored in reader.messages():
-                bag.write(stored.topic, stored.log_time_ns, stored.message)
-        picture = np.zeros((240, 320, 3), np.uint8)
-        message = compressed_image_message(MESSAGES, picture, STAMPS[0], FRAME_ID)
-        bag.write('overlay/compressed', STAMPS[0], message)
-    found = data_of(make(out, tmp_path / 'report'))
-    assert found['images']['drawn_on'] is False
-    assert len(found['images']['jpegs']) == FRAMES
-    assert found['layers'][0]['pixels'] is not None
-
-
-def test_what_the_tracker_drew_stands_in_for_images(body, poses, tmp_path):
-    out = write_out(tmp_path / 'out', body, poses, overlay=True)
-    found = data_of(make(out, tmp_path / 'report'))
-    assert found['images']['drawn_on'] is True
-    assert len(found['images']['jpegs']) == FRAMES
-    assert found['layers'][0]['pixels'] is None
-    assert not (tmp_path / 'report' / 'overview.png').exists()
 
 
 def test_chosen_topics_and_fewer_times(made, tmp_path):
@@ -245,16 +174,6 @@ def test_chosen_topics_and_fewer_times(made, tmp_path):
 
 
 @pytest.mark.usefixtures('no_pictures')
-def test_notes_of_who_asks_for_the_report_are_on_the_page(made, tmp_path):
-    place, notes = tmp_path / 'report', ['the lens is assumed']
-    options = report.ReportOptions(made.out, place, quiet=True, notes=notes)
-    _, summary = report.write_report(options)
-    found = data_of((place / 'report.html').read_text('utf-8'))
-    assert found['notes'][0] == 'the lens is assumed'
-    assert 'the lens is assumed' in summary.splitlines()
-
-
-@pytest.mark.usefixtures('no_pictures')
 def test_bag_in_a_namespace(body, poses, tmp_path):
     """The topics of a person are found in the person's namespace; a relative name is enough."""
     place = '/humans/bodies/anna'
@@ -263,54 +182,6 @@ def test_bag_in_a_namespace(body, poses, tmp_path):
     assert [layer['topic'] for layer in found['layers']] == [f'{place}/pose_mixture']
     assert found['truth']['source'].endswith(f'({place}/ground_truth)')
     assert len(found['images']['jpegs']) == FRAMES  # of the overlay
-
-
-def test_one_window_over_the_whole_time(body, poses, tmp_path):
-    """Trajectories that stand alone: their own times are shown."""
-    rng = np.random.default_rng(0)
-    means = poses + 0.1 * rng.normal(size=(2, *poses.shape))
-    content = TrajectoryMixture(
-        np.array([0.25, 0.75]), means, None, np.zeros(2), np.ones(2), tuple(STAMPS), STAMPS[-1],
-        np.array([2.0, 1.0]), body.name, body.dof_names, FRAME_ID,
-    )  # fmt: skip
-    for with_body in (True, False):
-        with BagWriter(tmp_path / f'out{with_body}') as bag:
-            if with_body:
-                bag.write('body', START_NS, message_of_body(MESSAGES, body, START_NS, FRAME_ID))
-            message = trajectory_mixture_message(MESSAGES, content)
-            bag.write('trajectory_mixture', STAMPS[-1], message)
-        data = data_of(make(tmp_path / f'out{with_body}', tmp_path / f'report{with_body}'))
-        assert np.allclose(data['times'], np.arange(FRAMES) / 10)
-        (window,) = data['trajectories'][0]['windows']
-        assert window['weights'] == [0.75, 0.25]
-        assert (window['ways'] is not None) == with_body
-        assert len(data['notes']) == (0 if with_body else 1)
-
-
-def test_mixtures_without_covariances_and_missing_frames(body, poses, tmp_path):
-    def change(message):
-        for component in message.components:
-            component.covariance = np.empty(0)
-        return message
-
-    out = write_out(tmp_path / 'out', body, poses, change=change)
-    found = data_of(make(out, tmp_path / 'report'))
-    assert found['scores']['topics']['/pose_mixture']['calibration']['together'] is None
-    assert not (tmp_path / 'report' / 'calibration.png').exists()
-
-    with BagWriter(tmp_path / 'predicted') as bag:
-        for i, stamp in enumerate(STAMPS[:3]):
-            mixture = GaussianMixture(
-                np.ones(1), poses[i : i + 1], 0.01 * np.eye(body.dimension)[None]
-            )
-            message = pose_message(body, mixture, stamp, MixtureKind.PREDICTION)
-            if i == 1:
-                message.components = []
-            bag.write('pose_prediction', stamp, message)
-    found = data_of(make(tmp_path / 'predicted', tmp_path / 'second'))
-    assert np.allclose(found['times'], [0.0, 0.1, 0.2])
-    assert [len(weights) for weights in found['layers'][0]['weights']] == [1, 0, 1]
-    assert found['notes'] == ['nobody is found at 1 of 3 times']
 
 
 @pytest.mark.usefixtures('no_pictures')
@@ -383,52 +254,6 @@ def test_images_get_smaller_until_they_fit(each, tmp_path):
 
 
 @pytest.mark.usefixtures('no_pictures')
-def test_two_hundred_frames_stay_under_20_mb(body, poses, tmp_path):
-    # The longer it lasts, the larger images may be: here the whole page is what bounds them.
-    stamps = [START_NS + i * 200_000_000 for i in range(200)]
-    rng = np.random.default_rng(0)
-    with BagWriter(tmp_path / 'out') as bag:
-        mixture = mixture_of(body, poses[0], 16, rng)
-        message = pose_message(body, mixture, START_NS, MixtureKind.POSTERIOR)
-        for stamp in stamps:
-            message.header.stamp = time_message(MESSAGES, stamp)
-            for topic in ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture'):
-                bag.write(topic, stamp, message)
-    # Nothing compresses worse than noise: 0.2 MB an image.
-    images = write_images(tmp_path / 'in', stamps, noise(640, 480))
-    page = make(tmp_path / 'out', tmp_path / 'report', '--images', images)
-    data = data_of(page)
-    assert len(data['times']) == 200
-    assert None not in data['images']['jpegs']
-    assert 10_000_000 < len(page) < 20_000_000
-    mixtures = read_mixtures(tmp_path / 'out')
-    parts = ('positions', 'pixels', 'regions')
-    told = sum(len(layer[part]) for layer in data['layers'] for part in parts)
-    assert told < data_size(mixtures) < 1.2 * told
-
-
-@pytest.mark.usefixtures('no_pictures')
-def test_five_seconds_stay_under_6_mb(body, poses, tmp_path):
-    stamps = [START_NS + i * 33_333_333 for i in range(150)]
-    rng = np.random.default_rng(0)
-    with BagWriter(tmp_path / 'out') as bag:
-        for topic, kind, modes in (
-            ('pose_mixture', MixtureKind.POSTERIOR, 7),
-            ('smoothed_pose_mixture', MixtureKind.SMOOTHED, 3),
-            ('likelihood_mixture', MixtureKind.LIKELIHOOD, 7),
-        ):
-            mixture = mixture_of(body, poses[0], modes, rng)
-            message = pose_message(body, mixture, START_NS, kind)
-            for stamp in stamps:
-                message.header.stamp = time_message(MESSAGES, stamp)
-                bag.write(topic, stamp, message)
-    images = write_images(tmp_path / 'in', stamps, noise(640, 480))
-    page = make(tmp_path / 'out', tmp_path / 'report', '--images', images)
-    assert None not in data_of(page)['images']['jpegs']
-    assert len(page) < 6_000_000
-
-
-@pytest.mark.usefixtures('no_pictures')
 def test_times_are_left_out_where_the_data_get_too_large(made, tmp_path, monkeypatch):
     size = data_size(read_mixtures(made.out))
     monkeypatch.setattr(report, 'DATA_BYTES', size // 2)
@@ -461,6 +286,9 @@ def test_bags_that_can_not_be_shown(made, tmp_path, capsys):
     assert str(empty) in fails(tmp_path, capsys, empty)
     line = fails(tmp_path, capsys, made.out, '--images', made.out)
     assert 'no topic of type' in line
+    other = write_images(tmp_path / 'other', [stamp + 1 for stamp in STAMPS])
+    line = fails(tmp_path, capsys, made.out, '--images', other)
+    assert 'is this the bag that was tracked?' in line
 
 
 def test_mixtures_that_can_not_be_understood(body, poses, tmp_path, capsys):
@@ -477,27 +305,6 @@ def test_mixtures_that_can_not_be_understood(body, poses, tmp_path, capsys):
 
     out = write_out(tmp_path / 'elsewhere', body, poses, change=elsewhere, truth=False)
     assert 'name those of one camera by --topic' in fails(tmp_path, capsys, out)
-
-
-def test_truth_that_does_not_fit(made, body, poses, tmp_path, capsys):
-    joints = body.joint_positions(poses)
-    later = tmp_path / 'later.npz'
-    np.savez(
-        later, stamps=np.array(STAMPS) + 1, joint_names=np.array(body.joint_names), joints=joints
-    )
-    assert 'is among those of' in fails(tmp_path, capsys, made.out, '--truth', later)
-    fewer = tmp_path / 'fewer.npz'
-    np.savez(fewer, stamps=np.array(STAMPS), joint_names=np.array(['pelvis']), joints=joints)
-    assert 'wanted (1, 3)' in fails(tmp_path, capsys, made.out, '--truth', fewer)
-    line = fails(tmp_path, capsys, made.out, '--truth', tmp_path / 'none.npz')
-    assert 'can not be read' in line
-    assert 'has no ground truth' in fails(tmp_path, capsys, made.out, '--truth', made.images)
-
-
-def test_images_that_do_not_fit(made, tmp_path, capsys):
-    other = write_images(tmp_path / 'other', [stamp + 1 for stamp in STAMPS])
-    line = fails(tmp_path, capsys, made.out, '--images', other)
-    assert 'is this the bag that was tracked?' in line
 
 
 @pytest.mark.usefixtures('no_pictures')
@@ -532,13 +339,6 @@ def test_after_an_error_nothing_is_left(made, error, code, tmp_path, monkeypatch
     assert [path.read_text() for path in folder.iterdir()] == ['an older one']
 
 
-def test_it_tells_what_came_out(made, tmp_path, capsys):
-    assert report.main([str(made.out), '-o', str(tmp_path / 'report')]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith(f'{tmp_path / "report" / "report.html"}: {FRAMES} times, ')
-    assert any('weights.png' in line for line in lines)
-
-
 # The floor.
 
 UP = np.array([0.0, -0.8, -0.6])
@@ -569,25 +369,6 @@ def test_floor_is_that_of_the_bag(body, poses, tmp_path):
     ground = data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground']
     assert ground['planes'] == [None, *[[0.0, -0.8, -0.6, 1.5]] * (FRAMES - 1)]
     assert ground['contacts'] == [{}, *[{'left': 0.9, 'right': 0.1}] * (FRAMES - 1)]
-
-
-@pytest.mark.usefixtures('no_pictures')
-@pytest.mark.parametrize(
-    'options',
-    [{'frame': 'elsewhere'}, {'topics': ('a/ground', 'b/ground')}, {'topics': ()}],
-    ids=['another frame', 'of other persons', 'none'],
-)
-def test_floor_that_is_not_known(body, poses, tmp_path, options):
-    bag = with_ground(tmp_path, body, poses, **options)
-    assert data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground'] is None
-
-
-@pytest.mark.usefixtures('no_pictures')
-def test_contacts_without_a_floor(body, poses, tmp_path):
-    bag = with_ground(tmp_path, body, poses, height=None)
-    ground = data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground']
-    assert ground['planes'] == [None] * FRAMES
-    assert ground['contacts'][1] == {'left': 0.9, 'right': 0.1}
 
 
 def test_floor_that_contradicts_itself(body, poses, tmp_path, capsys):

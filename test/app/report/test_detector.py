@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 from hmt_ros.app.report import command as report
-from hmt_ros.app.report.mixtures import read_mixtures
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools import BagReader, BagWriter
 from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import FRAME_ID, header_message
 from msg_tools.messages.keypoints import positions_message
 from msg_tools.messages.pose_mixtures import pose_mixture_of
-from test.app.conftest import FRAMES, MESSAGES, STAMPS, data_of, make, write_out
+from test.app.conftest import FRAMES, MESSAGES, STAMPS, data_of, make
 from test.app.report.test_command import integers, positions
 
 pytestmark = pytest.mark.usefixtures('no_pictures')
@@ -56,12 +55,6 @@ def with_detector(path, source, body, poses, *, topics=('keypoints_3d',), spoil=
             for topic in topics:
                 result.write(topic, stamp, message)
     return path
-
-
-def test_an_image_in_which_the_detector_saw_nobody(made, body, poses, tmp_path):
-    bag = with_detector(tmp_path / 'bag', made.out, body, poses, nobody=True)
-    known = data_of(make(bag, tmp_path / 'report'))['detector']['known']
-    assert known == [False, True, True, False, *[True] * (FRAMES - 4)]
 
 
 @pytest.mark.parametrize('where', ['with the mixtures', 'with the images'])
@@ -129,16 +122,3 @@ def test_regions_hold_90_percent_of_the_joints(made, data, body):
             continue
         inside = np.linalg.solve(root, np.linalg.cholesky(covariance) @ samples.T)
         assert abs(np.mean((inside**2).sum(0) < 1) - 0.9) < 0.02
-
-
-def test_regions_that_are_not_known(body, poses, tmp_path):
-    def without(message):
-        for component in message.components:
-            component.joint_covariances_relative = np.empty(0)
-        return message
-
-    out = write_out(tmp_path / 'out', body, poses, change=without)
-    assert all(not m.regions.size for m in read_mixtures(out).layers[0].mixtures.values())
-    assert [layer['regions'] for layer in data_of(make(out, tmp_path / 'r'))['layers']] == [
-        None
-    ] * 2

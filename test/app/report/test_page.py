@@ -10,7 +10,7 @@ import subprocess
 import pytest
 
 from test.app.conftest import FRAMES, TRAJECTORIES, make, write_out
-from test.app.report.test_command import with_beliefs, with_ground
+from test.app.report.test_command import with_ground
 from test.app.report.test_detector import with_detector
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable', 'chrome')
@@ -199,78 +199,6 @@ def test_layers_modes_and_play(page, tmp_path):
     assert seen['scores'] == 3
     assert seen['named'] is True
     assert seen['title'] == 'out: mixtures over poses'
-
-
-@in_a_browser
-def test_pages_with_less_in_them(made, body, poses, tmp_path):
-    bare = make(made.out, tmp_path / 'bare', '--topic', 'pose_mixture')
-    steps = "look('space'); seen.image = get('image-figure').hidden; look('weights', 'weights');"
-    seen = visit(bare, steps, tmp_path)
-    assert seen['image'] is True
-    assert min(seen['space drawn'], seen['weights drawn']) > 1000
-
-    ways = make(made.out, tmp_path / 'ways', '--topic', 'trajectory_mixture')
-    seen = visit(
-        ways,
-        "look('space'); get('time').value = 3; get('time').dispatchEvent(new Event('input'));"
-        "look('later');",
-        tmp_path,
-    )
-    assert seen['space drawn'] > 1000
-    assert seen['space'] != seen['later']
-
-    single = make(
-        made.out,
-        tmp_path / 'single',
-        '--times',
-        '1',
-        '--images',
-        made.images,
-        '--truth',
-        made.truth,
-    )
-    seen = visit(single, "look('space'); get('play').click(); await pause(200);", tmp_path)
-    assert seen['space drawn'] > 1000
-
-
-@pytest.mark.usefixtures('no_pictures')
-@in_a_browser
-def test_beliefs_are_drawn_where_a_topic_has_them(page, body, poses, tmp_path):
-    steps = """
-        const tell = (name) => {
-          seen[name] = get('beliefs-figure').hidden ? null : get('beliefs-caption').textContent;
-        };
-        tell('first'); look('beliefs', 'beliefs');
-        get('time').value = 3; get('time').dispatchEvent(new Event('input'));
-        look('later', 'beliefs');
-        get('chosen').value = 1; get('chosen').dispatchEvent(new Event('change')); tell('second');
-        get('chosen').value = 0; get('chosen').dispatchEvent(new Event('change')); tell('again');
-        const place = get('beliefs').getBoundingClientRect();
-        pointer(get('beliefs'), 'pointerdown', place.right - 12, place.top + 20);
-        seen.clock = get('clock').value;
-    """
-    assert visit(page, steps, tmp_path)['first'] is None
-    known = make(write_out(tmp_path / 'out', body, poses, change=with_beliefs), tmp_path / 'known')
-    seen = visit(known, steps, tmp_path)
-    assert ' '.join(seen['first'].split()) == (
-        'person in view silhouette track depth '
-        'How far each cue of the images is believed in filter (/pose_mixture): the probability '
-        'that it shows the person; of the track, that some mode is about where the person is.'
-    )
-    assert seen['beliefs drawn'] > 1000
-    assert seen['beliefs'] != seen['later']
-    assert (seen['second'], seen['again']) == (None, seen['first'])
-    assert seen['clock'] == f'0.60 s, {FRAMES} of {FRAMES}'
-
-
-@in_a_browser
-def test_the_address_tells_what_is_shown(page, tmp_path):
-    steps = "look('space'); seen.clock = get('clock').value; seen.second = pressed(get('layer-1'));"
-    plain = visit(page, steps, tmp_path)
-    given = visit(page, steps, tmp_path, '#frame=4&yaw=90&pitch=10&show=0,1')
-    assert given['clock'] == f'0.40 s, 5 of {FRAMES}'
-    assert (plain['second'], given['second']) == (False, True)
-    assert given['space'] != plain['space']
 
 
 @pytest.mark.usefixtures('no_pictures')

@@ -4,43 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from hmt_learning.app import learn
 from hmt_ros.body import load_body
-
-LEG = [('UpLeg', (0.1, -0.1, 0)), ('Leg', (0, -0.42, 0)), ('Foot', (0, -0.41, 0))]
-LEG += [('ToeBase', (0, -0.03, 0.13))]
-ARM = [('Arm', (0.18, 0.26, 0)), ('ForeArm', (0.28, 0, 0)), ('Hand', (0.23, 0, 0))]
-TRUNK = [('Spine', (0, 0.15, 0)), ('Neck', (0, 0.28, 0)), ('Head', (0, 0.18, 0))]
-CHANNELS = '3 Zrotation Xrotation Yrotation'
+from test.learning.stick_figure import figure, write_bvh
 
 
 def write_figure(path: Path, size: float, arms: float = 1.0, hips: float = 1.0) -> Path:
     """Three frames of a T pose."""
-    count = 0
-
-    def chain(bones, side: int, factor: float) -> str:
-        nonlocal count
-        text, name = '', ('', 'Left', 'Right')[side]
-        for bone, (x, y, z) in bones:
-            first = hips if bone == 'UpLeg' else 1.0
-            mirror = -1.0 if side == 2 else 1.0
-            place = [mirror * x, first * y, z]
-            offset = ' '.join(f'{size * factor * v:.5f}' for v in place)
-            text += f'JOINT {name}{bone}\n{{\nOFFSET {offset}\nCHANNELS {CHANNELS}\n'
-            count += 1
-            if bone == 'Spine':
-                text += chain(ARM, 1, arms) + chain(ARM, 2, arms)
-        return text + 'End Site\n{\nOFFSET 0 0.05 0\n}\n' + '}\n' * len(bones)
-
-    body = chain(LEG, 1, 1.0) + chain(LEG, 2, 1.0) + chain(TRUNK, 0, 1.0)
-    channels = '6 Xposition Yposition Zposition Zrotation Xrotation Yrotation'
-    head = f'HIERARCHY\nROOT Hips\n{{\nOFFSET 0 0 0\nCHANNELS {channels}\n{body}}}\n'
-    row = ' '.join(['0', f'{0.95 * size:.3f}', '0', *['0'] * (3 * count + 3)])
-    path.write_text(f'{head}MOTION\nFrames: 3\nFrame Time: 0.033333\n' + f'{row}\n' * 3)
-    return path
+    joints = figure(size, arms, hips)
+    rows = np.zeros((3, 3 + 3 * len(joints)))
+    rows[:, 1] = 0.95 * size
+    return write_bvh(path, joints, rows)
 
 
 def test_people_give_the_spreads_of_the_yaml_file(tmp_path, capsys):

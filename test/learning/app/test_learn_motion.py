@@ -9,56 +9,19 @@ import pytest
 
 from hmt_learning.app import learn
 from hmt_ros.body.motion_prior import read_motion_prior
-
-# Joints of a stick figure: name, parent, offset in cm (y up); the T pose faces z.
-JOINTS = [('Hips', None, (0, 95, 0)), ('Spine', 'Hips', (0, 15, 0)), ('Neck', 'Spine', (0, 28, 0))]
-JOINTS += [('Head', 'Neck', (0, 18, 0))]
-for side, x in (('Left', 1), ('Right', -1)):
-    JOINTS += [
-        (f'{side}UpLeg', 'Hips', (10 * x, -10, 0)),
-        (f'{side}Leg', f'{side}UpLeg', (0, -41, 0)),
-        (f'{side}Foot', f'{side}Leg', (0, -41, 0)),
-        (f'{side}ToeBase', f'{side}Foot', (0, -3, 13)),
-        (f'{side}Arm', 'Spine', (18 * x, 26, 0)),
-        (f'{side}ForeArm', f'{side}Arm', (28 * x, 0, 0)),
-        (f'{side}Hand', f'{side}ForeArm', (23 * x, 0, 0)),
-        (f'{side}FingerBase', f'{side}Hand', (10 * x, 0, 0)),
-    ]
-
-
-def hierarchy(name: str, order: list[str]) -> str:
-    """The part of a BVH file for a joint and its children; `order` gains the joints in turn."""
-    order.append(name)
-    offset = next(o for n, _, o in JOINTS if n == name)
-    channels = '3 Zrotation Xrotation Yrotation'
-    if name == 'Hips':
-        channels = '6 Xposition Yposition Zposition Zrotation Xrotation Yrotation'
-    text = 'ROOT ' if name == 'Hips' else 'JOINT '
-    text += f'{name}\n{{\nOFFSET {offset[0]} {offset[1]} {offset[2]}\nCHANNELS {channels}\n'
-    children = [n for n, parent, _ in JOINTS if parent == name]
-    text += ''.join(hierarchy(child, order) for child in children)
-    if not children:
-        text += 'End Site\n{\nOFFSET 0 2 0\n}\n'
-    return text + '}\n'
+from test.learning.stick_figure import figure, write_bvh
 
 
 def write_motion(path: Path, times: int, fps: float, seed: int) -> Path:
     """A figure that sways, swings its limbs and drifts to the side."""
-    order: list[str] = []
-    head = hierarchy('Hips', order)
-    rng = np.random.default_rng(seed)
+    rng, joints = np.random.default_rng(seed), figure()
     t = np.arange(times)[:, None] / fps
-    numbers = 3 + 3 * len(order)
+    numbers = 3 + 3 * len(joints)
     size = rng.uniform(2.0, 15.0, numbers)
-    rows = size * np.sin(
-        2 * np.pi * rng.uniform(0.3, 1.2, numbers) * t + rng.uniform(0, 6, numbers)
-    )
-    rows[:, :3] = np.concatenate([20 * t, np.full_like(t, 95.0), 5 * np.sin(t)], axis=1)
-    lines = '\n'.join(' '.join(f'{x:.4f}' for x in row) for row in rows)
-    path.write_text(
-        f'HIERARCHY\n{head}MOTION\nFrames: {times}\nFrame Time: {1 / fps:.6f}\n{lines}\n'
-    )
-    return path
+    phases = 2 * np.pi * rng.uniform(0.3, 1.2, numbers) * t + rng.uniform(0, 6, numbers)
+    rows = size * np.sin(phases)
+    rows[:, :3] = np.concatenate([0.2 * t, np.full_like(t, 0.95), 0.05 * np.sin(t)], axis=1)
+    return write_bvh(path, joints, rows, fps)
 
 
 def test_motions_give_a_motion_prior(tmp_path, read_here, capsys):

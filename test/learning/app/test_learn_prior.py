@@ -1,100 +1,33 @@
 """The command on a handful of short motions of a stick figure."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import hmt_learning.app
 from hmt_learning.app import learn
-from hmt_learning.app.motions import people_in
 from hmt_ros.body import load_body
 from hmt_ros.body.angle_mixture import read_pose_prior
 from hmt_ros.body.mirror import mirror
-
-# Joint: (parent, offset in m, y up).
-JOINTS: dict[str, tuple[str | None, tuple[float, float, float]]] = {
-    'Hips': (None, (0, 0, 0)),
-    'LeftUpLeg': ('Hips', (0.1, -0.1, 0)),
-    'LeftLeg': ('LeftUpLeg', (0, -0.42, 0)),
-    'LeftFoot': ('LeftLeg', (0, -0.41, 0)),
-    'LeftToeBase': ('LeftFoot', (0, -0.03, 0.13)),
-    'RightUpLeg': ('Hips', (-0.1, -0.1, 0)),
-    'RightLeg': ('RightUpLeg', (0, -0.42, 0)),
-    'RightFoot': ('RightLeg', (0, -0.41, 0)),
-    'RightToeBase': ('RightFoot', (0, -0.03, 0.13)),
-    'Spine': ('Hips', (0, 0.2, 0)),
-    'Neck': ('Spine', (0, 0.23, 0)),
-    'Head': ('Neck', (0, 0.1, 0)),
-    'LeftShoulder': ('Spine', (0.02, 0.2, 0)),
-    'LeftArm': ('LeftShoulder', (0.15, 0, 0)),
-    'LeftForeArm': ('LeftArm', (0, -0.28, 0)),
-    'LeftHand': ('LeftForeArm', (0, -0.23, 0)),
-    'RightShoulder': ('Spine', (-0.02, 0.2, 0)),
-    'RightArm': ('RightShoulder', (-0.15, 0, 0)),
-    'RightForeArm': ('RightArm', (0, -0.28, 0)),
-    'RightHand': ('RightForeArm', (0, -0.23, 0)),
-}
-ENDS = {'Head': (0, 0.1, 0)}
+from test.learning.stick_figure import figure, write_bvh
 
 
-def write_motion(path: Path, seed: int, frames: int = 24) -> Path:
+def write_motion(path, seed, frames=24):
     """A figure that swings its limbs."""
-    rng = np.random.default_rng(seed)
-    lines: list[str] = ['HIERARCHY']
-    channels: list[str] = []
-
-    def add(name: str, depth: int) -> None:
-        parent, offset = JOINTS[name]
-        word = 'ROOT' if parent is None else 'JOINT'
-        places = 'Xposition Yposition Zposition ' if parent is None else ''
-        count = 6 if parent is None else 3
-        pad = '  ' * depth
-        lines.extend(
-            [
-                f'{pad}{word} {name}',
-                pad + '{',
-                f'{pad}  OFFSET {" ".join(map(str, offset))}',
-                f'{pad}  CHANNELS {count} {places}Zrotation Yrotation Xrotation',
-            ]
-        )
-        channels.append(name)
-        children = [x for x, (above, _) in JOINTS.items() if above == name]
-        for child in children:
-            add(child, depth + 1)
-        if not children:
-            end = ENDS.get(name, (0, -0.1, 0))
-            lines.extend(
-                [f'{pad}  End Site', pad + '  {', f'{pad}    OFFSET {" ".join(map(str, end))}']
-            )
-            lines.append(pad + '  }')
-        lines.append(pad + '}')
-
-    add('Hips', 0)
-    phase = {name: rng.uniform(0, 6) for name in channels}
-    lines += ['MOTION', f'Frames: {frames}', 'Frame Time: 0.0333333']
-    for t in range(frames):
-        row: list[float] = [0.0, 1.0, 0.0]
-        for name in channels:
-            swing = 12.0 * np.sin(0.4 * t + phase[name])
-            if name in ('LeftLeg', 'RightLeg'):
-                row += [0.0, 0.0, 25.0 + swing]
-            elif name in ('LeftForeArm', 'RightForeArm'):
-                row += [0.0, 0.0, -45.0 + swing]
-            elif name in ('LeftHand', 'RightHand'):
-                row += [0.0, 0.0, 0.0]
-            else:
-                row += [0.3 * swing, 0.3 * swing, swing]
-        lines.append(' '.join(f'{x:.4f}' for x in row))
-    path.write_text('\n'.join(lines) + '\n')
-    return path
+    rng, joints = np.random.default_rng(seed), figure(hang=True)
+    rows = np.zeros((frames, 3 + 3 * len(joints)))
+    rows[:, 1] = 1.0
+    for i, name in enumerate(joints, 1):
+        swing = 12.0 * np.sin(0.4 * np.arange(frames) + rng.uniform(0, 6))[:, None]
+        bend = {'Leg': 25.0, 'ForeArm': -45.0}.get(name.removeprefix('Left').removeprefix('Right'))
+        if bend is not None:
+            rows[:, 3 * i + 1] = bend + swing[:, 0]
+        elif not name.endswith('Hand'):
+            rows[:, 3 * i : 3 * i + 3] = swing * [0.3, 1.0, 0.3]
+    return write_bvh(path, joints, rows)
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     result = tmp_path_factory.mktemp('motions')
     for i in range(4):
         write_motion(result / f'lab_{i:02d}_walk.bvh', i)
@@ -102,12 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return result
 
 
-def test_the_command_learns_chooses_and_tells(
-    folder: Path,
-    tmp_path: Path,
-    read_here: Callable[[], None],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_learns_chooses_and_tells(folder, tmp_path, read_here, capsys):
     output = tmp_path / 'prior.npz'
     rest = [
         str(folder),
@@ -145,15 +73,6 @@ def test_the_command_learns_chooses_and_tells(
     assert 'exists: --overwrite replaces it' in capsys.readouterr().err
 
 
-def test_people_come_from_tables(folder: Path, tmp_path: Path) -> None:
-    table = tmp_path / 'index.csv'
-    table.write_text('file,subject,more\ntrain/lab_00_walk.bvh,07?,x\nlab_01_walk.bvh,08,y\n')
-    assert people_in([table]) == {'lab_00_walk': '07', 'lab_01_walk': '08'}
-    table.write_text('name,subject\n')
-    with pytest.raises(ValueError, match=r"index.csv: no column 'file'"):
-        people_in([table])
-
-
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
@@ -165,14 +84,7 @@ def test_people_come_from_tables(folder: Path, tmp_path: Path) -> None:
         (['FOLDER', '--people', 'none.csv'], 'none.csv'),
     ],
 )
-def test_bad_input_is_one_line(
-    folder: Path,
-    tmp_path: Path,
-    arguments: list[str],
-    message: str,
-    read_here: Callable[[], None],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_bad_input_is_one_line(folder, tmp_path, arguments, message, read_here, capsys):
     read_here()
     places = {'FOLDER': str(folder), 'ONE': str(folder / 'lab_00_walk.bvh')}
     given = [places.get(x, x) for x in arguments]

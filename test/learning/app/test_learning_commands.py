@@ -1,14 +1,9 @@
 """The commands of hmt_learning explain themselves; bad arguments are one line."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
 from hmt_learning.app import COMMANDS, main
 
-ROOT = Path(__file__).resolve().parents[3]
 WHAT = ('lengths', 'lifter', 'motion', 'prior')
 
 
@@ -37,13 +32,3 @@ def test_what_nobody_can_learn_is_one_line(capsys):
     assert main(['learn', 'weather', 'a.bvh']) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert all(what in line for what in ('weather', *WHAT))
-
-
-def test_module_is_the_command(tmp_path):
-    command = ['-m', 'hmt_learning', 'make-bag', 'swim', '-o', str(tmp_path / 'new' / 'bag')]
-    result = subprocess.run(
-        [sys.executable, *command], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 1
-    assert result.stderr.startswith('make-bag: ')
-    assert not any(tmp_path.iterdir())

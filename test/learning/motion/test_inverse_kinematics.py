@@ -123,34 +123,6 @@ def test_joints_that_do_not_matter(small):
     assert np.abs(kept - joints[:, small.skeleton.joint_index(names)]).max() < 5e-3
 
 
-def test_a_precise_joint_wins(small):
-    """Two contradicting targets of a translated body are met by their precisions."""
-    pose = np.zeros((1, small.dimension))
-    pose[0, 2] = 3.0
-    names = ('left_shoulder', 'right_shoulder')
-    joints = small.joint_positions(pose)[:, small.skeleton.joint_index(names)]
-    targets = joints + np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 0.0]])
-    found = solve_joint_positions(
-        small, pose, targets, names, sigma=[0.01, 0.02], free_dofs=('root_tz',), prior_weight=0.0
-    )
-    # precisions 4 : 1
-    assert found.x[0, 2] == pytest.approx(3.0 + 0.3 * 4 / 5, abs=1e-6)
-
-
-def test_only_free_degrees_of_freedom_move(small):
-    truth = inner_poses(small, 4, 8)
-    start = truth.copy()
-    free = ('left_shoulder_x', 'left_shoulder_y', 'left_shoulder_z', 'left_elbow')
-    own = small.skeleton.dof_index(free)
-    start[:, own] = near(small, truth, 0.3, 9)[:, own]
-    found = solve_joint_positions(
-        small, start, small.joint_positions(truth), free_dofs=free, prior_weight=1e-9
-    )
-    others = np.setdiff1d(np.arange(small.dimension), own)
-    assert np.array_equal(found.x[:, others], start[:, others])
-    assert np.abs(found.x - truth).max() < 1e-3
-
-
 def test_limits_hold(small):
     """A forearm asked to bend backwards stays straight."""
     pose = np.zeros((1, small.dimension))
@@ -166,15 +138,6 @@ def test_limits_hold(small):
     whole = solve_joint_positions(small, pose, wanted)
     assert (whole.x >= small.lower).all()
     assert (whole.x <= small.upper).all()
-
-
-def test_problems_of_a_batch_do_not_touch_each_other(small):
-    truth = inner_poses(small, 5, 10)
-    start, joints = near(small, truth, 0.1, 11), small.joint_positions(truth)
-    together = solve_joint_positions(small, start, joints)
-    for n in range(5):
-        alone = solve_joint_positions(small, start[n], joints[n : n + 1])
-        assert np.allclose(alone.x[0], together.x[n], atol=1e-9)
 
 
 def test_what_does_not_fit_is_refused(small):

@@ -1,12 +1,9 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from hmt_learning.training.predictor_learning import (
     KINDS,
     affinities,
-    multimodality,
     new_model,
     target_basis,
 )
@@ -16,7 +13,7 @@ from hmt_ros.experts import CalibratedExperts
 from hmt_ros.experts.pose_encoding import PoseEncoding
 
 
-def test_models_by_name() -> None:
+def test_models_by_name():
     for name in KINDS:
         assert isinstance(new_model(name), CalibratedExperts)
     few = new_model('joint', samples=200)
@@ -26,7 +23,7 @@ def test_models_by_name() -> None:
         new_model('forest')
 
 
-def test_affinities() -> None:
+def test_affinities():
     vectors = np.random.default_rng(0).normal(size=(20, 3))
     found = affinities(vectors)
     np.testing.assert_allclose(found, found.T)
@@ -35,22 +32,7 @@ def test_affinities() -> None:
     assert np.median(off) == pytest.approx(np.exp(-0.5), rel=0.05)
 
 
-def test_multimodality_counts_branches() -> None:
-    rng = np.random.default_rng(1)
-    groups = np.repeat(np.arange(6), 40)
-    inputs = np.stack([10.0 * groups, 0 * groups], axis=1) + 0.01 * rng.normal(size=(240, 2))
-    branch = np.where(groups < 3, 0, np.arange(240) % 2)  # three groups have two poses each
-    targets = np.stack([10.0 * groups, 100.0 * branch], axis=1) + 0.01 * rng.normal(size=(240, 2))
-    found = multimodality(inputs, targets, 9, seed=3)
-    assert len(found) >= 2
-    assert found.sum() <= 9
-    alone = multimodality(inputs, inputs, 6, seed=3)
-    np.testing.assert_array_equal(alone, [6])
-    with pytest.raises(ValueError, match='clusters'):
-        multimodality(inputs, targets, 241)
-
-
-def test_the_metric_of_targets_is_that_of_joints() -> None:
+def test_the_metric_of_targets_is_that_of_joints():
     body = load_body('human37')
     encoding = PoseEncoding(body)
     poses = procedural_sequence('dance', body, 3.0, 1).poses

@@ -1,7 +1,5 @@
 """Archives of arrays: data alone, of a bounded size."""
 
-from __future__ import annotations
-
 import io
 import random
 import zipfile
@@ -13,22 +11,22 @@ import pytest
 from msg_tools.files.array_file import read_archive
 
 
-def archive_of(path: Path, header: bytes, data: bytes) -> Path:
+def archive_of(path, header, data):
     """An archive whose only array has this header and these bytes."""
     with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive:
         archive.writestr('a.npy', b'\x93NUMPY\x01\x00' + header + data)
     return path
 
 
-def header_of(text: str) -> bytes:
+def header_of(text):
     return len(text).to_bytes(2, 'little') + text.encode()
 
 
-def test_arrays_come_back(tmp_path: Path) -> None:
+def test_arrays_come_back(tmp_path):
     path = tmp_path / 'a.npz'
     rng = np.random.default_rng(0)
     arrays = {'x': rng.normal(size=(3, 4)), 'name': np.array('walk'), 'none': np.zeros((0, 5))}
-    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(path, **arrays)
     found = read_archive(path)
     assert found.keys() == arrays.keys()
     for name, array in arrays.items():
@@ -36,9 +34,9 @@ def test_arrays_come_back(tmp_path: Path) -> None:
         assert found[name].dtype == array.dtype
 
 
-def test_objects_are_never_unpickled(tmp_path: Path) -> None:
+def test_objects_are_never_unpickled(tmp_path):
     class Trap:
-        def __reduce__(self) -> tuple[object, tuple[str]]:
+        def __reduce__(self):
             return (Path.touch, (str(tmp_path / 'sprung'),))
 
     path = tmp_path / 'a.npz'
@@ -53,7 +51,7 @@ def test_objects_are_never_unpickled(tmp_path: Path) -> None:
     assert not (tmp_path / 'sprung').exists()
 
 
-def test_what_unfolds_to_too_much_is_refused_unread(tmp_path: Path) -> None:
+def test_what_unfolds_to_too_much_is_refused_unread(tmp_path):
     path = tmp_path / 'bomb.npz'
     np.savez_compressed(path, zeros=np.zeros(2_000_000))
     assert path.stat().st_size < 50_000
@@ -63,22 +61,15 @@ def test_what_unfolds_to_too_much_is_refused_unread(tmp_path: Path) -> None:
     assert read_archive(path)['zeros'].shape == (2_000_000,)
 
 
-def test_claims_are_compared_with_what_is_there(tmp_path: Path) -> None:
+def test_claims_are_compared_with_what_is_there(tmp_path):
     text = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}"
     path = archive_of(tmp_path / 'a.npz', header_of(text.ljust(117) + '\n'), b'\0' * 80)
     with pytest.raises(ValueError, match=r'a.npy claims 8000000000000 bytes, but has 208'):
         read_archive(path)
 
 
-def test_a_head_that_is_no_python(tmp_path: Path) -> None:
-    path = archive_of(tmp_path / 'a.npz', header_of('{(' * 20 + '\n'), b'\0' * 80)
-    with pytest.raises(ValueError, match=r'.') as caught:
-        read_archive(path)
-    assert '\n' not in str(caught.value)
-
-
 @pytest.mark.parametrize('content', [b'', b'PK', b'not an archive at all'])
-def test_other_files(content: bytes, tmp_path: Path) -> None:
+def test_other_files(content, tmp_path):
     path = tmp_path / 'a.npz'
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r'(?i)zip file|no data|pickle|magic') as caught:
@@ -88,7 +79,7 @@ def test_other_files(content: bytes, tmp_path: Path) -> None:
         read_archive(tmp_path / 'none.npz')
 
 
-def test_damaged_archives_are_read_or_refused(tmp_path: Path) -> None:
+def test_damaged_archives_are_read_or_refused(tmp_path):
     path = tmp_path / 'a.npz'
     buffer = io.BytesIO()
     np.savez_compressed(buffer, x=np.arange(100.0), y=np.array('text'))

@@ -1,15 +1,11 @@
 """Files up to an agreed size."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from msg_tools.files.bounded_file import read_bytes
 
 
-def test_content_up_to_the_limit(tmp_path: Path) -> None:
+def test_content_up_to_the_limit(tmp_path):
     path = tmp_path / 'file'
     path.write_bytes(bytes(range(256)) * 8192)
     assert read_bytes(path, 2**21) == path.read_bytes()
@@ -18,12 +14,12 @@ def test_content_up_to_the_limit(tmp_path: Path) -> None:
     assert str(path) not in str(caught.value)
 
 
-def test_what_has_no_size_ends_at_the_limit() -> None:
+def test_what_has_no_size_ends_at_the_limit():
     with pytest.raises(ValueError, match='more than 1000 bytes'):
         read_bytes('/dev/zero', 1000)
 
 
-def test_what_can_not_be_read(tmp_path: Path) -> None:
+def test_what_can_not_be_read(tmp_path):
     for path, error in ((tmp_path / 'none', 'No such file'), (tmp_path, 'Is a directory')):
         with pytest.raises(ValueError, match=rf'can not be read \({error}'):
             read_bytes(path, 1000)

@@ -1,7 +1,5 @@
 """YAML from outside: data alone, bounded."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 
@@ -17,7 +15,7 @@ BOMB = 'a: &a [x, x, x, x, x, x, x, x, x, x]\n' + ''.join(
 )
 
 
-def test_plain_documents() -> None:
+def test_plain_documents():
     assert load_plain_yaml('a: {b: [1, 2.5, x], c: true}\n') == {
         'a': {'b': [1, 2.5, 'x'], 'c': True}
     }
@@ -40,13 +38,13 @@ def test_plain_documents() -> None:
         ('a: 1\n---\nb: 2\n', 'single document'),
     ],
 )
-def test_everything_else_is_one_line(text: str, message: str) -> None:
+def test_everything_else_is_one_line(text, message):
     with pytest.raises(ValueError, match=message) as caught:
         load_plain_yaml(text)
     assert '\n' not in str(caught.value)
 
 
-def test_damaged_model_files_are_read_or_refused(tmp_path: Path) -> None:
+def test_damaged_model_files_are_read_or_refused(tmp_path):
     whole = MODEL.read_bytes()
     rng = random.Random(1)
     path = tmp_path / 'body.yaml'
@@ -64,7 +62,7 @@ def test_damaged_model_files_are_read_or_refused(tmp_path: Path) -> None:
     assert not any('\n' in text for text in refused)
 
 
-def test_names_from_messages_lead_to_no_files(tmp_path: Path) -> None:
+def test_names_from_messages_lead_to_no_files(tmp_path):
     path = tmp_path / 'own.yaml'
     path.write_bytes(MODEL.read_bytes())
     assert load_body(path).name == 'human37'

@@ -1,10 +1,6 @@
 """People in the messages of other detectors, and what is refused."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,13 +19,13 @@ from msg_tools.messages.message_types import register_definitions, typestore
 COCO = schemes()['coco17']
 
 
-def skeleton(**points: tuple[float, float, float]) -> Any:
+def skeleton(**points):
     names = schemes()['skeleton2d'].names
     rows = [points.get(name, (0.0, 0.0, 0.0)) for name in names]
     return SimpleNamespace(skeleton=[SimpleNamespace(x=x, y=y, c=c) for x, y, c in rows])
 
 
-def test_a_skeleton_is_in_units_of_the_image() -> None:
+def test_a_skeleton_is_in_units_of_the_image():
     message = skeleton(neck=(0.5, 0.25, 0.75), left_hip=(0.0, 1.0, 1.0), nose=(0.5, 0.5, 0.0))
     person = person_of_skeleton(message, 640, 480)
     keypoints = person.keypoints
@@ -38,7 +34,7 @@ def test_a_skeleton_is_in_units_of_the_image() -> None:
     np.testing.assert_array_equal(keypoints.confidences[keypoints.seen], [0.75, 1.0])
 
 
-def test_skeletons_that_are_none() -> None:
+def test_skeletons_that_are_none():
     message = skeleton()
     message.skeleton.pop()
     with pytest.raises(MessageError, match='Skeleton2D has 17 points, wanted 18'):
@@ -49,7 +45,7 @@ def test_skeletons_that_are_none() -> None:
         person_of_skeleton(skeleton(nose=(0.5, 0.5, 1.5)), 640, 480)
 
 
-def detection(name: str, **points: tuple[float, float, float]) -> Any:
+def detection(name, **points):
     """A detection of yolo_ros: its keypoints have numbers from 1."""
     data = [
         SimpleNamespace(
@@ -62,7 +58,7 @@ def detection(name: str, **points: tuple[float, float, float]) -> Any:
     return SimpleNamespace(id=name, keypoints=SimpleNamespace(data=data))
 
 
-def test_people_of_yolo() -> None:
+def test_people_of_yolo():
     dog = detection('1')
     anna = detection('2', left_ankle=(10.0, 20.0, 0.5), nose=(0.0, 0.0, 0.1))
     (person,) = people_of_yolo(SimpleNamespace(detections=[dog, anna]), COCO)
@@ -83,13 +79,13 @@ def test_people_of_yolo() -> None:
         ([detection('1')] * 1001, 'message has 1001 people, the limit is 1000'),
     ],
 )
-def test_people_of_yolo_that_are_none(found: list[Any], error: str) -> None:
+def test_people_of_yolo_that_are_none(found, error):
     with pytest.raises(MessageError, match=error) as caught:
         people_of_yolo(SimpleNamespace(detections=found), COCO)
     assert '\n' not in str(caught.value)
 
 
-def floats(data: Any, *shape: int, label: str = '', offset: int = 0) -> Any:
+def floats(data, *shape, label='', offset=0):
     messages = RosbagsMessages()
     dimensions = [
         messages.create(
@@ -102,7 +98,7 @@ def floats(data: Any, *shape: int, label: str = '', offset: int = 0) -> Any:
     return messages.create('std_msgs/msg/Float32MultiArray', layout=layout, data=content)
 
 
-def test_people_of_floats() -> None:
+def test_people_of_floats():
     rows = np.arange(2 * 17 * 3, dtype=float).reshape(2, 17, 3)
     rows[..., 2] = 0.5
     both = people_of_floats(floats(rows, 2, 17, 3), COCO)
@@ -131,7 +127,7 @@ def test_people_of_floats() -> None:
         (floats(np.ones((1001, 17, 2)), 1001, 17, 2), 'has 1001 people, the limit is 1000'),
     ],
 )
-def test_floats_that_are_no_people(message: Any, error: str) -> None:
+def test_floats_that_are_no_people(message, error):
     with pytest.raises(MessageError, match=error):
         people_of_floats(message, COCO)
 
@@ -140,12 +136,12 @@ def test_floats_that_are_no_people(message: Any, error: str) -> None:
     ('label', 'stamp'),
     [('1700000000000000001', 1_700_000_000_000_000_001), ('', None), ('rows', None), ('-1', None)],
 )
-def test_stamps_of_floats(label: str, stamp: int | None) -> None:
+def test_stamps_of_floats(label, stamp):
     assert stamp_of_floats(floats(np.ones((17, 2)), 17, 2, label=label)) == stamp
     assert stamp_of_floats(floats(np.ones(34))) is None
 
 
-def test_messages_of_another_package_can_be_read(tmp_path: Path) -> None:
+def test_messages_of_another_package_can_be_read(tmp_path):
     (tmp_path / 'Spot.msg').write_text('float32 x\nfloat32 y\n', 'utf-8')
     (tmp_path / 'Spots.msg').write_text('std_msgs/Header header\nSpot[2] spots\n', 'utf-8')
     register_definitions('foreign_msgs', tmp_path)

@@ -70,12 +70,6 @@ def test_contradictions_are_refused(name, value, why):
         ground_of(message)
 
 
-@pytest.mark.parametrize('up', [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, np.nan, 1.0], [1.0, 0.0]])
-def test_what_is_no_direction(up):
-    with pytest.raises(MessageError, match='ground: up'):
-        state(up=np.array(up))
-
-
 def place_of(marker):
     position, turn = marker.pose.position, marker.pose.orientation
     q = np.array([turn.x, turn.y, turn.z, turn.w])
@@ -100,15 +94,6 @@ def test_floor_lies_under_the_person(up):
     across = top - joints.mean(0)
     np.testing.assert_allclose(across - (across @ content.up) * content.up, 0.0, atol=1e-9)
     assert 0 < floor.color.a < 0.5
-
-
-def test_feet_that_stand_are_marked():
-    joints = np.arange(12.0).reshape(4, 3)
-    contacts = {'left_foot': 0.9, 'right_foot': 0.2, 'tail': 1.0}
-    _, feet = ground_markers(MESSAGES, state(contacts=contacts), joints, JOINTS)
-    assert (feet.ns, feet.type, feet.action) == ('contacts', 7, 0)
-    np.testing.assert_array_equal([[p.x, p.y, p.z] for p in feet.points], joints[1:])
-    np.testing.assert_allclose([c.a for c in feet.colors], [0.9, 0.9, 0.2])
 
 
 def test_what_is_not_known_is_deleted():

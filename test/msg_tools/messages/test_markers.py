@@ -1,13 +1,11 @@
 """Markers of the modes of a mixture."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 
-from msg_tools import MessageError, RosbagsMessages
+from msg_tools import MessageError
 from msg_tools.messages.markers import skeleton_markers
 
 ADD, DELETE, LINE_LIST, SPHERE_LIST = 0, 2, 5, 7
@@ -17,7 +15,7 @@ POSITIONS = np.arange(27, dtype=float).reshape(3, 3, 3)
 WEIGHTS = [0.2, 0.5, 0.3]
 
 
-def markers(messages: RosbagsMessages, **changes: Any) -> Any:
+def markers(messages, **changes):
     arguments: dict[str, Any] = {
         'joint_positions': POSITIONS,
         'joint_names': NAMES,
@@ -30,7 +28,7 @@ def markers(messages: RosbagsMessages, **changes: Any) -> Any:
     return skeleton_markers(messages, **{**arguments, **changes}).markers
 
 
-def test_every_rank_is_spoken_of(messages: RosbagsMessages) -> None:
+def test_every_rank_is_spoken_of(messages):
     found = [(m.ns, m.id, m.action) for m in markers(messages)]
     assert found == [
         (f'mode_{rank}', key, ADD if rank < 3 else DELETE) for rank in range(5) for key in (0, 1)
@@ -43,7 +41,7 @@ def test_every_rank_is_spoken_of(messages: RosbagsMessages) -> None:
     assert all(m.pose.orientation.w == 1.0 for m in later)
 
 
-def test_heaviest_first_and_least_transparent(messages: RosbagsMessages) -> None:
+def test_heaviest_first_and_least_transparent(messages):
     found = markers(messages)
     for rank, mode in enumerate([1, 2, 0]):
         bones, joints = found[2 * rank : 2 * rank + 2]
@@ -61,18 +59,7 @@ def test_heaviest_first_and_least_transparent(messages: RosbagsMessages) -> None
     assert found[2].color.r < found[2].color.b
 
 
-def test_lightest_modes_are_left_out(messages: RosbagsMessages) -> None:
-    found = markers(messages, ranks=2)
-    assert [m.ns for m in found] == ['mode_0', 'mode_0', 'mode_1', 'mode_1']
-    assert found[3].points[0].x == POSITIONS[2, 0, 0]
-
-
-def test_no_modes_delete_everything(messages: RosbagsMessages) -> None:
-    found = markers(messages, joint_positions=np.zeros((0, 3, 3)), weights=[])
-    assert [m.action for m in found] == [DELETE] * 10
-
-
-def test_defects(messages: RosbagsMessages) -> None:
+def test_defects(messages):
     with pytest.raises(MessageError, match=r'shape \(3, 3, 3\), wanted \(2, 3, 3\)'):
         markers(messages, weights=[0.5, 0.5])
     with pytest.raises(MessageError, match="has the unknown joint 'tail'"):

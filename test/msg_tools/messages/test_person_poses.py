@@ -1,24 +1,22 @@
 """The pose of a person, with its covariance about fixed axes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hmt_ros.body import Body, load_body
+from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
-from msg_tools import MessageError, RosbagsMessages
+from msg_tools import MessageError
 from msg_tools.messages.cdr import deserialise, serialise
 from msg_tools.messages.person_poses import PERSON_POSE, person_pose, person_pose_message
 
 
 @pytest.fixture(scope='module')
-def body() -> Body:
+def body():
     return load_body('human37')
 
 
-def one(body: Body, **angles: float) -> np.ndarray:
+def one(body, **angles):
     """A pose (1, d) 4 m before the camera."""
     pose = body.prior_mean.copy()
     pose[2] = 4.0
@@ -27,11 +25,11 @@ def one(body: Body, **angles: float) -> np.ndarray:
     return pose[None]
 
 
-def joint(body: Body, poses: np.ndarray, name: str) -> np.ndarray:
+def joint(body, poses, name):
     return body.joint_positions(poses)[0, body.joint_names.index(name)]
 
 
-def test_axes_are_forward_left_and_up(body: Body) -> None:
+def test_axes_are_forward_left_and_up(body):
     poses = one(body, root_z=0.7, root_y=0.2, root_x=-0.3)
     found = person_pose(body, GaussianMixture([1.0], poses, 1e-4 * np.eye(37)[None]))
     left = joint(body, poses, 'left_hip') - joint(body, poses, 'right_hip')
@@ -42,7 +40,7 @@ def test_axes_are_forward_left_and_up(body: Body) -> None:
     np.testing.assert_allclose(found.position, joint(body, poses, 'pelvis'), atol=1e-9)
 
 
-def test_covariance_is_that_of_samples(body: Body) -> None:
+def test_covariance_is_that_of_samples(body):
     """Of the rotation, about the axes of the camera, and of what it has to do with the place."""
     rng = np.random.default_rng(0)
     poses = one(body, root_z=1.2, root_y=0.5, root_x=0.4)
@@ -59,7 +57,7 @@ def test_covariance_is_that_of_samples(body: Body) -> None:
     np.testing.assert_allclose(found.covariance / scale, sampled / scale, atol=0.1)
 
 
-def test_components_that_disagree_widen_it(body: Body) -> None:
+def test_components_that_disagree_widen_it(body):
     means = np.concatenate([one(body), one(body, root_tz=4.4, root_z=0.3)])
     tight = np.tile(1e-6 * np.eye(37), (2, 1, 1))
     found = person_pose(body, GaussianMixture([0.75, 0.25], means, tight))
@@ -68,7 +66,7 @@ def test_components_that_disagree_widen_it(body: Body) -> None:
     assert np.trace(found.covariance[3:, 3:]) == pytest.approx(0.25 * 0.3**2, rel=1e-3)
 
 
-def test_in_another_frame(body: Body) -> None:
+def test_in_another_frame(body):
     turn = Rotation.from_euler('zyx', [0.3, 1.0, -0.5]).as_matrix()
     poses = one(body, root_z=1.2)
     found = person_pose(body, GaussianMixture([1.0], poses, np.diag(np.arange(1.0, 38.0))[None]))
@@ -83,7 +81,7 @@ def test_in_another_frame(body: Body) -> None:
     )
 
 
-def test_message(body: Body, messages: RosbagsMessages) -> None:
+def test_message(body, messages):
     found = person_pose(body, GaussianMixture([1.0], one(body), 1e-4 * np.eye(37)[None]))
     message = person_pose_message(messages, found, 1_700_000_000_000_000_007, 'odom')
     back = deserialise(serialise(message), PERSON_POSE)

@@ -64,7 +64,3 @@ def test_keypoints_that_are_not_believed_show_nothing():
     usual = TrackerSettings()
     off = replace(usual.likelihood, keypoints=TermSettings(0.0, 1.0, 3.0))
     assert searched_for(every, settings=replace(usual, likelihood=off)) == LIMBS
-
-
-def test_without_shapes_nothing_is_searched_for():
-    assert searched_for(Observation(keypoints=seen()), surprising=True) == set()

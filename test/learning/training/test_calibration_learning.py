@@ -5,13 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_learning.training.calibration_learning import LearningCalibration, calibration, folds_of
 from hmt_ros.experts import JointExperts, NearestNeighbours, RelevanceVectorRegression
-from hmt_ros.experts.calibrated_experts import (
-    CalibratedExperts,
-    Calibration,
-    calibration,
-    folds_of,
-)
+from hmt_ros.experts.calibrated_experts import CalibratedExperts, Calibration
 from hmt_ros.experts.conditional_density import Components
 from hmt_ros.experts.model_file import nested
 
@@ -31,7 +27,7 @@ def grouped(seed: int, spread: float) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def test_what_motions_left_out_add() -> None:
     inputs, targets, groups = grouped(0, 0.5)
-    model = CalibratedExperts(NearestNeighbours(3))
+    model = LearningCalibration(NearestNeighbours(3))
     # Neighbours of the same group know its offset: the plain model is far too sure.
     plain = NearestNeighbours(3).fit(inputs, targets)
     assert np.sqrt(np.trace(plain.noise_)) < 0.25
@@ -73,7 +69,7 @@ def test_gates_that_are_right_by_chance_are_softened() -> None:
 
 def test_means_stay_as_they_are() -> None:
     inputs, targets, groups = grouped(4, 0.2)
-    model = CalibratedExperts(JointExperts(2, 'linear')).fit(inputs, targets, groups=groups)
+    model = LearningCalibration(JointExperts(2, 'linear')).fit(inputs, targets, groups=groups)
     plain = JointExperts(2, 'linear').fit(inputs, targets)
     np.testing.assert_array_equal(
         model.components(inputs[:9]).means, plain.components(inputs[:9]).means
@@ -84,7 +80,7 @@ def test_means_stay_as_they_are() -> None:
 
 def test_a_file_brings_it_back(tmp_path: Path) -> None:
     inputs, targets, groups = grouped(5, 0.2)
-    model = CalibratedExperts(RelevanceVectorRegression(), folds=2)
+    model = LearningCalibration(RelevanceVectorRegression(), folds=2)
     model.fit(inputs, targets, groups=groups)
     again = CalibratedExperts.load(model.save(tmp_path / 'model'))
     assert again.folds == 2
@@ -105,22 +101,24 @@ def test_folds_leave_whole_groups_out() -> None:
 
 def test_bad_input() -> None:
     inputs, targets, groups = grouped(6, 0.2)
-    model = CalibratedExperts(NearestNeighbours(3))
+    model = LearningCalibration(NearestNeighbours(3))
     with pytest.raises(ValueError, match='one group only'):
         model.fit(inputs, targets, groups=np.zeros(len(inputs)))
     with pytest.raises(ValueError, match='groups have shape'):
         model.fit(inputs, targets, groups=groups[:-1])
     with pytest.raises(ValueError, match='folds is 1'):
-        CalibratedExperts(NearestNeighbours(3), folds=1).fit(inputs, targets)
+        LearningCalibration(NearestNeighbours(3), folds=1).fit(inputs, targets)
     with pytest.raises(ValueError, match='has not learned'):
-        CalibratedExperts(NearestNeighbours(3)).components(inputs)
+        LearningCalibration(NearestNeighbours(3)).components(inputs)
     with pytest.raises(ValueError, match='temperature must be at least 1'):
         Calibration(0.5, np.zeros((2, 2)), 1.0)
 
 
 def test_files_that_nest_calibrated_models_are_refused() -> None:
     inputs, targets, groups = grouped(7, 0.2)
-    arrays = CalibratedExperts(NearestNeighbours(3)).fit(inputs, targets, groups=groups).to_arrays()
+    arrays = (
+        LearningCalibration(NearestNeighbours(3)).fit(inputs, targets, groups=groups).to_arrays()
+    )
     own = {name: value for name, value in arrays.items() if not name.startswith('model/')}
     with pytest.raises(ValueError, match='calibrated model inside a calibrated model'):
         CalibratedExperts.from_arrays(own | nested('model', arrays))
