@@ -26,8 +26,9 @@ from benchmarks.truth_fits import QUICK, SUBTRACTED, TRUE, best_poses, fitted, s
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import GROWTH_SIGMAS, ShapeSpace
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, ObservedImage
 from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.surface import (
     empty_contour,
     flesh_table_of,
@@ -36,6 +37,7 @@ from hmt_ros.image.surface import (
     trace_contour,
 )
 from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.inference.energy import Derivatives
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 
 Array = NDArray[np.float64]
@@ -157,8 +159,8 @@ def energy_of(clips: Sequence[Posed], growth: Array) -> float:
         body = grown(clip.body, growth)
         likelihood = ImageLikelihood(body, clip.camera, SETTINGS)
         for pose, observation in zip(clip.poses, clip.observations, strict=True):
-            frames = forward(body.skeleton, pose[None])
-            result += float(likelihood.energies(frames, observation, derivatives=False).value[0])
+            image = PoseEnergy(likelihood, (ObservedImage(likelihood, observation),))
+            result += float(image.energy(pose[None], derivatives=Derivatives.NONE).value[0])
     return result
 
 

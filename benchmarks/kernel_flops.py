@@ -31,7 +31,6 @@ from hmt_ros.image.observation import observe
 from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import lens_of
 from hmt_ros.image.surface_points import seen_points
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.energy import Derivatives, Quadratic
@@ -66,7 +65,7 @@ def energies(poses: int) -> tuple[dict[str, PoseEnergy], Array]:
         body, GroundSettings(), FloorPlane(np.array([0.0, -1.0, 0.0]), 0.05, 1.2, 0.02)
     )
     flow = FlowTerm(
-        body.skeleton, lens_of(CAMERA), seen_points(body, CAMERA, forward(body.skeleton, x)),
+        seen_points(body, CAMERA, forward(body.skeleton, x)),
         ImageMap(rng.normal(0.0, 3.0, (2, 480, 640)).astype(np.float32)), 5.0,
     )  # fmt: skip
     nothing = PoseEnergy(likelihood, ())

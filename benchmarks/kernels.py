@@ -17,7 +17,6 @@ from benchmarks.command import benchmark_parser, show
 from benchmarks.kernel_flops import ALL, KINDS, PLACING, counts, energies
 from benchmarks.machine import best_time, description, dgemm_rate
 from hmt_ros.body import load_body
-from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.tracking.selection import choose_hypotheses
@@ -73,12 +72,11 @@ def _cases(seconds: float) -> Iterator[dict[str, Any]]:
     body, rng = load_body('human37'), np.random.default_rng(0)
     joints, log_weights = rng.normal(0, 0.1, (256, 19, 3)), rng.normal(0, 3, 256)
     poses = _any_poses(128)
-    frames = forward(body.skeleton, poses)
     cases: tuple[tuple[str, int, Callable[[], Any]], ...] = (
         ('choice of hypotheses', 256, partial(choose_hypotheses, joints, log_weights, 16)),
         ('flips of an arm', 1, partial(enumerate_flips, body, poses[:1], 'left_arm')),
         ('flips of an arm', 128, partial(enumerate_flips, body, poses, 'left_arm')),
-        ('self-intersection', 128, partial(self_intersection_energy, body, frames)),
+        ('self-intersection', 128, partial(self_intersection_energy, body, poses)),
     )
     for what, batch, function in cases:
         yield {'what': what, 'batch': batch, 'ms': 1e3 * best_time(function, seconds=seconds)}

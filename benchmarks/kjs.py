@@ -15,12 +15,12 @@ from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import description, dgemm_rate
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips import enumerate_flips
 from hmt_ros.flips.interpretation_tree import distinct_poses
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, Status, minimise
@@ -258,7 +258,9 @@ def setting_of(body: Body, pose: Array) -> Setting:
     )
     least_squares = LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
     settings = replace(least_squares, prior_weight=PRIOR_WEIGHT)
-    energy = ImageLikelihood(body, CAMERA, settings).given(Observation(keypoints=keypoints))
+    likelihood = ImageLikelihood(body, CAMERA, settings)
+    terms = (*likelihood.seen(Observation(keypoints=keypoints)), *likelihood.priors)
+    energy = PoseEnergy(likelihood, terms)
     start = optimise(body, energy, pose[None])
     return Setting(body, energy, start, np.linalg.inv(start.hessian[0]))
 
@@ -280,7 +282,7 @@ def drawn_poses(body: Body, count: int = DRAWN) -> Array:
     poses = np.clip(poses, body.lower, body.upper)
     poses[:, body.skeleton.dof_index(['root_tx', 'root_ty', 'root_tz'])] = 0.0, 0.1, DISTANCE
     poses[:, body.dof_names.index('root_z')] = 0.0
-    overlap, _, _ = self_intersection_energy(body, forward(body.skeleton, poses))
+    overlap = self_intersection_energy(body, poses)
     return poses[overlap == 0.0]
 
 

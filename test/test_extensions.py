@@ -121,9 +121,9 @@ BRIGHTNESS = ImageTerm(
 TRY_TERM = """
 import numpy as np
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.kinematics import forward
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import observe
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.image_term import TermSettings
 
 body, camera = load_body('human32'), Camera(100.0, 100.0, 31.5, 23.5, 64, 48)
@@ -132,7 +132,8 @@ poses = np.zeros((2, body.dimension))
 poses[:, 2] = 3.0
 observation = observe(np.full((48, 64, 3), 60, np.uint8))
 likelihood = ImageLikelihood(body, camera, settings)
-print(likelihood.energies(forward(body.skeleton, poses), observation).terms['brightness'].tolist())
+energy = PoseEnergy(likelihood, likelihood.seen(observation))
+print(energy.by_cue(poses, derivatives=False).values[:, 0].tolist())
 """
 
 

@@ -186,7 +186,7 @@ def _bme() -> Scene:
 def _smoother() -> Scene:
     return Scene(
         'smoother_node',
-        SmootherParameters(max_trajectories=4, window_length=8, queue_size=5),
+        SmootherParameters(window_length=8, queue_size=5),
         SmootherSession,
         {MIXTURE: ('likelihood_mixture', 'hmt_msgs/msg/PoseMixture')},
         (),

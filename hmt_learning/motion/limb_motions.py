@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from hmt_learning.motion.inverse_kinematics import solve_joint_positions
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import forward
 from hmt_ros.body.limb_angles import SIDES
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.inference.arrays import Array
@@ -124,7 +123,7 @@ def _intersects(body: Body, before: Mapping[str, float], after: Mapping[str, flo
         if name in body.dof_names:
             start = before.get(name, 0.0)
             poses[:, body.dof_names.index(name)] = start + share * (after[name] - start)
-    energy, _, _ = self_intersection_energy(body, forward(body.skeleton, poses))
+    energy = self_intersection_energy(body, poses)
     return bool(energy.max() > 0.0)
 
 

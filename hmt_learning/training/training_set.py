@@ -340,7 +340,9 @@ def random_build(body: Body, s: TrainingSettings, rng: np.random.Generator) -> B
     }
     whole = rng.uniform(*s.width_range)
     widths = whole * np.exp(s.width_spread * rng.normal(size=len(body.shapes)))
-    return body.with_segment_lengths(lengths).with_widths(np.clip(widths, 0.6, 1.8).tolist())
+    growth = body.growth.copy()
+    growth[:, :2] += np.log(np.clip(widths, 0.6, 1.8))[:, None]
+    return body.with_segment_lengths(lengths).with_growth(growth)
 
 
 def _fitting_camera(body: Body, poses: Array) -> Camera:

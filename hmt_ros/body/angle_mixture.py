@@ -12,7 +12,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from scipy.special import logsumexp
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import mirror_order
-from hmt_ros.body.model_file import load_body, model_names
+from hmt_ros.body.model_file import load_body, shipped_file
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.mixture import GaussianMixture
@@ -166,11 +165,8 @@ def shipped_prior(body: Body) -> AngleMixture | None:
 
 @lru_cache(maxsize=16)
 def _shipped(name: str) -> AngleMixture | None:
-    file = resources.files('hmt_ros.body') / 'models' / f'{name}_prior.npz'
-    if name not in model_names() or not file.is_file():
-        return None
-    with resources.as_file(file) as path:
-        return read_pose_prior(path, load_body(name))
+    file = shipped_file(name, 'prior')
+    return None if file is None else read_pose_prior(file, load_body(name))
 
 
 def _same_angles(first: Skeleton, second: Skeleton) -> bool:

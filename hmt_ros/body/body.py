@@ -12,7 +12,7 @@ The model file has the table; what a map does is defined by `MAPS`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -315,14 +315,6 @@ class Body:
         mounts = self.skeleton.mounts.copy()
         mounts[0] = level @ self.level.T @ mounts[0]
         return replace(self, skeleton=replace(self.skeleton, mounts=mounts), level=level)
-
-    def with_widths(self, widths: Sequence[float]) -> Body:
-        """The same body, the x and y radii of its parts (B,) multiplied by these factors."""
-        if len(widths) != len(self.shapes):
-            raise ValueError(f'{len(widths)} widths for {len(self.shapes)} parts')
-        growth = self.growth.copy()
-        growth[:, :2] += np.log(np.asarray(widths, dtype=np.float64))[:, None]
-        return self.with_growth(growth)
 
     def _sum_of(self, lengths: Array) -> float:
         names = self.skeleton.length_names

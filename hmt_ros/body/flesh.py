@@ -58,12 +58,6 @@ class Superquadric:
         if not all(abs(t) < 1 for t in self.taper):
             raise ValueError(f'tapers must lie in (-1, 1), saw {self.taper}')
 
-    def surface(self, s: Array, w: Array) -> tuple[Array, Array]:
-        """Points and outward unit normals (..., 3) at heights s in (-1, 1) and angles w."""
-        points, normals = _surfaces((self,), np.ravel(s), np.ravel(w))
-        shape = (*np.shape(s), 3)
-        return points[0].reshape(shape), normals[0].reshape(shape)
-
 
 @dataclass(frozen=True, eq=False)
 class Rings:
@@ -84,12 +78,6 @@ class Rings:
     exponent: Array
 
 
-def rings(part: Superquadric, s: Array) -> Rings:
-    """Rings of a part at heights s (R,) in (-1, 1)."""
-    centre, radius, slope, lean = (x[0] for x in _rings((part,), s))
-    return Rings(centre, radius, slope, lean, np.full(len(s), part.exponents[1]))
-
-
 def _rings(parts: Sequence[Superquadric], s: Array) -> tuple[Array, Array, Array, Array]:
     """Centres (P, R, 3), radii, slopes and leans (P, R, 2) of P parts at heights s (R,)."""
     radii, taper, bend, middle = (
@@ -108,8 +96,11 @@ def _rings(parts: Sequence[Superquadric], s: Array) -> tuple[Array, Array, Array
     return centre, radius, slope, 2.0 * bend * s / az
 
 
-def _surfaces(parts: Sequence[Superquadric], s: Array, w: Array) -> tuple[Array, Array]:
-    """Points and normals (P, R, 3) of P parts at heights s (R,) and angles w (R,)."""
+def surfaces(parts: Sequence[Superquadric], s: Array, w: Array) -> tuple[Array, Array]:
+    """Points and outward unit normals (P, R, 3) of P parts at heights s in (-1, 1) and angles w.
+
+    s, w: (R,).
+    """
     centre, radius, slope, lean = _rings(parts, s)
     e2 = np.array([part.exponents[1] for part in parts])[:, None, None]
     around = np.stack([np.cos(w), np.sin(w)], axis=1)
@@ -144,15 +135,12 @@ class Flesh:
     def rings(self) -> Rings:
         """Rings of all parts, one part after the other."""
         stacks = [
-            rings(part, np.sin(np.linspace(-0.42, 0.42, n) * np.pi))
+            [x[0] for x in _rings((part,), np.sin(np.linspace(-0.42, 0.42, n) * np.pi))]
             for part, n in zip(self.parts, self.ring_count, strict=True)
         ]
-        return Rings(
-            *(
-                np.concatenate([getattr(x, name) for x in stacks])
-                for name in ('centre', 'radius', 'slope', 'lean', 'exponent')
-            )
-        )
+        exponents = np.repeat([part.exponents[1] for part in self.parts], self.ring_count)
+        centre, radius, slope, lean = map(np.concatenate, zip(*stacks, strict=True))
+        return Rings(centre, radius, slope, lean, exponents)
 
     @cached_property
     def ring_parts(self) -> Index:
@@ -223,7 +211,7 @@ def _mesh(flesh: Flesh, stacks: int, slices: int) -> Mesh:
     count = stacks * slices + 2
     vertices, normals = np.empty((2, len(parts), count, 3))
     if parts:
-        vertices[:, :-2], normals[:, :-2] = _surfaces(parts, grid_s, grid_w)
+        vertices[:, :-2], normals[:, :-2] = surfaces(parts, grid_s, grid_w)
     tip = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     for i, part in enumerate(parts):
         vertices[i, -2:] = part.centre + part.radii[2] * tip

@@ -50,61 +50,23 @@ class Constants(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def add_ground_energies(  # type: ignore[no-untyped-def]
-    c,
-    columns,
-    origins,
-    axes,
-    dof_origins,
-    terms,
-    gradient,
-    hessian,
-):
-    """Adds the terms of N poses.
+def add_ground_energy(c, columns, origins, axes, dof_origins, wanted, gradient, hessian):  # type: ignore[no-untyped-def]
+    """The terms of one pose; adds their derivatives.
 
     Args:
         c: the constants.
-        columns, origins: (N, S, 3, 3), (N, S, 3) frames of the segments.
-        axes, dof_origins: (N, d, 3) of the degrees of freedom.
-        terms: (N, 2) is added to.
-        gradient, hessian: (N, d), (N, d, d) are added to; of no length: not wanted.
+        columns, origins: (S, 3, 3), (S, 3) frames of the segments.
+        axes, dof_origins: (d, 3) of the degrees of freedom.
+        wanted: whether derivatives are wanted.
+        gradient, hessian: (d,), (d, d) are added to.
     """
-    count, d, points = len(columns), axes.shape[1], len(c.soles)
-    wanted = len(gradient) > 0
-    place = np.zeros((points, 3))
-    moved = np.zeros((points, 3, d))
-    row = np.zeros(d)
-    for n in range(count):
-        if c.weights[0] > 0:
-            terms[n, 0] += _upright(c, columns[n], axes[n], row, n, wanted, gradient, hessian)
-        if c.weights[1] == 0:
-            continue
-        for p in range(points):
-            s = c.soles[p]
-            for k in range(3):
-                place[p, k] = origins[n, s, k]
-                for i in range(3):
-                    place[p, k] += c.local[p, i] * columns[n, s, i, k]
-            if wanted:
-                _move(c.moves[s], c.dof_is_rotation, axes[n], dof_origins[n], place[p], moved[p])
-        terms[n, 1] += _floor(c, place, moved, row, n, wanted, gradient, hessian)
-
-
-@njit(cache=True, nogil=True)
-def _move(moves, is_rotation, axes, origins, point, result):  # type: ignore[no-untyped-def]
-    """Derivative (3, d) of a point by the degrees of freedom that move it."""
-    for j in range(len(moves)):
-        if not moves[j]:
-            for k in range(3):
-                result[k, j] = 0.0
-        elif is_rotation[j]:
-            x, y, z = point[0] - origins[j, 0], point[1] - origins[j, 1], point[2] - origins[j, 2]
-            result[0, j] = axes[j, 1] * z - axes[j, 2] * y
-            result[1, j] = axes[j, 2] * x - axes[j, 0] * z
-            result[2, j] = axes[j, 0] * y - axes[j, 1] * x
-        else:
-            for k in range(3):
-                result[k, j] = axes[j, k]
+    row = np.zeros(len(axes))
+    total = 0.0
+    if c.weights[0] > 0:
+        total += _upright(c, columns, axes, row, wanted, gradient, hessian)
+    if c.weights[1] > 0:
+        total += _floor(c, columns, origins, axes, dof_origins, row, wanted, gradient, hessian)
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -127,7 +89,7 @@ def _student(square, tails, dimension):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _upright(c, columns, axes, row, n, wanted, gradient, hessian):  # type: ignore[no-untyped-def]
+def _upright(c, columns, axes, row, wanted, gradient, hessian):  # type: ignore[no-untyped-def]
     total = 0.0
     axis, residual = np.empty((3, 3)), np.empty(3)
     for u in range(len(c.upright)):
@@ -155,35 +117,34 @@ def _upright(c, columns, axes, row, n, wanted, gradient, hessian):  # type: igno
                 if c.moves[s, j] and c.dof_is_rotation[j]:
                     row[j] = (axes[j, 0] * x + axes[j, 1] * y + axes[j, 2] * z) / c.lean[u, i]
             k = c.weights[0] * factor
-            _add(row, k * residual[i], k, gradient[n], hessian[n])
+            _add(row, k * residual[i], k, gradient, hessian)
     return total
 
 
-@njit(cache=True, nogil=True, inline='always')
-def _height(up, height, point):  # type: ignore[no-untyped-def]
-    return up[0] * point[0] + up[1] * point[1] + up[2] * point[2] + height
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _project(direction, moved, factor, row):  # type: ignore[no-untyped-def]
-    """Derivative of a point along a direction, times a factor."""
-    for j in range(len(row)):
-        row[j] = factor * (
-            direction[0] * moved[0, j] + direction[1] * moved[1, j] + direction[2] * moved[2, j]
-        )
-
-
 @njit(cache=True, nogil=True)
-def _floor(c, place, moved, row, n, wanted, gradient, hessian):  # type: ignore[no-untyped-def]
+def _floor(c, columns, origins, axes, dof_origins, row, wanted, gradient, hessian):  # type: ignore[no-untyped-def]
     total = 0.0
-    for p in range(len(place)):
-        r = _height(c.up, c.height, place[p]) * c.per_floor
+    up, place = c.up, np.empty(3)
+    for p in range(len(c.soles)):
+        s = c.soles[p]
+        for k in range(3):
+            place[k] = origins[s, k]
+            for i in range(3):
+                place[k] += c.local[p, i] * columns[s, i, k]
+        r = (up[0] * place[0] + up[1] * place[1] + up[2] * place[2] + c.height) * c.per_floor
         if r >= 0.0:
             continue
         value, factor = _student(r * r, c.floor_tails, 1.0)
         total += c.weights[1] * value
         if wanted:
-            _project(c.up, moved[p], c.per_floor, row)
+            for j in range(len(row)):
+                x, y, z = axes[j, 0], axes[j, 1], axes[j, 2]
+                if c.dof_is_rotation[j]:
+                    r0, r1 = place[0] - dof_origins[j, 0], place[1] - dof_origins[j, 1]
+                    r2 = place[2] - dof_origins[j, 2]
+                    x, y, z = y * r2 - z * r1, z * r0 - x * r2, x * r1 - y * r0
+                along = up[0] * x + up[1] * y + up[2] * z
+                row[j] = c.per_floor * along if c.moves[s, j] else 0.0
             k = c.weights[1] * factor
-            _add(row, k * r, k, gradient[n], hessian[n])
+            _add(row, k * r, k, gradient, hessian)
     return total

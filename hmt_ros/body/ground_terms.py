@@ -27,11 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.ground_kernel import Constants, add_ground_energies
+from hmt_ros.body.ground_kernel import Constants
 from hmt_ros.body.kinematics import Frames, forward, point_jacobians
 from hmt_ros.body.skeleton import other_side
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.energy import Derivatives, Energy
 
 # Mean lean forwards of trunk and pelvis, and the deviations sideways and forwards or back, rad.
 # People differ: from hips to neck the clips lean from 9 degrees back to 9 forwards in the mean. The
@@ -97,7 +96,7 @@ class FloorPlane:
 
 @dataclass(frozen=True, eq=False)
 class GroundTerm:
-    """The sum of the terms; a `FrameTerm`.
+    """The sum of the terms.
 
     Attributes:
         body: of the poses.
@@ -108,34 +107,6 @@ class GroundTerm:
     body: Body
     settings: GroundSettings
     plane: FloorPlane
-
-    def energy(
-        self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        """See `hmt_ros.body.pose_terms.FrameTerm`."""
-        terms, gradient, hessian = self._evaluated(frames, bool(derivatives))
-        value = terms.sum(1)
-        return Energy(value, gradient, hessian) if derivatives else Energy(value)
-
-    def parts(self, frames: Frames) -> dict[str, Array]:
-        """The terms one by one: name -> (N,)."""
-        terms, _, _ = self._evaluated(frames, False)
-        return dict(zip(('upright', 'floor'), terms.T, strict=True))
-
-    def _evaluated(self, frames: Frames, derivatives: bool) -> tuple[Array, Array, Array]:
-        n, d = frames.count, self.body.dimension
-        terms = np.zeros((n, 2))
-        gradient = np.zeros((n if derivatives else 0, d))
-        hessian = np.zeros((n if derivatives else 0, d, d))
-        add_ground_energies(
-            self.compiled,
-            *frames.by_pose(),
-            *frames.dofs_by_pose(),
-            terms,
-            gradient,
-            hessian,
-        )
-        return terms, gradient, hessian
 
     @cached_property
     def compiled(self) -> Constants:
@@ -257,12 +228,10 @@ class Soles:
     Attributes:
         segments: (P,) that carry them; empty for a body without feet.
         local: (P, 3) in the frames of the segments, m.
-        feet: (P,) 0: left, 1: right.
     """
 
     segments: Index
     local: Array
-    feet: NDArray[np.intp]
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -274,8 +243,7 @@ def soles(body: Body) -> Soles:
     names = body.joint_names
     wanted = [f'{side}_{joint}' for side in FEET for joint in ('ankle', 'toe')]
     if not set(wanted) <= set(names):
-        nothing = np.zeros(0, dtype=np.intp)
-        return Soles(nothing, np.zeros((0, 3)), nothing)
+        return Soles(np.zeros(0, dtype=np.intp), np.zeros((0, 3)))
     joints = body.skeleton.joint_index(tuple(wanted)).reshape(2, 2)
     segments, local = [], []
     for ankle, toe in joints:
@@ -291,8 +259,7 @@ def soles(body: Body) -> Soles:
             # The middle of the equally low points: left and right of the middle line.
             local.append(points[lowest > lowest.max() - 1e-6].mean(0))
             segments.append(carrier)
-    feet = np.array([0, 0, 1, 1], dtype=np.intp)
-    return Soles(np.array(segments, dtype=np.intp), np.array(local), feet)
+    return Soles(np.array(segments, dtype=np.intp), np.array(local))
 
 
 def sole_points(body: Body, poses: Array) -> Array:

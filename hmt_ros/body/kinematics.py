@@ -119,10 +119,9 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     """
     q = _checked(skeleton, poses)
     n, s, d = len(q), len(skeleton.parents), skeleton.dimension
-    columns, origins = np.empty((s, 3, 3, n)), np.empty((s, 3, n))
-    axes, dof_origins = np.empty((d, 3, n)), np.zeros((d, 3, n))
-    _place_segments(placing_of(skeleton), q, columns, origins, axes, dof_origins)
-    return Frames(skeleton, q, columns, origins, axes, dof_origins)
+    placed = np.empty((n, s, 3, 3)), np.empty((n, s, 3)), np.empty((n, d, 3)), np.zeros((n, d, 3))
+    _place_poses(placing_of(skeleton), q, *placed)
+    return Frames(skeleton, q, *(np.ascontiguousarray(np.moveaxis(x, 0, -1)) for x in placed))
 
 
 def joint_positions(skeleton: Skeleton, poses: ArrayLike) -> Array:
@@ -434,22 +433,10 @@ def place_segment(tree, s, pose, columns, origins, axes, dof_origins):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def _place_segments(tree, poses, columns, origins, axes, dof_origins):  # type: ignore[no-untyped-def]
-    """Fills the arrays of `Frames`, pose by pose."""
-    segments, d = len(tree.parents), poses.shape[1]
-    frame, place = np.empty((segments, 3, 3)), np.empty((segments, 3))
-    axis, on_axis = np.empty((d, 3)), np.zeros((d, 3))
+def _place_poses(tree, poses, columns, origins, axes, dof_origins):  # type: ignore[no-untyped-def]
+    """Fills the frames of N poses (N, d), pose by pose; see `place_pose`."""
     for n in range(len(poses)):
-        place_pose(tree, poses[n], frame, place, axis, on_axis)
-        for s in range(segments):
-            for k in range(3):
-                origins[s, k, n] = place[s, k]
-                for i in range(3):
-                    columns[s, i, k, n] = frame[s, i, k]
-        for j in range(d):
-            for k in range(3):
-                axes[j, k, n] = axis[j, k]
-                dof_origins[j, k, n] = on_axis[j, k]
+        place_pose(tree, poses[n], columns[n], origins[n], axes[n], dof_origins[n])
 
 
 @njit(cache=True, nogil=True)

@@ -50,6 +50,15 @@ def model_names() -> list[str]:
     )
 
 
+def shipped_file(body: str, kind: str) -> Path | None:
+    """What ships for a body, 'prior' or 'motion'; None: nothing.
+
+    Names come with messages, too, and must not lead to other files.
+    """
+    file = Path(__file__).parent / 'models' / f'{body}_{kind}.npz'
+    return file if body in model_names() and file.is_file() else None
+
+
 def load_body(source: str | Path) -> Body:
     """The body of a YAML file, or of a name that ships: 'human37', 'human34' or 'human32'.
 

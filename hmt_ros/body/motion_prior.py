@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.model_file import model_names
+from hmt_ros.body.model_file import shipped_file
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.damped_velocity import DampedVelocity
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
@@ -93,14 +92,8 @@ def shipped_motion(name: str) -> LearnedMotion | None:
     Raises:
         ValueError: the file that ships is damaged.
     """
-    # Names come with messages, too, and must not lead to other files.
-    if name not in model_names():
-        return None
-    file = resources.files('hmt_ros.body') / 'models' / f'{name}_motion.npz'
-    if not file.is_file():
-        return None
-    with resources.as_file(file) as path:
-        return read_motion_prior(path)
+    file = shipped_file(name, 'motion')
+    return None if file is None else read_motion_prior(file)
 
 
 def read_motion_prior(path: str | Path) -> LearnedMotion:

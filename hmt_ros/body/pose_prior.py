@@ -22,10 +22,8 @@ from numba import njit
 
 from hmt_ros.body.angle_mixture import AngleMixture, shipped_prior
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import Frames
-from hmt_ros.body.pose_terms import AnglePrior, FrameTerm
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.energy import Derivatives, Energy
+from hmt_ros.inference.energy import Energy
 
 LEARNED, ANGLES = 'learned', 'angles'
 KINDS = (LEARNED, ANGLES)
@@ -36,8 +34,36 @@ FAINT = 1e-12  # responsibility below which a component adds nothing to the deri
 
 
 @dataclass(frozen=True, eq=False)
+class AnglePrior:
+    """The soft prior of the joint angles: an independent Gaussian for each.
+
+    Attributes:
+        body: with the means and standard deviations.
+        weight: factor on the energy.
+    """
+
+    body: Body
+    weight: float = 1.0
+
+    @cached_property
+    def compiled(self) -> PriorModel:
+        """As compiled code reads it."""
+        nothing = np.zeros((1, 0))
+        return PriorModel(
+            np.zeros((1, 0, 0)),
+            nothing,
+            np.zeros(1),
+            np.zeros((1, 0, 0)),
+            np.zeros(0, dtype=np.int64),
+            self.body.prior_mean,
+            self.body.prior_sigma**-2.0,
+            self.weight,
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class MixturePrior:
-    """The learned prior of the poses; a `FrameTerm`, zero at the most probable pose.
+    """The learned prior of the poses, zero at the most probable pose.
 
     Attributes:
         body: whose poses; its Gaussians hold for the degrees of freedom beside the mixture.
@@ -48,19 +74,6 @@ class MixturePrior:
     body: Body
     mixture: AngleMixture
     weight: float = 1.0
-
-    def energy(
-        self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        """See `FrameTerm`."""
-        poses = np.ascontiguousarray(frames.poses)
-        count, d = poses.shape
-        value = np.empty(count)
-        asked = count if derivatives else 0
-        gradient, hessian = np.empty((asked, d)), np.empty((asked, d, d))
-        exact = derivatives == Derivatives.EXACT
-        evaluate_prior(self.compiled, poses, exact, value, gradient, hessian)
-        return Energy(value, gradient, hessian) if derivatives else Energy(value)
 
     @cached_property
     def compiled(self) -> PriorModel:
@@ -92,7 +105,7 @@ def check_kind(kind: str) -> None:
         raise ValueError(f'pose_prior must be one of {KINDS}, saw {kind!r}')
 
 
-def pose_prior(body: Body, kind: str, weight: float) -> FrameTerm:
+def pose_prior(body: Body, kind: str, weight: float) -> AnglePrior | MixturePrior:
     """The soft prior of the poses of a body.
 
     Args:
@@ -107,6 +120,15 @@ def pose_prior(body: Body, kind: str, weight: float) -> FrameTerm:
     check_kind(kind)
     mixture = shipped_prior(body) if kind == LEARNED else None
     return AnglePrior(body, weight) if mixture is None else MixturePrior(body, mixture, weight)
+
+
+def prior_energies(prior: AnglePrior | MixturePrior, poses: Array) -> Energy:
+    """Energies of poses (N, d), with derivatives; the Hessians are positive definite."""
+    n, d = poses.shape
+    value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
+    for i, pose in enumerate(np.ascontiguousarray(poses)):
+        value[i] = evaluate_prior(prior.compiled, pose, False, True, gradient[i], hessian[i])
+    return Energy(value, gradient, hessian)
 
 
 class PriorModel(NamedTuple):
@@ -132,92 +154,74 @@ class PriorModel(NamedTuple):
     weight: float
 
 
-def gaussian_model(body: Body, weight: float) -> PriorModel:
-    """The independent Gaussians of the model file as compiled code reads them."""
-    nothing = np.zeros((1, 0))
-    return PriorModel(
-        np.zeros((1, 0, 0)),
-        nothing,
-        np.zeros(1),
-        np.zeros((1, 0, 0)),
-        np.zeros(0, dtype=np.int64),
-        body.prior_mean,
-        body.prior_sigma**-2.0,
-        weight,
-    )
-
-
 @njit(cache=True, nogil=True)
-def evaluate_prior(
-    model: PriorModel, poses: Array, exact: bool, value: Array, gradient: Array, hessian: Array
-) -> None:
-    """Fills the energies (N,) of poses (N, d), and their derivatives where these have rows.
+def evaluate_prior(model, pose, exact, wanted, gradient, hessian):  # type: ignore[no-untyped-def]
+    """The energy of a pose.
 
     Args:
         model: the prior.
-        poses: (N, d).
+        pose: (d,).
         exact: whether the Hessian is the exact one.
-        value, gradient, hessian: (N,), (N, d) and (N, d, d) or no rows: the result.
+        wanted: whether derivatives are wanted.
+        gradient, hessian: (d,), (d, d) become the derivatives.
     """
     count, n = model.centres.shape
-    d, places, weight = poses.shape[1], model.places, model.weight
+    d, places, weight = len(pose), model.places, model.weight
     z, log = np.empty((count, n)), np.empty(count)
-    angles, pull, pulls, curvature = np.empty(n), np.empty(n), np.empty(n), np.empty((n, n))
-    for p in range(len(poses)):
+    angles = np.empty(n)
+    for i in range(n):
+        angles[i] = pose[places[i]]
+    best = -np.inf
+    for c in range(count):
+        # The distance only grows: a component that is far away is given up early.
+        most = 2.0 * (model.constants[c] - best + NEGLIGIBLE)
+        distance = 0.0
         for i in range(n):
-            angles[i] = poses[p, places[i]]
-        best = -np.inf
-        for c in range(count):
-            # The distance only grows: a component that is far away is given up early.
-            most = 2.0 * (model.constants[c] - best + NEGLIGIBLE)
-            distance = 0.0
-            for i in range(n):
-                s = 0.0
-                for j in range(i + 1):
-                    s += model.whitening[c, i, j] * angles[j]
-                s -= model.centres[c, i]
-                z[c, i] = s
-                distance += s * s
-                if distance > most:
-                    break
-            log[c] = -np.inf if distance > most else model.constants[c] - 0.5 * distance
-            best = max(best, log[c])
-        total = 0.0
-        for c in range(count):
-            log[c] = np.exp(log[c] - best)
-            total += log[c]
-        energy = -best - np.log(total)
-        for i in range(d):
-            offset = poses[p, i] - model.means[i]
-            energy += 0.5 * model.rest[i] * offset * offset
-        value[p] = weight * energy
-        if len(gradient) == 0:
+            s = 0.0
+            for j in range(i + 1):
+                s += model.whitening[c, i, j] * angles[j]
+            s -= model.centres[c, i]
+            z[c, i] = s
+            distance += s * s
+            if distance > most:
+                break
+        log[c] = -np.inf if distance > most else model.constants[c] - 0.5 * distance
+        best = max(best, log[c])
+    total = 0.0
+    for c in range(count):
+        log[c] = np.exp(log[c] - best)
+        total += log[c]
+    energy = -best - np.log(total)
+    for i in range(d):
+        offset = pose[i] - model.means[i]
+        energy += 0.5 * model.rest[i] * offset * offset
+    if not wanted:
+        return weight * energy
+    pull, pulls, curvature = np.empty(n), np.zeros(n), np.zeros((n, n))
+    for c in range(count):
+        share = log[c] / total
+        if share < FAINT:
             continue
-        pulls[:] = 0.0
-        curvature[:] = 0.0
-        for c in range(count):
-            share = log[c] / total
-            if share < FAINT:
-                continue
-            pull[:] = 0.0
-            for i in range(n):
-                for j in range(i + 1):
-                    pull[j] += model.whitening[c, i, j] * z[c, i]
-            for i in range(n):
-                pulls[i] += share * pull[i]
-                for j in range(n):
-                    curvature[i, j] += share * model.precisions[c, i, j]
-            if exact:
-                for i in range(n):
-                    for j in range(n):
-                        curvature[i, j] -= share * pull[i] * pull[j]
-        hessian[p] = 0.0
-        for i in range(d):
-            gradient[p, i] = weight * model.rest[i] * (poses[p, i] - model.means[i])
-            hessian[p, i, i] = weight * model.rest[i]
+        pull[:] = 0.0
         for i in range(n):
-            gradient[p, places[i]] += weight * pulls[i]
+            for j in range(i + 1):
+                pull[j] += model.whitening[c, i, j] * z[c, i]
+        for i in range(n):
+            pulls[i] += share * pull[i]
             for j in range(n):
-                hessian[p, places[i], places[j]] = weight * curvature[i, j]
-                if exact:
-                    hessian[p, places[i], places[j]] += weight * pulls[i] * pulls[j]
+                curvature[i, j] += share * model.precisions[c, i, j]
+        if exact:
+            for i in range(n):
+                for j in range(n):
+                    curvature[i, j] -= share * pull[i] * pull[j]
+    hessian[:] = 0.0
+    for i in range(d):
+        gradient[i] = weight * model.rest[i] * (pose[i] - model.means[i])
+        hessian[i, i] = weight * model.rest[i]
+    for i in range(n):
+        gradient[places[i]] += weight * pulls[i]
+        for j in range(n):
+            hessian[places[i], places[j]] = weight * curvature[i, j]
+            if exact:
+                hessian[places[i], places[j]] += weight * pulls[i] * pulls[j]
+    return weight * energy

@@ -304,18 +304,17 @@ def _joints(
         return float(np.linalg.norm(at[last] - at[first]))
 
     trunk, head = length('pelvis', 'neck'), length('neck', 'head')
-    added = additions
     result = [
         # In the reference the trunk leans about the hips.
         _joint('waist', 'body', 'waist', (0, 0, float(at['pelvis'][2])), (0, 1, 0)),
     ]
-    if added:
+    if additions:
         result += [
             _joint('r_torso', 'waist', 'r_torso', (0, 0, 0), (1, 0, 0)),
             _joint('y_torso', 'r_torso', 'y_torso', (0, 0, 0), (0, 0, 1)),
         ]
     result += [
-        _joint('torso', 'y_torso' if added else 'waist', 'torso', (0, 0, trunk), None),
+        _joint('torso', 'y_torso' if additions else 'waist', 'torso', (0, 0, trunk), None),
         _joint('r_head', 'torso', 'r_head', (0, 0, 0), (1, 0, 0)),
         _joint('y_head', 'r_head', 'y_head', (0, 0, 0), (0, 0, 1)),
         _joint('p_head', 'y_head', 'p_head', (0, 0, 0), (0, -1, 0)),
@@ -331,10 +330,10 @@ def _joints(
         shin = (0, 0, -length(f'{side}_knee', f'{side}_ankle'))
         upper, yaw, pitch = f'{x}_shoulder', f'{x}_y_shoulder', f'{x}_p_shoulder'
         clavicle = f'{x}_clavicle'
-        if added:
+        if additions:
             result.append(_joint(clavicle, 'torso', clavicle, (0, 0, 0), (s, 0, 0)))
         result += [
-            _joint(yaw, clavicle if added else 'torso', yaw, shoulder, (0, 0, -s)),
+            _joint(yaw, clavicle if additions else 'torso', yaw, shoulder, (0, 0, -s)),
             _joint(pitch, yaw, pitch, (0, 0, 0), (s, 0, 0)),
             _joint(f'{x}_r_shoulder', pitch, upper, (0, 0, 0), (0, 0, s)),
             _joint(f'{x}_elbow', upper, f'{x}_elbow', arm, (0, -1, 0)),

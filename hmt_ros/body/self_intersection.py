@@ -6,6 +6,7 @@ that connects the axes where they are nearest; the overlap is penalised quadrati
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.body.kinematics import forward
 from hmt_ros.inference.arrays import Array, Index
 
 TOLERANCE = 0.02  # m of overlap without cost: flesh is soft, and ellipsoids fit roughly
@@ -57,29 +58,35 @@ class Overlaps(NamedTuple):
     sigma: float
 
 
-def self_intersection_energy(
-    body: Body, frames: Frames, *, sigma: float = 0.02
-) -> tuple[Array, Array, Array]:
-    """Energy (N,), gradient (N, d) and Gauss-Newton Hessian (N, d, d) of overlapping parts.
+@dataclass(frozen=True, eq=False)
+class SelfIntersection:
+    """The prior against parts of the body that run through each other.
 
-    The derivatives are those of the distance: that an elliptic cross-section turns is left out.
+    Its derivatives are those of the distance: that an elliptic cross-section turns is left out.
 
-    Args:
-        body: the body; parts that are neighbours along the skeleton are left out.
-        frames: frames of N poses.
-        sigma: overlap with energy 1/2, m.
+    Attributes:
+        body: whose parts; those that are neighbours along the skeleton are left out.
+        sigma: overlap that costs 1/2, m; inf: none costs anything.
     """
-    n, d = frames.count, body.dimension
-    value, gradient, hessian = np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
-    add_overlaps(
-        overlaps_of(body, sigma),
-        *frames.by_pose(),
-        *frames.dofs_by_pose(),
-        value,
-        gradient,
-        hessian,
-    )
-    return value, gradient, hessian
+
+    body: Body
+    sigma: float
+
+    @property
+    def compiled(self) -> Overlaps:
+        """As compiled code reads it."""
+        return overlaps_of(self.body, self.sigma)
+
+
+def self_intersection_energy(body: Body, poses: Array, *, sigma: float = 0.02) -> Array:
+    """Energies (N,) of poses (N, d); sigma as for `SelfIntersection`."""
+    overlaps, d = overlaps_of(body, sigma), body.dimension
+    frames = forward(body.skeleton, poses)
+    placed = zip(*frames.by_pose(), *frames.dofs_by_pose(), strict=True)
+    value, gradient, hessian = np.zeros((len(poses), 1)), np.zeros(d), np.zeros((d, d))
+    for own, place in zip(value, placed, strict=True):
+        add_overlaps(overlaps, *place, False, own, gradient, hessian)
+    return value[:, 0]
 
 
 @lru_cache(maxsize=16)
@@ -135,31 +142,30 @@ def _pairs(body: Body) -> tuple[Index, Index]:
     first, second = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
     rest = body.prior_mean.copy()
     rest[~body.skeleton.dof_is_rotation] = 0.0
-    columns, origins = forward(body.skeleton, rest[None]).by_pose()
+    (columns,), (origins,) = forward(body.skeleton, rest[None]).by_pose()
     axes = _axes_of(body)
     centres = np.empty((len(parts), 3))
-    _place_centres(axes, columns[0], origins[0], centres)
+    _place_centres(axes, columns, origins, centres)
     apart = [
-        _overlap(axes, i, j, columns[0], centres, columns[0], centres)[9] < TOLERANCE
+        _overlap(axes, i, j, columns, centres)[9] < TOLERANCE
         for i, j in zip(first, second, strict=True)
     ]
     return first[apart], second[apart]
 
 
 @njit(cache=True, nogil=True)
-def _overlap(parts, i, j, columns, centres, others, middles):  # type: ignore[no-untyped-def]
+def _overlap(parts, i, j, columns, centres):  # type: ignore[no-untyped-def]
     """Nearest points p and q of the axes of two parts, the direction between, and the overlap.
 
-    The first part is placed by columns and centres, the second by others and middles. The axes are
-    middle + s axis, s in [-1, 1]; all ten numbers are scalars, as small arrays would cost more than
-    the arithmetic.
+    The axes are middle + s axis, s in [-1, 1]; all ten numbers are scalars, as small arrays would
+    cost more than the arithmetic.
     """
     a, b = parts.segments[i], parts.segments[j]
     c0, c1, c2 = centres[i, 0], centres[i, 1], centres[i, 2]
-    e0, e1, e2 = middles[j, 0], middles[j, 1], middles[j, 2]
+    e0, e1, e2 = centres[j, 0], centres[j, 1], centres[j, 2]
     h, g = parts.halves[i], parts.halves[j]
     u0, u1, u2 = columns[a, 2, 0] * h, columns[a, 2, 1] * h, columns[a, 2, 2] * h
-    v0, v1, v2 = others[b, 2, 0] * g, others[b, 2, 1] * g, others[b, 2, 2] * g
+    v0, v1, v2 = columns[b, 2, 0] * g, columns[b, 2, 1] * g, columns[b, 2, 2] * g
     w0, w1, w2 = c0 - e0, c1 - e1, c2 - e2
     uu = u0 * u0 + u1 * u1 + u2 * u2
     uv = u0 * v0 + u1 * v1 + u2 * v2
@@ -175,7 +181,7 @@ def _overlap(parts, i, j, columns, centres, others, middles):  # type: ignore[no
     distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     away = max(distance, SMALL)
     d0, d1, d2 = d0 / away, d1 / away, d2 / away
-    reach = _width(parts, i, columns, d0, d1, d2) + _width(parts, j, others, d0, d1, d2)
+    reach = _width(parts, i, columns, d0, d1, d2) + _width(parts, j, columns, d0, d1, d2)
     return p0, p1, p2, q0, q1, q2, d0, d1, d2, reach - distance
 
 
@@ -204,68 +210,70 @@ def _place_centres(parts, columns, origins, centres):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _far(parts, i, j, centres, middles, allowed):  # type: ignore[no-untyped-def]
+def _far(parts, i, j, centres):  # type: ignore[no-untyped-def]
     """Whether two parts are too far from each other to overlap by more than is allowed."""
-    x = centres[i, 0] - middles[j, 0]
-    y = centres[i, 1] - middles[j, 1]
-    z = centres[i, 2] - middles[j, 2]
-    reach = parts.reaches[i] + parts.reaches[j] - allowed
+    x = centres[i, 0] - centres[j, 0]
+    y = centres[i, 1] - centres[j, 1]
+    z = centres[i, 2] - centres[j, 2]
+    reach = parts.reaches[i] + parts.reaches[j] - TOLERANCE
     return x * x + y * y + z * z > reach * reach
 
 
 @njit(cache=True, nogil=True)
 def add_overlaps(  # type: ignore[no-untyped-def]
-    overlaps, columns, origins, dof_axes, dof_origins, value, gradient, hessian
+    overlaps, columns, origins, dof_axes, dof_origins, wanted, value, gradient, hessian
 ):
-    """Adds energy, gradient and Gauss-Newton Hessian of all pairs that overlap, pose by pose.
+    """Adds energy (1,), gradient (d,) and Gauss-Newton Hessian (d, d) of one pose.
 
-    Gradients of no pose: no derivatives are wanted.
+    Args:
+        overlaps: pairs of parts.
+        columns, origins: (S, 3, 3), (S, 3) frames of the segments.
+        dof_axes, dof_origins: (d, 3) of the degrees of freedom.
+        wanted: whether derivatives are wanted.
+        value, gradient, hessian: added to.
     """
     parts, first, second, sigma = overlaps.parts, overlaps.first, overlaps.second, overlaps.sigma
     is_rotation, moves = overlaps.dof_is_rotation, overlaps.moves
-    d = dof_axes.shape[1]
+    d = len(dof_axes)
     row = np.zeros(d)
     centres = np.empty((len(parts.segments), 3))
-    for n in range(len(value)):
-        _place_centres(parts, columns[n], origins[n], centres)
-        for pair in range(len(first)):
-            i, j = first[pair], second[pair]
-            if _far(parts, i, j, centres, centres, TOLERANCE):
+    _place_centres(parts, columns, origins, centres)
+    for pair in range(len(first)):
+        i, j = first[pair], second[pair]
+        if _far(parts, i, j, centres):
+            continue
+        p0, p1, p2, q0, q1, q2, d0, d1, d2, depth = _overlap(parts, i, j, columns, centres)
+        overlap = (depth - TOLERANCE) / sigma
+        if overlap <= 0.0:
+            continue
+        value[0] += 0.5 * overlap * overlap
+        if not wanted:
+            continue
+        a, b = parts.segments[i], parts.segments[j]
+        for k in range(d):
+            moved = 0.0
+            x0, x1, x2 = dof_axes[k, 0], dof_axes[k, 1], dof_axes[k, 2]
+            if not is_rotation[k]:
+                along = x0 * d0 + x1 * d1 + x2 * d2
+                if moves[a, k]:
+                    moved += along
+                if moves[b, k]:
+                    moved -= along
+            else:
+                o0, o1, o2 = dof_origins[k, 0], dof_origins[k, 1], dof_origins[k, 2]
+                # direction . (axis x arm) = axis . (arm x direction)
+                if moves[a, k]:
+                    r0, r1, r2 = p0 - o0, p1 - o1, p2 - o2
+                    moved += x0 * (r1 * d2 - r2 * d1) + x1 * (r2 * d0 - r0 * d2)
+                    moved += x2 * (r0 * d1 - r1 * d0)
+                if moves[b, k]:
+                    r0, r1, r2 = q0 - o0, q1 - o1, q2 - o2
+                    moved -= x0 * (r1 * d2 - r2 * d1) + x1 * (r2 * d0 - r0 * d2)
+                    moved -= x2 * (r0 * d1 - r1 * d0)
+            row[k] = -moved / sigma
+        for k in range(d):
+            if row[k] == 0.0:
                 continue
-            p0, p1, p2, q0, q1, q2, d0, d1, d2, depth = _overlap(
-                parts, i, j, columns[n], centres, columns[n], centres
-            )
-            overlap = (depth - TOLERANCE) / sigma
-            if overlap <= 0.0:
-                continue
-            value[n] += 0.5 * overlap * overlap
-            if len(gradient) == 0:
-                continue
-            a, b = parts.segments[i], parts.segments[j]
-            for k in range(d):
-                moved = 0.0
-                x0, x1, x2 = dof_axes[n, k, 0], dof_axes[n, k, 1], dof_axes[n, k, 2]
-                if not is_rotation[k]:
-                    along = x0 * d0 + x1 * d1 + x2 * d2
-                    if moves[a, k]:
-                        moved += along
-                    if moves[b, k]:
-                        moved -= along
-                else:
-                    o0, o1, o2 = dof_origins[n, k, 0], dof_origins[n, k, 1], dof_origins[n, k, 2]
-                    # direction . (axis x arm) = axis . (arm x direction)
-                    if moves[a, k]:
-                        r0, r1, r2 = p0 - o0, p1 - o1, p2 - o2
-                        moved += x0 * (r1 * d2 - r2 * d1) + x1 * (r2 * d0 - r0 * d2)
-                        moved += x2 * (r0 * d1 - r1 * d0)
-                    if moves[b, k]:
-                        r0, r1, r2 = q0 - o0, q1 - o1, q2 - o2
-                        moved -= x0 * (r1 * d2 - r2 * d1) + x1 * (r2 * d0 - r0 * d2)
-                        moved -= x2 * (r0 * d1 - r1 * d0)
-                row[k] = -moved / sigma
-            for k in range(d):
-                if row[k] == 0.0:
-                    continue
-                gradient[n, k] += overlap * row[k]
-                for m in range(d):
-                    hessian[n, k, m] += row[k] * row[m]
+            gradient[k] += overlap * row[k]
+            for m in range(d):
+                hessian[k, m] += row[k] * row[m]

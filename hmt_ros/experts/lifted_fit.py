@@ -22,7 +22,7 @@ from hmt_ros.body.camera import Camera, roll
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.body.limb_angles import limb_angles
 from hmt_ros.body.mirror import relevelled
-from hmt_ros.body.pose_prior import LEARNED, pose_prior
+from hmt_ros.body.pose_prior import LEARNED, pose_prior, prior_energies
 from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_offsets, landmark_rays
 from hmt_ros.image.keypoint_schemes import AUTO, noise_of
 from hmt_ros.image.lifted_poses import HIPS, WHOLE, LiftedPoses
@@ -187,8 +187,7 @@ def _fitted(
         marks = point_energy(
             frames, segments, local, nothing[..., rows], precision[:, rows], across[..., rows]
         )
-        known = prior.energy(frames, rows)
-        total = add_energies([Energy(*placed), Energy(*marks), known])
+        total = add_energies([Energy(*placed), Energy(*marks), prior_energies(prior, x)])
         return total.value, *total.derivatives()
 
     found = minimise(

@@ -2,7 +2,8 @@
 
     E(x) = sum_t E_t(x) + E_keypoints(x) + E_prior(x) + E_intersection(x)
 
-over the image terms t of `terms.registry`. `ImageLikelihood.given` is this sum for one observation.
+over the image terms t of `terms.registry`. `ImageLikelihood` makes the terms; `PoseEnergy` is the
+sum of some of them.
 """
 
 from __future__ import annotations
@@ -18,24 +19,22 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames
-from hmt_ros.body.pose_prior import LEARNED, check_kind, pose_prior
-from hmt_ros.body.pose_terms import FrameTerm, Posed, SelfIntersection
+from hmt_ros.body.pose_prior import (
+    LEARNED,
+    AnglePrior,
+    MixturePrior,
+    check_kind,
+    pose_prior,
+)
+from hmt_ros.body.self_intersection import SelfIntersection
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of, lens_of
 from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
-from hmt_ros.image.terms.registry import (
-    TERMS,
-    Model,
-    Placement,
-    add_energies,
-    record_residuals,
-)
+from hmt_ros.image.terms.registry import TERMS, Model, record_residuals
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
-from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.energy import Derivatives, Energy
-from hmt_ros.inference.threads import in_threads
+from hmt_ros.inference.arrays import Array
 
 OFF = TermSettings(0.0, 1.0, 1.0)
 
@@ -84,28 +83,6 @@ LikelihoodSettings.__doc__ = '\n'.join(
 
 
 @dataclass(frozen=True, eq=False)
-class ImageEnergy:
-    """Energies of the image terms at N poses.
-
-    Attributes:
-        terms: name -> (N,) energy, of the terms that are on and have evidence.
-        costs: (N, M) energy of each sample of the silhouette's outline.
-        gradient, hessian: (N, d), (N, d, d) of the sum; None: not asked for.
-    """
-
-    terms: dict[str, Array]
-    costs: Array
-    gradient: Array | None
-    hessian: Array | None
-
-    @property
-    def value(self) -> Array:
-        """The sum of the terms, (N,)."""
-        total: Array = np.sum(list(self.terms.values()), axis=0)
-        return total
-
-
-@dataclass(frozen=True, eq=False)
 class ImageLikelihood:
     """The energy of poses of a body before a camera, given an image.
 
@@ -125,23 +102,19 @@ class ImageLikelihood:
     occluders: tuple[int, ...] | None = None
     threads: int = 0
 
-    def given(
-        self,
-        observation: Observation,
-        exchanges: Array | None = None,
-    ) -> Posed:
-        """-log p(image | pose) - log prior(pose), of one observation."""
-        seen = self.seen(observation, exchanges=exchanges)
-        terms = (*seen, *self.priors)
-        return Posed(self.body.skeleton, terms)
-
     def seen(
         self,
         observation: Observation,
         explained: Array | None = None,
         exchanges: Array | None = None,
-    ) -> tuple[FrameTerm, ...]:
-        """The terms of the image and of the keypoints; arguments as for `given`, `energies`."""
+    ) -> tuple[ObservedImage | KeypointTerm, ...]:
+        """The terms of the image and of the keypoints.
+
+        Args:
+            observation: of the image.
+            explained: as for `ObservedImage`.
+            exchanges: as for `keypoint_term`.
+        """
         image = ObservedImage(self, observation, explained)
         keypoints, s = observation.keypoints, self.settings.keypoints
         if keypoints is None or s.weight == 0:
@@ -176,7 +149,7 @@ class ImageLikelihood:
         )
 
     @cached_property
-    def priors(self) -> tuple[FrameTerm, ...]:
+    def priors(self) -> tuple[AnglePrior | MixturePrior | SelfIntersection, ...]:
         """The terms without any image: prior of joint angles, parts that do not intersect."""
         s = self.settings
         if not np.isfinite(s.self_intersection_sigma):
@@ -184,57 +157,10 @@ class ImageLikelihood:
         return (self.pose_prior, SelfIntersection(self.body, s.self_intersection_sigma))
 
     @cached_property
-    def pose_prior(self) -> FrameTerm:
+    def pose_prior(self) -> AnglePrior | MixturePrior:
         """The soft prior of the joint angles."""
         s = self.settings
         return pose_prior(self.body, s.pose_prior, s.prior_weight)
-
-    def energies(
-        self,
-        frames: Frames,
-        observation: Observation,
-        *,
-        explained: Array | None = None,
-        derivatives: bool = True,
-    ) -> ImageEnergy:
-        """The image terms, one by one, at the frames of N poses.
-
-        Args:
-            explained: (N, M) or (1, M) maximum energy of each sample of the outline, because
-                something else explains it.
-            derivatives: whether gradient and Hessian are wanted.
-        """
-        n, d = frames.count, self.body.dimension
-        inputs = self.inputs(observation, n, explained)
-        running = [bool(x.term.weight > 0) for x in inputs]
-        energies = np.zeros((n, len(TERMS)))
-        gradient = np.zeros((n if derivatives else 0, d))
-        hessian = np.zeros((n if derivatives else 0, d, d))
-        if any(running):
-            placement = Placement(*frames.by_pose(), *frames.dofs_by_pose())
-            shape = any(on and term.needs_contour for on, term in zip(running, TERMS, strict=True))
-
-            def work(first: int, last: int) -> None:
-                add_energies(
-                    first,
-                    last,
-                    self.model,
-                    inputs,
-                    shape,
-                    placement,
-                    energies,
-                    gradient,
-                    hessian,
-                )
-
-            in_threads(work, n, threads=self.threads)
-        result = {term.name: energies[:, i] for i, term in enumerate(TERMS) if running[i]} or {
-            'nothing': np.zeros(n)
-        }
-        costs = next((x.costs for x in inputs if hasattr(x, 'costs')), np.zeros((n, 0)))
-        if not derivatives:
-            return ImageEnergy(result, costs, None, None)
-        return ImageEnergy(result, costs, gradient, hessian)
 
     def recorded(self, frames: Frames, observation: Observation) -> Array:
         """The residuals of the terms of contours and depths at the frames of N poses.
@@ -250,9 +176,7 @@ class ImageLikelihood:
         most = 1 + 6 * len(self.model.flesh.ring_parts) + 2 * samples
         result = np.zeros((n, most, RECORDED))
         if any(x.term.weight > 0 for x in inputs):
-            record_residuals(
-                self.model, inputs, *frames.by_pose(), np.zeros((n, len(TERMS))), result
-            )
+            record_residuals(self.model, inputs, *frames.by_pose(), result)
         return result
 
     def inputs(
@@ -296,20 +220,18 @@ class ImageLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class ObservedImage:
-    """The image terms of an observation; a `FrameTerm`. Attributes as for `ImageLikelihood`."""
+    """The image terms of an observation.
+
+    Attributes:
+        likelihood: of the terms.
+        observation: of the image.
+        explained: (N, M) or (1, M) maximum energy of each sample of the outline, because something
+            else explains it; None: unlimited.
+    """
 
     likelihood: ImageLikelihood
     observation: Observation
     explained: Array | None = None
-
-    def energy(
-        self, frames: Frames, _rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        """See `hmt_ros.body.pose_terms.FrameTerm`."""
-        found = self.likelihood.energies(
-            frames, self.observation, explained=self.explained, derivatives=bool(derivatives)
-        )
-        return Energy(found.value, found.gradient, found.hessian)
 
 
 def _selected(parts: Sequence[int] | None, count: int) -> NDArray[np.bool_]:

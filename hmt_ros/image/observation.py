@@ -120,29 +120,27 @@ def observe(
         # Somebody may be anywhere behind the others.
         box = _box(known if others is None else known | others)
     left, top, right, bottom = _grown(box, MARGIN, image.shape)
-    rows, columns = slice(top, bottom), slice(left, right)
-    mask = None
-    if known is not None:
-        mask = np.ascontiguousarray(known[rows, columns]).view(np.uint8)
-    doubtful = None
-    if known is not None and unsure is not None:
-        doubtful = np.ascontiguousarray(unsure[rows, columns]).view(np.uint8)
-    hidden = None
-    if others is not None:
-        hidden = np.ascontiguousarray(others[rows, columns]).view(np.uint8)
+    inside = slice(top, bottom), slice(left, right)
+
+    def cut(whole: NDArray[Any] | None) -> Any:
+        """The window, of a mask with 0 and 1."""
+        if whole is None:
+            return None
+        part = np.ascontiguousarray(whole[inside])
+        return part.view(np.uint8) if part.dtype == np.bool_ else part
+
     measured = depth
     if depth is not None and others is not None:
         measured = np.where(others, 0.0, depth)
-    before = None if last_image is None else np.ascontiguousarray(last_image[rows, columns])
     part = ImageWindow(
-        np.ascontiguousarray(image[rows, columns]),
+        cut(image),
         left,
         top,
-        mask,
-        before,
-        doubtful,
-        hidden,
-        None if measured is None else measured[rows, columns],
+        cut(known),
+        cut(last_image),
+        cut(None if known is None else unsure),
+        cut(others),
+        cut(measured),
     )
     terms = [term for term in TERMS if wanted is None or term.name in wanted]
     takes = [partial(term.evidence, part) for term in terms]

@@ -9,34 +9,22 @@ each compares points of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numba import njit
 
-from hmt_ros.body.kinematics import Frames
-from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.image.sampling import ImageMap, sample
-from hmt_ros.image.surface import Lens, project
+from hmt_ros.image.surface import project
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import ImageWindow
-from hmt_ros.image.terms.residuals import (
-    add_residual,
-    assemble_pose,
-    geman_mcclure,
-    tree_of,
-)
-from hmt_ros.inference.arrays import Index
-from hmt_ros.inference.energy import Derivatives, Energy
+from hmt_ros.image.terms.residuals import FEWEST, add_residual, assemble_pose, geman_mcclure
 
 # Standard deviation of the flow, px, and its further error, as a share of the displacement.
 SIGMA, SHARE = 1.5, 0.15
 # Width of the Geman-McClure kernel, in standard deviations.
 SCALE = 2.0
-# Fewer points than this do not make each of them count more.
-FEWEST = 20
 # Smaller images, px, have a flow of 0.
 SMALLEST = 32
 
@@ -60,112 +48,82 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
     return window.as_map(channels)
 
 
-class FlowInputs(NamedTuple):
-    """Inputs of the energy of the flow; attributes as for `FlowTerm`."""
-
-    points: SurfacePoints
-    flow: ImageMap
-    weight: float
-
-
-@dataclass(frozen=True, eq=False)
-class FlowTerm:
-    """The energy of poses against the flow; a `FrameTerm`.
+class FlowTerm(NamedTuple):
+    """The energy of poses against the flow, as compiled code reads it.
 
     Attributes:
-        skeleton: of the body.
-        lens: of the camera.
         points: of K poses in the image before, one for each problem.
         flow: from that image to this one.
         weight: w, number of independent measurements.
     """
 
-    skeleton: Skeleton
-    lens: Lens
     points: SurfacePoints
     flow: ImageMap
     weight: float
 
-    def energy(
-        self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        """See `FrameTerm`."""
-        n, d = frames.count, self.skeleton.dimension
-        value = np.zeros(n)
-        gradient = np.zeros((n if derivatives else 0, d))
-        hessian = np.zeros((n if derivatives else 0, d, d))
-        add_flow(
-            self.compiled,
-            tree_of(self.skeleton),
-            self.lens,
-            np.ascontiguousarray(rows),
-            *frames.by_pose(),
-            *frames.dofs_by_pose(),
-            value,
-            gradient,
-            hessian,
-        )
-        return Energy(value, gradient, hessian) if derivatives else Energy(value)
-
     @property
-    def compiled(self) -> FlowInputs:
+    def compiled(self) -> FlowTerm:
         """The term as compiled code reads it."""
-        return FlowInputs(self.points, self.flow, float(self.weight))
+        return self
 
 
 @njit(cache=True, nogil=True)
 def add_flow(  # type: ignore[no-untyped-def]
-    inputs, tree, lens, rows, columns, origins, axes, dof_origins, value, gradients, hessians
+    term, tree, lens, row, columns, origins, axes, dof_origins, wanted, value, gradient, hessian
 ):
-    """Adds energies (N,), and unless hessians has no pose gradients (N, d), Hessians (N, d, d)."""
-    points, flow, weight = inputs.points, inputs.flow, inputs.weight
+    """Adds energy (1,), gradient (d,) and Hessian (d, d) of a pose of one problem.
+
+    Args:
+        term: `FlowTerm`.
+        tree, lens: skeleton and camera.
+        row: of the problem.
+        columns, origins: (S, 3, 3), (S, 3) frames of the segments.
+        axes, dof_origins: (d, 3) of the degrees of freedom.
+        wanted: whether derivatives are wanted.
+        value, gradient, hessian: added to.
+    """
+    points, flow = term.points, term.flow
     segments = len(tree.parents)
-    wrenches, stiffnesses = np.empty((segments, 6)), np.empty((segments, 6, 6))
+    wrenches, stiffnesses = np.zeros((segments, 6)), np.zeros((segments, 6, 6))
     pixel, projection = np.empty((1, 2)), np.empty((1, 2, 3))
     values, left, top = flow.values, flow.left, flow.top
-    carriers, local, pixels = points.segments, points.local, points.pixels
-    for n in range(len(value)):
-        wrenches[:] = 0.0
-        stiffnesses[:] = 0.0
-        t = rows[n]
-        count = points.counts[t]
-        each = weight / max(count, FEWEST)
-        for q in range(count):
-            s = carriers[t, q]
-            x, y, z = local[t, q, 0], local[t, q, 1], local[t, q, 2]
-            axis, origin = columns[n, s], origins[n, s]
-            p0 = origin[0] + axis[0, 0] * x + axis[1, 0] * y + axis[2, 0] * z
-            p1 = origin[1] + axis[0, 1] * x + axis[1, 1] * y + axis[2, 1] * z
-            p2 = origin[2] + axis[0, 2] * x + axis[1, 2] * y + axis[2, 2] * z
-            if not project(lens, p0, p1, p2, 0, pixel, projection):
-                continue
-            u, v = pixels[t, q, 0], pixels[t, q, 1]
-            fu, _, _ = sample(values, left, top, 0, u, v)
-            fv, _, _ = sample(values, left, top, 1, u, v)
-            if np.isnan(fu):
-                # Somebody else hides it: it has the usual cost, wherever it is.
-                value[n] += geman_mcclure(1.0, SCALE, each)[0]
-                continue
-            inverse = 1.0 / (SIGMA + SHARE * np.sqrt(fu * fu + fv * fv))
-            e0, e1 = (pixel[0, 0] - u - fu) * inverse, (pixel[0, 1] - v - fv) * inverse
-            rho, _, curvature = geman_mcclure(np.sqrt(e0 * e0 + e1 * e1), SCALE, each)
-            value[n] += rho
-            for a in range(2):
-                error = e0 if a == 0 else e1
-                add_residual(
-                    wrenches,
-                    stiffnesses,
-                    s,
-                    p0,
-                    p1,
-                    p2,
-                    projection[0, a, 0] * inverse,
-                    projection[0, a, 1] * inverse,
-                    projection[0, a, 2] * inverse,
-                    curvature * error,
-                    curvature,
-                )
-        if len(hessians) > 0:
-            assemble_pose(
-                tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradients[n], hessians[n]
+    carriers, local, pixels = points.segments[row], points.local[row], points.pixels[row]
+    count = points.counts[row]
+    each = term.weight / max(count, FEWEST)
+    for q in range(count):
+        s = carriers[q]
+        x, y, z = local[q, 0], local[q, 1], local[q, 2]
+        axis, origin = columns[s], origins[s]
+        p0 = origin[0] + axis[0, 0] * x + axis[1, 0] * y + axis[2, 0] * z
+        p1 = origin[1] + axis[0, 1] * x + axis[1, 1] * y + axis[2, 1] * z
+        p2 = origin[2] + axis[0, 2] * x + axis[1, 2] * y + axis[2, 2] * z
+        if not project(lens, p0, p1, p2, 0, pixel, projection):
+            continue
+        u, v = pixels[q, 0], pixels[q, 1]
+        fu, _, _ = sample(values, left, top, 0, u, v)
+        fv, _, _ = sample(values, left, top, 1, u, v)
+        if np.isnan(fu):
+            # Somebody else hides it: it has the usual cost, wherever it is.
+            value[0] += geman_mcclure(1.0, SCALE, each)[0]
+            continue
+        inverse = 1.0 / (SIGMA + SHARE * np.sqrt(fu * fu + fv * fv))
+        e0, e1 = (pixel[0, 0] - u - fu) * inverse, (pixel[0, 1] - v - fv) * inverse
+        rho, _, curvature = geman_mcclure(np.sqrt(e0 * e0 + e1 * e1), SCALE, each)
+        value[0] += rho
+        for a in range(2):
+            error = e0 if a == 0 else e1
+            add_residual(
+                wrenches,
+                stiffnesses,
+                s,
+                p0,
+                p1,
+                p2,
+                projection[0, a, 0] * inverse,
+                projection[0, a, 1] * inverse,
+                projection[0, a, 2] * inverse,
+                curvature * error,
+                curvature,
             )
+    if wanted:
+        assemble_pose(tree, axes, dof_origins, wrenches, stiffnesses, gradient, hessian)

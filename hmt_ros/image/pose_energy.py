@@ -13,33 +13,41 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.ground_kernel import Constants
-from hmt_ros.body.ground_terms import GroundTerm
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
 from hmt_ros.body.kinematics import forward, placing_of
-from hmt_ros.body.pose_prior import MixturePrior, gaussian_model
-from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, SelfIntersection
-from hmt_ros.body.self_intersection import overlaps_of
+from hmt_ros.body.pose_prior import AnglePrior, MixturePrior
+from hmt_ros.body.pose_terms import FrameTerm
+from hmt_ros.body.self_intersection import SelfIntersection
 from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.optical_flow import FlowInputs, FlowTerm
+from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.pose_energy_kernel import NO_DESCENT, Compiled, Descent, solve
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import NO_MAP
-from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, Points
-from hmt_ros.image.terms.keypoints import NOT_LIFTED, KeypointTerm
-from hmt_ros.image.terms.registry import TERMS, Model
+from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
+from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, add_energies
 from hmt_ros.inference.threads import in_threads
 
-Term = TypeVar('Term')
+Parts = tuple[Array, Array]
+CompiledTerm = (
+    ObservedImage
+    | KeypointTerm
+    | MixturePrior
+    | AnglePrior
+    | SelfIntersection
+    | GroundTerm
+    | FlowTerm
+)
 
 # Length of a moderate step of an angle, rad, and of a place, m.
 ROTATION_STEP, PLACE_STEP = 0.4, 0.3
@@ -61,13 +69,12 @@ class ByCue:
     Attributes:
         energy: sum of all.
         values: (n, 3).
-        gradients, hessians: (n, 3, d), (n, 3, d, d); of no pose: not asked for.
+        hessians: (n, 3, d, d); of no pose: not asked for.
         outline_costs: (n, M) energy of each sample of the silhouette's outline.
     """
 
     energy: Energy
     values: Array
-    gradients: Array
     hessians: Array
     outline_costs: Array
 
@@ -89,14 +96,14 @@ class PoseEnergy:
     """
 
     likelihood: ImageLikelihood
-    terms: tuple[FrameTerm, ...]
+    terms: tuple[CompiledTerm | FrameTerm, ...]
     motion: Quadratic | Student | None = None
     point: Array | None = None
     free: Index | None = None
     counted: Callable[[int], None] | None = None
 
     def __post_init__(self) -> None:
-        for kind in _KNOWN:
+        for kind in KINDS.values():
             found = [type(term).__name__ for term in self.terms if isinstance(term, kind)]
             if len(found) > 1:
                 raise ValueError(f'a sum has one term of a kind at most, saw {" and ".join(found)}')
@@ -133,46 +140,23 @@ class PoseEnergy:
 
     def _evaluated(
         self, x: Array, rows: Index | None, derivatives: Derivatives, *, apart: bool
-    ) -> tuple[Energy, tuple[Array, Array, Array], Compiled]:
+    ) -> tuple[Energy, Parts, Compiled]:
         x = self._checked(x)
-        n, f = x.shape
-        rows = np.arange(n) if rows is None else np.asarray(rows, dtype=np.intp)
-        compiled, asked = self._compiled(n), n if derivatives else 0
-        value, gradient, hessian = np.empty(n), np.empty((asked, f)), np.empty((asked, f, f))
-        parts = _empty_parts(n if apart else 0, asked if apart else 0, f)
+        rows = np.arange(len(x)) if rows is None else np.asarray(rows, dtype=np.intp)
         exact = derivatives == Derivatives.EXACT
-        limits, nothing = np.zeros((2, f)), (np.empty(n, np.int8), np.zeros(n, np.int32))
-
-        def work(first: int, last: int) -> None:
-            solve(
-                first,
-                last,
-                compiled,
-                self._point,
-                self._free,
-                rows,
-                exact,
-                limits,
-                NO_DESCENT,
-                x,
-                value,
-                gradient,
-                hessian,
-                parts,
-                *nothing,
-            )
-
-        in_threads(work, n, 8, self.likelihood.threads)
+        limits = np.zeros((2, x.shape[1]))
+        energy, parts, compiled, *_ = self._solved(
+            x, rows, limits, NO_DESCENT, 8, exact=exact, wanted=bool(derivatives), apart=apart
+        )
         if self.counted is not None:
-            self.counted(n)
-        found = Energy(value, gradient, hessian) if derivatives else Energy(value)
+            self.counted(len(x))
         others = self._others(x, rows, derivatives)
         if apart:
             for other in others:
                 parts[0][:, 2] += other.value
                 if derivatives:
-                    for known, own in zip(parts[1:], other.derivatives(), strict=True):
-                        known[:, 2] += own
+                    parts[1][:, 2] += other.derivatives()[1]
+        found = energy if derivatives else Energy(energy.value)
         return add_energies([found, *others]), parts, compiled
 
     def minimise(
@@ -213,11 +197,40 @@ class PoseEnergy:
         n, f = x.shape
         metric = np.broadcast_to(np.asarray(step_scale, dtype=np.float64) ** -2.0, (f,)).copy()
         descent = Descent(max_iterations, float(damping), float(tolerance), metric)
-        limits, rows = np.stack([lower, upper]), np.arange(n)
-        compiled = self._compiled(n)
-        value, gradient, hessian = np.empty(n), np.empty((n, f)), np.empty((n, f, f))
+        energy, _, _, status, iterations = self._solved(
+            x, np.arange(n), np.stack([lower, upper]), descent, 2
+        )
+        if self.counted is not None:
+            self.counted(n + int(iterations.sum()))
+        gradient, hessian = energy.derivatives()
+        free = ~resting(x, gradient, lower, upper)
+        return Minimum(x, energy.value, gradient, hessian, free, status, iterations)
+
+    def _solved(
+        self,
+        x: Array,
+        rows: Index,
+        limits: Array,
+        descent: Descent,
+        together: int,
+        *,
+        exact: bool = False,
+        wanted: bool = True,
+        apart: bool = False,
+    ) -> tuple[Energy, Parts, Compiled, NDArray[np.int8], NDArray[np.int32]]:
+        """Energies of points x (n, f), which become minima; arguments and results as for `solve`.
+
+        Args:
+            together: number of points that a thread takes at once.
+            wanted: whether derivatives are wanted.
+            apart: whether the parts by cue are.
+        """
+        n, f = x.shape
+        asked, values = n if wanted else 0, n if apart else 0
+        energy = np.empty(n), np.empty((asked, f)), np.empty((asked, f, f))
+        parts = np.empty((values, 3)), np.empty((asked if apart else 0, 3, f, f))
         status, iterations = np.empty(n, dtype=np.int8), np.zeros(n, dtype=np.int32)
-        parts = _empty_parts(0, 0, f)
+        compiled = self._compiled(n)
 
         def work(first: int, last: int) -> None:
             solve(
@@ -227,23 +240,18 @@ class PoseEnergy:
                 self._point,
                 self._free,
                 rows,
-                False,
+                exact,
                 limits,
                 descent,
                 x,
-                value,
-                gradient,
-                hessian,
+                *energy,
                 parts,
                 status,
                 iterations,
             )
 
-        in_threads(work, n, 2, self.likelihood.threads)
-        if self.counted is not None:
-            self.counted(n + int(iterations.sum()))
-        free = ~resting(x, gradient, lower, upper)
-        return Minimum(x, value, gradient, hessian, free, status, iterations)
+        in_threads(work, n, together, self.likelihood.threads)
+        return Energy(*energy), parts, compiled, status, iterations
 
     @cached_property
     def _point(self) -> Array:
@@ -271,7 +279,7 @@ class PoseEnergy:
     @cached_property
     def _strange(self) -> tuple[FrameTerm, ...]:
         """Terms without a kernel here."""
-        return tuple(x for x in self.terms if not any(isinstance(x, kind) for kind in _KNOWN))
+        return tuple(x for x in self.terms if not isinstance(x, CompiledTerm))
 
     def _others(self, x: Array, rows: Index, derivatives: Derivatives) -> list[Energy]:
         """Energies of the terms without a kernel, over the free variables."""
@@ -292,43 +300,39 @@ class PoseEnergy:
 
     def _compiled(self, count: int) -> Compiled:
         """The terms as compiled code reads them, for so many poses."""
-        image = self._term(ObservedImage)
-        likelihood = self.likelihood if image is None else image.likelihood
-        observation = NOTHING_SEEN if image is None else image.observation
-        inputs = likelihood.inputs(observation, count, None if image is None else image.explained)
+        image = self._known.get('image') or ObservedImage(self.likelihood, NOTHING_SEEN)
+        inputs = image.likelihood.inputs(image.observation, count, image.explained)
         running = [bool(one.term.weight > 0) for one in inputs]
         contour = any(on and term.needs_contour for on, term in zip(running, TERMS, strict=True))
+        model = image.likelihood.model
         return Compiled(
-            inputs=inputs, image=any(running), contour=contour, model=likelihood.model, **self._rest
+            inputs=inputs, image=any(running), contour=contour, model=model, **self._rest
         )
 
     @cached_property
     def _rest(self) -> dict[str, Any]:
         """Inputs of compiled code besides the terms of the image."""
         body = self.likelihood.body
-        keypoints, overlaps = self._term(KeypointTerm), self._term(SelfIntersection)
-        ground, mixture = self._term(GroundTerm), self._term(MixturePrior)
-        angles, flow = self._term(AnglePrior), self._term(FlowTerm)
-        detected = _no_keypoints(self.likelihood.model) if keypoints is None else keypoints.compiled
-        if mixture is None:
-            prior = gaussian_model(body, 0.0 if angles is None else angles.weight)
-        else:
-            prior = mixture.compiled
+        own = {name: term.compiled for name, term in self._known.items() if name != 'image'}
         centres, precisions, tails = self._expected
         return {
+            **_absent(body, self.likelihood.camera),
+            **own,
             'placing': placing_of(body.skeleton),
-            'keypoints': detected,
-            'prior': prior,
-            'overlaps': overlaps_of(body, np.inf if overlaps is None else overlaps.sigma),
-            'ground': _no_ground(body.dimension) if ground is None else ground.compiled,
-            'flow': _NO_FLOW if flow is None else flow.compiled,
             'centres': centres,
             'precisions': precisions,
             'tails': tails,
         }
 
-    def _term(self, kind: type[Term]) -> Term | None:
-        return next((term for term in self.terms if isinstance(term, kind)), None)
+    @cached_property
+    def _known(self) -> dict[str, Any]:
+        """Terms with a kernel here, by the name of their inputs."""
+        return {
+            name: term
+            for name, kind in KINDS.items()
+            for term in self.terms
+            if isinstance(term, kind)
+        }
 
     @cached_property
     def _expected(self) -> tuple[Array, Array, float]:
@@ -350,52 +354,29 @@ class PoseEnergy:
         )
 
 
-def _empty_parts(values: int, derivatives: int, d: int) -> tuple[Array, Array, Array]:
-    return np.empty((values, 3)), np.empty((derivatives, 3, d)), np.empty((derivatives, 3, d, d))
-
-
-# Kinds of terms with a kernel here.
-_KNOWN: tuple[Any, ...] = (
-    ObservedImage,
-    KeypointTerm,
-    (MixturePrior, AnglePrior),
-    SelfIntersection,
-    GroundTerm,
-    FlowTerm,
-)
+# Kinds of terms with a kernel here, by the names of their inputs in `Compiled`.
+KINDS: dict[str, Any] = {
+    'image': ObservedImage,
+    'keypoints': KeypointTerm,
+    'prior': (MixturePrior, AnglePrior),
+    'overlaps': SelfIntersection,
+    'ground': GroundTerm,
+    'flow': FlowTerm,
+}
 NOTHING_SEEN = Observation()
-_NONE, _NO_PAIRS = np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
-_NO_POINTS = Points(_NO_PAIRS, np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)), _NONE)
-_NO_FLOW = FlowInputs(
-    SurfacePoints(_NONE, np.zeros((0, 0), np.int64), np.zeros((0, 0, 3)), np.zeros((0, 0, 2))),
-    NO_MAP,
-    0.0,
-)
-_AS_CALLED = np.zeros((1, 1), dtype=np.int64)
-_ONE, _SURE = np.zeros(1), np.zeros((1, 1))
-
-
-def _no_keypoints(model: Model) -> KeypointInputs:
-    return KeypointInputs(
-        _NO_POINTS, NOT_LIFTED, model.tree, model.lens, 1.0, _ONE, _AS_CALLED, _SURE
-    )
 
 
 @lru_cache(maxsize=16)
-def _no_ground(dimension: int) -> Constants:
-    none, nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-    return Constants(
-        np.zeros(dimension, dtype=np.bool_),
-        np.zeros((0, dimension), dtype=np.bool_),
-        np.zeros(2),
-        np.zeros(3),
-        0.0,
-        none,
-        np.zeros((0, 3, 3)),
-        nothing,
-        none,
-        nothing,
-        0.0,
-        1.0,
-        1.0,
-    )
+def _absent(body: Body, camera: Camera) -> dict[str, Any]:
+    """What compiled code reads where a term is not there."""
+    none, nothing = np.zeros(0, np.int64), np.zeros((0, 0, 3))
+    no_keypoints = Keypoints((), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
+    no_floor = FloorPlane(np.zeros(3), 0.0, None, np.inf)
+    no_points = SurfacePoints(none, np.zeros((0, 0), np.int64), nothing, nothing[..., :2].copy())
+    return {
+        'keypoints': KeypointTerm(body.skeleton, camera, no_keypoints).compiled,
+        'prior': AnglePrior(body, 0.0).compiled,
+        'overlaps': SelfIntersection(body, np.inf).compiled,
+        'ground': GroundTerm(body, GroundSettings(0.0, 0.0), no_floor).compiled,
+        'flow': FlowTerm(no_points, NO_MAP, 0.0),
+    }

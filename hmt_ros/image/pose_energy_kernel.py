@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from hmt_ros.body.ground_kernel import Constants, add_ground_energies
+from hmt_ros.body.ground_kernel import Constants, add_ground_energy
 from hmt_ros.body.kinematics import Placing, place_pose
 from hmt_ros.body.pose_prior import PriorModel, evaluate_prior
 from hmt_ros.body.self_intersection import Overlaps, add_overlaps
-from hmt_ros.image.optical_flow import FlowInputs, add_flow
+from hmt_ros.image.optical_flow import FlowTerm, add_flow
 from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, add_keypoints
 from hmt_ros.image.terms.registry import Model, look, new_view, run_terms
 from hmt_ros.image.terms.residuals import assemble_pose
@@ -59,7 +58,7 @@ class Compiled(NamedTuple):
     prior: PriorModel
     overlaps: Overlaps
     ground: Constants
-    flow: FlowInputs
+    flow: FlowTerm
     centres: Array
     precisions: Array
     tails: float
@@ -87,22 +86,17 @@ class Room(NamedTuple):
     """Working arrays for one pose.
 
     Attributes:
-        pose: (1, d).
-        columns, origins: (1, S, 3, 3), (1, S, 3) frames of its segments.
-        axes, dof_origins: (1, d, 3) of its degrees of freedom.
-        shown: the pose as the terms of the image see it.
+        pose: (d,).
+        axes, dof_origins: (d, 3) of its degrees of freedom.
+        shown: the pose as the terms of the image see it, with the frames of the segments.
         wrenches, stiffnesses: (S, 6), (S, 6, 6) sums over the segments.
         energies: (terms,) of the image.
         value: (cues,) energies: of image, keypoints and all other terms, or one of them all.
-        ground: (1, 2).
-        row: (1,) of the problem.
         gradient, hessian: (cues, d), (cues, d, d).
         slope, curve: (f,), (f, f) on the free variables.
     """
 
     pose: Array
-    columns: Array
-    origins: Array
     axes: Array
     dof_origins: Array
     shown: Any
@@ -110,8 +104,6 @@ class Room(NamedTuple):
     stiffnesses: Array
     energies: Array
     value: Array
-    ground: Array
-    row: NDArray[np.int64]
     gradient: Array
     hessian: Array
     slope: Array
@@ -121,55 +113,45 @@ class Room(NamedTuple):
 @njit(cache=True, nogil=True)
 def _room(model, terms, point, f, cues):  # type: ignore[no-untyped-def]
     segments, d = len(model.tree.parents), len(point)
-    room = Room(
-        np.empty((1, d)),
-        np.empty((1, segments, 3, 3)),
-        np.empty((1, segments, 3)),
-        np.empty((1, d, 3)),
-        np.zeros((1, d, 3)),
+    return Room(
+        point.copy(),
+        np.empty((d, 3)),
+        np.zeros((d, 3)),
         new_view(model),
         np.empty((segments, 6)),
         np.empty((segments, 6, 6)),
         np.empty(terms),
         np.empty(cues),
-        np.empty((1, 2)),
-        np.zeros(1, np.int64),
         np.empty((cues, d)),
         np.empty((cues, d, d)),
         np.empty(f),
         np.empty((f, f)),
     )
-    room.pose[0] = point
-    return room
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: ignore[no-untyped-def]
-    """Energy of the pose in a room without the motion.
+def _add_terms(compiled, number, row, exact, wanted, room):  # type: ignore[no-untyped-def]
+    """Energy of the pose in a room without the motion; derivatives become those of the pose.
 
     Args:
         compiled: the terms.
         number, row: of the pose in its call, and of its problem.
         exact: whether the Hessian of the prior is the exact one.
+        wanted: whether derivatives are wanted.
         room: with the pose.
-        gradient, hessian: (cues, d), (cues, d, d) result; of no cue: not wanted.
     """
-    columns, origins, axes, dof_origins = room.columns, room.origins, room.axes, room.dof_origins
-    wanted, apart = len(gradient) > 0, len(room.value) > 1
-    value, keypoint_value, known_value = room.value, room.value, room.value
-    keypoint_gradient, known_gradient = gradient, gradient
-    keypoint_hessian, known_hessian = hessian, hessian
-    if apart:
-        keypoint_value, known_value = value[1:2], value[2:]
-        keypoint_gradient, known_gradient = gradient[1:2], gradient[2:]
-        keypoint_hessian, known_hessian = hessian[1:2], hessian[2:]
-        value[:] = 0.0
+    view, axes, dof_origins = room.shown, room.axes, room.dof_origins
+    columns, origins = view.columns, view.origins
+    value, gradient, hessian = room.value, room.gradient, room.hessian
+    of_keypoints, of_others = min(1, len(value) - 1), len(value) - 1
+    value[:] = 0.0
+    if wanted:
         gradient[:], hessian[:] = 0.0, 0.0
-    place_pose(compiled.placing, room.pose[0], columns[0], origins[0], axes[0], dof_origins[0])
-    evaluate_prior(compiled.prior, room.pose, exact, known_value, known_gradient, known_hessian)
+    place_pose(compiled.placing, room.pose, columns, origins, axes, dof_origins)
+    value[of_others] = evaluate_prior(
+        compiled.prior, room.pose, exact, wanted, gradient[of_others], hessian[of_others]
+    )
     if compiled.image:
-        view = room.shown
-        view.columns[:], view.origins[:] = columns[0], origins[0]
         look(view, number, compiled.contour)
         room.energies[:] = 0.0
         wrenches, stiffnesses = room.wrenches, room.stiffnesses
@@ -180,67 +162,45 @@ def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: 
         run_terms(view, compiled.inputs, 0, room.energies, wrenches, stiffnesses)
         value[0] += room.energies.sum()
         if wanted:
-            assemble_pose(
-                compiled.model.tree,
-                axes[0],
-                dof_origins[0],
-                wrenches,
-                stiffnesses,
-                gradient[0],
-                hessian[0],
-            )
+            tree = compiled.model.tree
+            assemble_pose(tree, axes, dof_origins, wrenches, stiffnesses, gradient[0], hessian[0])
     keypoints = compiled.keypoints
     if len(keypoints.points.groups) > 0 or keypoints.lifted.weight > 0.0:
         own = row if len(keypoints.log_priors) > 1 else 0
-        add_keypoints(
+        value[of_keypoints] += add_keypoints(
             keypoints,
-            keypoints.log_priors[own : own + 1],
+            keypoints.log_priors[own],
             columns,
             origins,
             axes,
             dof_origins,
-            keypoint_value,
-            keypoint_gradient,
-            keypoint_hessian,
+            wanted,
+            gradient[of_keypoints],
+            hessian[of_keypoints],
         )
+    known, slope, curve = value[of_others:], gradient[of_others], hessian[of_others]
     if compiled.overlaps.sigma < np.inf:
         add_overlaps(
-            compiled.overlaps,
-            columns,
-            origins,
-            axes,
-            dof_origins,
-            known_value,
-            known_gradient,
-            known_hessian,
+            compiled.overlaps, columns, origins, axes, dof_origins, wanted, known, slope, curve
         )
     if compiled.ground.weights.sum() > 0.0:
-        room.ground[:] = 0.0
-        add_ground_energies(
-            compiled.ground,
-            columns,
-            origins,
-            axes,
-            dof_origins,
-            room.ground,
-            known_gradient,
-            known_hessian,
+        known[0] += add_ground_energy(
+            compiled.ground, columns, origins, axes, dof_origins, wanted, slope, curve
         )
-        known_value[0] += room.ground.sum()
     if compiled.flow.weight > 0.0:
-        room.row[0] = row
         add_flow(
             compiled.flow,
             compiled.model.tree,
             compiled.model.lens,
-            room.row,
+            row,
             columns,
             origins,
             axes,
             dof_origins,
-            known_value,
-            known_gradient,
-            known_hessian,
+            wanted,
+            known,
+            slope,
+            curve,
         )
     return value.sum()
 
@@ -277,20 +237,18 @@ def _energy_at(compiled, number, row, free, x, exact, room, slope, curve):  # ty
     """
     f = len(free)
     for i in range(f):
-        room.pose[0, free[i]] = x[i]
-    count = len(room.value) if len(slope) > 0 else 0
-    gradient, hessian = room.gradient[:count], room.hessian[:count]
-    value = _add_terms(compiled, number, row, exact, room, gradient, hessian)
-    if count > 0:
+        room.pose[free[i]] = x[i]
+    value = _add_terms(compiled, number, row, exact, len(slope) > 0, room)
+    if len(slope) > 0:
         for i in range(f):
-            slope[i] = gradient[0, free[i]]
+            slope[i] = room.gradient[0, free[i]]
             for j in range(f):
-                curve[i, j] = hessian[0, free[i], free[j]]
-        for cue in range(1, count):
+                curve[i, j] = room.hessian[0, free[i], free[j]]
+        for cue in range(1, len(room.value)):
             for i in range(f):
-                slope[i] += gradient[cue, free[i]]
+                slope[i] += room.gradient[cue, free[i]]
                 for j in range(f):
-                    curve[i, j] += hessian[cue, free[i], free[j]]
+                    curve[i, j] += room.hessian[cue, free[i], free[j]]
     if len(compiled.centres) > 0:
         own = row if len(compiled.centres) > 1 else 0
         value += _add_motion(
@@ -330,9 +288,9 @@ def solve(  # type: ignore[no-untyped-def]
         x: (n, f) points; become minima, where iterations are asked for.
         value, gradient, hessian: (n,), (n, f), (n, f, f) result; of no point: no derivatives are
             wanted, and no minima.
-        by_cue: energies (n, 3), gradients (n, 3, d) and Hessians (n, 3, d, d) of image, keypoints
-            and all other terms, result; of no point: not wanted. They are those of the last
-            evaluation, all variables are free, and gradients only where the others are.
+        by_cue: energies (n, 3) and Hessians (n, 3, d, d) of image, keypoints and all other terms,
+            result; of no point: not wanted. They are those of the last evaluation, all variables
+            are free, and Hessians only where derivatives are.
         status, iterations: (n,) results.
     """
     f, apart = len(free), len(by_cue[0]) > 0
@@ -385,7 +343,7 @@ def solve(  # type: ignore[no-untyped-def]
             if apart:
                 by_cue[0][n] = room.value
                 if wanted:
-                    by_cue[1][n], by_cue[2][n] = room.gradient, room.hessian
+                    by_cue[1][n] = room.hessian
             if turn == 0:
                 better = True
                 ended = not np.isfinite(found)

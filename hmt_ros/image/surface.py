@@ -195,6 +195,57 @@ def project(lens, x, y, z, i, pixels, projections):  # type: ignore[no-untyped-d
     return True
 
 
+@njit(cache=True, nogil=True, inline='always')
+def signed_power(x, exponent):  # type: ignore[no-untyped-def]
+    """sgn(x) |x|^exponent."""
+    return np.sign(x) * np.abs(x) ** exponent
+
+
+@njit(cache=True, nogil=True, inline='always')
+def ring_seen(r, s, ring_centres, columns, origins):  # type: ignore[no-untyped-def]
+    """The centre of ring r of segment s relative to the camera, in the axes of the segment."""
+    o0, o1, o2 = origins[s, 0], origins[s, 1], origins[s, 2]
+    ux = columns[s, 0, 0] * o0 + columns[s, 0, 1] * o1 + columns[s, 0, 2] * o2
+    uy = columns[s, 1, 0] * o0 + columns[s, 1, 1] * o1 + columns[s, 1, 2] * o2
+    uz = columns[s, 2, 0] * o0 + columns[s, 2, 1] * o1 + columns[s, 2, 2] * o2
+    return ux + ring_centres[r, 0], uy + ring_centres[r, 1], uz + ring_centres[r, 2]
+
+
+@njit(cache=True, nogil=True, inline='always')
+def ring_point(r, s, c, sn, ring_centres, ring_radii, ring_slopes, ring_leans, e, columns, origins):  # type: ignore[no-untyped-def]
+    """A point of ring r of segment s, and the normal there, both in the camera frame.
+
+    c and sn are cosine and sine of its angle, e is the exponent of the ring.
+    """
+    x0, x1, x2 = columns[s, 0, 0], columns[s, 0, 1], columns[s, 0, 2]
+    y0, y1, y2 = columns[s, 1, 0], columns[s, 1, 1], columns[s, 1, 2]
+    z0, z1, z2 = columns[s, 2, 0], columns[s, 2, 1], columns[s, 2, 2]
+    outline_x, outline_y, lateral_x, lateral_y = c, sn, c, sn
+    if e != 1.0:
+        outline_x, outline_y = signed_power(c, e), signed_power(sn, e)
+        lateral_x, lateral_y = signed_power(c, 2.0 - e), signed_power(sn, 2.0 - e)
+    rx, ry, cz = ring_radii[r, 0], ring_radii[r, 1], ring_centres[r, 2]
+    px, py = ring_centres[r, 0] + rx * outline_x, ring_centres[r, 1] + ry * outline_y
+    nx, ny = lateral_x / rx, lateral_y / ry
+    nz = -(ring_slopes[r, 0] * c * c + ring_slopes[r, 1] * sn * sn)
+    nz = nz - (nx * ring_leans[r, 0] + ny * ring_leans[r, 1])
+    return (
+        origins[s, 0] + x0 * px + y0 * py + z0 * cz,
+        origins[s, 1] + x1 * px + y1 * py + z1 * cz,
+        origins[s, 2] + x2 * px + y2 * py + z2 * cz,
+        x0 * nx + y0 * ny + z0 * nz,
+        x1 * nx + y1 * ny + z1 * nz,
+        x2 * nx + y2 * ny + z2 * nz,
+    )
+
+
+@njit(cache=True, nogil=True, inline='always')
+def ring_deviation(r, c, sn, ring_noise):  # type: ignore[no-untyped-def]
+    """How far contours of people lie from the point of ring r with an angle, deviation, m."""
+    across, ahead = c * ring_noise[r, 0], sn * ring_noise[r, 1]
+    return np.sqrt(across * across + ahead * ahead)
+
+
 @njit(cache=True, nogil=True)
 def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: ignore[no-untyped-def]
     """Fills the contour of one pose: points, pixels, normals.
@@ -232,19 +283,11 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
         valid[r + rings] = False
         if not wanted[part]:
             continue
-        x0, x1, x2 = columns[s, 0, 0], columns[s, 0, 1], columns[s, 0, 2]
-        y0, y1, y2 = columns[s, 1, 0], columns[s, 1, 1], columns[s, 1, 2]
-        z0, z1, z2 = columns[s, 2, 0], columns[s, 2, 1], columns[s, 2, 2]
-        o0, o1, o2 = origins[s, 0], origins[s, 1], origins[s, 2]
-        cx, cy, cz = ring_centres[r, 0], ring_centres[r, 1], ring_centres[r, 2]
-        ux = x0 * o0 + x1 * o1 + x2 * o2 + cx
-        uy = y0 * o0 + y1 * o1 + y2 * o2 + cy
-        uz = z0 * o0 + z1 * o1 + z2 * o2 + cz
-        rx, ry = ring_radii[r, 0], ring_radii[r, 1]
+        ux, uy, uz = ring_seen(r, s, ring_centres, columns, origins)
         kx, ky = ring_slopes[r, 0], ring_slopes[r, 1]
-        lx, ly = ring_leans[r, 0], ring_leans[r, 1]
         e = ring_exponents[r]
-        bx, by = (ux - uz * lx) / rx, (uy - uz * ly) / ry
+        bx = (ux - uz * ring_leans[r, 0]) / ring_radii[r, 0]
+        by = (uy - uz * ring_leans[r, 1]) / ring_radii[r, 1]
         if e == 1.0 and kx == ky:
             length = np.sqrt(bx * bx + by * by)
             cosine = -(1.0 - uz * kx) / max(length, 1e-12)
@@ -257,26 +300,15 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
         elif not _bracketed_roots(bx, by, uz, kx, ky, 2.0 - e, cosines, sines):
             continue
         for side in range(2):
-            c, sn = cosines[side], sines[side]
-            if e == 1.0:
-                outline_x, outline_y, lateral_x, lateral_y = c, sn, c, sn
-            else:
-                outline_x, outline_y = signed_power(c, e), signed_power(sn, e)
-                lateral_x, lateral_y = signed_power(c, 2.0 - e), signed_power(sn, 2.0 - e)
-            across, ahead = c * ring_noise[r, 0], sn * ring_noise[r, 1]
-            noise[r + side * rings] = np.sqrt(across * across + ahead * ahead)
-            px, py = cx + rx * outline_x, cy + ry * outline_y
-            nx, ny = lateral_x / rx, lateral_y / ry
-            nz = -(kx * c * c + ky * sn * sn) - (nx * lx + ny * ly)
-            i = r + side * rings
-            p0 = o0 + x0 * px + y0 * py + z0 * cz
-            p1 = o1 + x1 * px + y1 * py + z1 * cz
-            p2 = o2 + x2 * px + y2 * py + z2 * cz
+            c, sn, i = cosines[side], sines[side], r + side * rings
+            noise[i] = ring_deviation(r, c, sn, ring_noise)
+            p0, p1, p2, n0, n1, _ = ring_point(
+                r, s, c, sn, ring_centres, ring_radii, ring_slopes, ring_leans, e, columns, origins
+            )
             points[i, 0], points[i, 1], points[i, 2] = p0, p1, p2
             if not project(lens, p0, p1, p2, i, pixels, projections):
                 continue
-            nu = (x0 * nx + y0 * ny + z0 * nz) / lens.focal[0]
-            nv = (x1 * nx + y1 * ny + z1 * nz) / lens.focal[1]
+            nu, nv = n0 / lens.focal[0], n1 / lens.focal[1]
             size = np.sqrt(nu * nu + nv * nv)
             if not size > 0.0:
                 continue
@@ -284,24 +316,18 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
             valid[i] = True
 
 
-@njit(cache=True, nogil=True, inline='always')
-def signed_power(x, exponent):  # type: ignore[no-untyped-def]
-    """sgn(x) |x|^exponent."""
-    return np.sign(x) * np.abs(x) ** exponent
-
-
 @njit(cache=True, nogil=True)
 def _bracketed_roots(bx, by, uz, kx, ky, power, cosines, sines):  # type: ignore[no-untyped-def]
     """Cosines, sines of the two roots of g(w) of `body.flesh`; False: none."""
     steps = 48
-    found_up, found_down = False, False
+    found = np.zeros(2, np.bool_)
     before = 0.0
     for k in range(steps + 1):
         w = -np.pi + k * (2.0 * np.pi / steps)
         at = _condition(w, bx, by, uz, kx, ky, power)
         if k > 0 and (before > 0) != (at > 0):
-            up = at > 0
-            if (up and not found_up) or (not up and not found_down):
+            side = 0 if at > 0 else 1
+            if not found[side]:
                 low, high, at_low, at_high = w - 2.0 * np.pi / steps, w, before, at
                 root = high
                 for _ in range(16):  # Illinois: false position that never stalls at one end
@@ -314,14 +340,10 @@ def _bracketed_roots(bx, by, uz, kx, ky, power, cosines, sines):  # type: ignore
                     else:
                         low, at_low = high, at_high
                     high, at_high = root, value
-                side = 0 if up else 1
                 cosines[side], sines[side] = np.cos(root), np.sin(root)
-                if up:
-                    found_up = True
-                else:
-                    found_down = True
+                found[side] = True
         before = at
-    return found_up and found_down
+    return found[0] and found[1]
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -31,16 +31,11 @@ from rclpy.utilities import remove_ros_args
 
 from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Image
-from hmt_ros.nodes.node_parameters import descriptor
+from hmt_ros.nodes.node_parameters import declare
 from hmt_ros.nodes.run_node import described
 from hmt_ros.nodes.signals import on_signals
 from hmt_ros.sessions.camera_file import camera_of_view, read_camera
-from hmt_ros.sessions.declared_parameters import (
-    AT_LAUNCH,
-    declared_parameters,
-    parameter_field,
-    with_values,
-)
+from hmt_ros.sessions.declared_parameters import AT_LAUNCH, parameter_field
 from hmt_ros.sessions.focal_length import USUAL_FOV, usual_camera
 from msg_tools import RosbagsMessages
 from msg_tools.files.display_matrix import STORED, display_matrix, is_mirrored
@@ -78,10 +73,6 @@ class CameraNodeParameters:
     rate: float = parameter_field(1.0, AT_LAUNCH, (0.01, 100.0))
 
 
-class CameraError(ValueError):
-    """A device or a file can not be used; one line."""
-
-
 class Video:
     """A webcam or a video file.
 
@@ -93,7 +84,7 @@ class Video:
         is_file: whether it is a file, which has an end.
 
     Raises:
-        CameraError: it can not be opened.
+        ValueError: it can not be opened; one line.
     """
 
     def __init__(self, source: str, *, loop: bool = False, speed: float = 1.0) -> None:
@@ -101,14 +92,14 @@ class Video:
         self.is_file = not number.isdecimal()
         self._source, self._loop, self._speed = source, loop, speed
         if self.is_file and not Path(source).is_file():
-            raise CameraError(f'{source}: no such file; wanted a video, or /dev/video0')
+            raise ValueError(f'{source}: no such file; wanted a video, or /dev/video0')
         self._capture = cv2.VideoCapture(source if self.is_file else int(number))
         if not self._capture.isOpened():
             kind = 'a video that OpenCV reads' if self.is_file else 'a webcam that nobody uses'
-            raise CameraError(f'{source} can not be opened; wanted {kind}')
+            raise ValueError(f'{source} can not be opened; wanted {kind}')
         if self.is_file and is_mirrored(display_matrix(Path(source)) or STORED):
             # OpenCV would turn it by 180 degrees.
-            raise CameraError(
+            raise ValueError(
                 f'{source}: its metadata mirror the images; write them as players show them, by '
                 f'ffmpeg -i {source} shown.mp4'
             )
@@ -119,7 +110,7 @@ class Video:
         """The images, (H, W, 3) BGR, and when they are due after the first of a file, ns.
 
         Raises:
-            CameraError: a device gives none any more.
+            ValueError: a device gives none any more.
         """
         start, number, seen, again = time.monotonic(), 0, time.monotonic(), 0
         while not stopped.is_set():
@@ -137,7 +128,7 @@ class Video:
             elif self.is_file:
                 return
             elif time.monotonic() - seen > _PATIENCE:
-                raise CameraError(f'{self._source} has given no image for {_PATIENCE:g} s')
+                raise ValueError(f'{self._source} has given no image for {_PATIENCE:g} s')
             else:
                 stopped.wait(_GLANCE)
 
@@ -155,7 +146,7 @@ def main(args: list[str] | None = None) -> int:
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(NAME)
     try:
-        p = _parameters(node)
+        p = declare(node, CameraNodeParameters())
         video = Video(given.video, loop=p.loop, speed=p.rate)
         try:
             _show(node, video, given, p.wait_for.split(), stopped)
@@ -197,14 +188,6 @@ def _angle(text: str) -> float:
     if not 1.0 <= angle <= 170.0:
         raise argparse.ArgumentTypeError(f'{text} degrees: wanted an angle from 1 to 170')
     return angle
-
-
-def _parameters(node: Any) -> CameraNodeParameters:
-    """The parameters, once they are declared."""
-    declared = declared_parameters(CameraNodeParameters())
-    node.declare_parameters('', [(p.name, p.default, descriptor(p)) for p in declared])
-    values = {p.name: node.get_parameter(p.name).value for p in declared}
-    return with_values(CameraNodeParameters(), values)
 
 
 def _await_active(node: Any, names: list[str], stopped: threading.Event) -> None:

@@ -9,6 +9,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -170,15 +171,13 @@ class MiddlewareEvents:
 
     def deaf_topic(self, subscriptions: Iterable[Any]) -> str:
         """A topic whose publishers all have a quality of service that does not fit, and why."""
-        try:
+        # The other thread may be closing them.
+        with suppress(InvalidHandle):
             for subscription in list(subscriptions):
                 topic = subscription.topic_name
                 policy = self._policies.get(f'publishers of {topic}')
                 if policy and not subscription.get_publisher_count():
                     return f'{topic}: publishers offer another {policy} than is asked for'
-        except InvalidHandle:
-            # The other thread is closing them.
-            pass
         return ''
 
     @property

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 import threading
 import time
-import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -173,24 +172,6 @@ class InputQueue:
             return len(self._waiting)
 
 
-class InnerFaults:
-    """Errors of the node itself since its start.
-
-    Attributes:
-        count: how many.
-        last: the newest; '' before the first.
-    """
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.last = ''
-
-    def add(self, error: Exception) -> None:
-        """Counts one."""
-        self.count += 1
-        self.last = f'{type(error).__name__}: {error_line(error)}'
-
-
 class EstimatingThread:
     """Gives sessions their turns, while it serves some.
 
@@ -286,8 +267,7 @@ class Estimator:
         place: of its turns among those of others.
         tell: takes the report on each message.
         tell_change: called when status or kinds of faults of the session have changed.
-        inner_faults: counts errors that the session should not have raised.
-        log_error: takes the traceback of such an error.
+        tell_error: takes an error that the session should not have raised; names it in a line.
 
     Attributes:
         queue: messages and requests that wait.
@@ -301,8 +281,7 @@ class Estimator:
         place: int,
         tell: Callable[[Handled], None],
         tell_change: Callable[[], None],
-        inner_faults: InnerFaults,
-        log_error: Callable[[str], None],
+        tell_error: Callable[[Exception], str],
     ) -> None:
         self._session, self._thread = session, thread
         self.place = place
@@ -310,8 +289,7 @@ class Estimator:
         limits = {_RESTART: 1, session.COUNTED: session.most_waiting}
         self.queue = InputQueue(limits, session.COUNTED, thread.changed)
         session.interrupted = lambda: bool(len(self.queue))
-        self._tell, self._tell_change = tell, tell_change
-        self._inner_faults, self._log_error = inner_faults, log_error
+        self._tell, self._tell_change, self._tell_error = tell, tell_change, tell_error
         self._durations: deque[Duration] = deque(maxlen=1000)
         self._arrivals: dict[int, float] = {}
         thread.serve(self)
@@ -366,9 +344,7 @@ class Estimator:
             self._handle(waiting, more=more)
         except Exception as error:  # noqa: BLE001
             # A fault of ours: later messages must not suffer from it.
-            self._inner_faults.add(error)
-            self._log_error(''.join(traceback.format_exception(error)))
-            text = f'the node itself failed: {self._inner_faults.last}'
+            text = f'the node itself failed: {self._tell_error(error)}'
             self._tell(session.break_off(waiting.source, text))
         after = session.state
         if (after.status, after.faults.keys()) != (before.status, before.faults.keys()):

@@ -14,12 +14,10 @@ from hmt_ros.nodes.tracking_node import TrackingNode
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
-from msg_tools import RosbagsMessages
 from msg_tools.messages.headers import time_ns
-from msg_tools.messages.pose_mixtures import pose_mixture_message
 
 
-class FilterNode(TrackingNode[TrackingSession, FilterParameters]):
+class FilterNode(TrackingNode):
     """The node; its parameters are the fields of `FilterParameters`."""
 
     NAME = 'filter_node'
@@ -44,11 +42,8 @@ class FilterNode(TrackingNode[TrackingSession, FilterParameters]):
     def _on_forecast_pose(
         self, request: ForecastPose.Request, response: ForecastPose.Response
     ) -> Any:
-        def forecast(session: TrackingSession) -> Any:
-            content = session.forecast(time_ns(request.stamp))
-            return pose_mixture_message(RosbagsMessages(), content)
-
-        return self._answer(response, 'mixture', forecast)
+        stamp = time_ns(request.stamp)
+        return self._answer(response, 'mixture', lambda session: session.forecast(stamp))
 
 
 def main(args: list[str] | None = None) -> int:

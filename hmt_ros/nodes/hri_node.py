@@ -87,12 +87,11 @@ class HriNode(SessionNode[HriSession, HriParameters]):
     def _found(self) -> list[str]:
         """Namespaces below /humans/bodies in which somebody publishes mixtures."""
         end = f'/{self._settings.mixture_topic}'
-        found = [
+        return sorted(
             topic.removesuffix(end)
             for topic, kinds in self.get_topic_names_and_types()
             if topic.startswith(f'{BODIES}/') and topic.endswith(end) and POSE_MIXTURE in kinds
-        ]
-        return sorted(found)
+        )
 
     def _look_for_people(self) -> None:
         if self._estimator is None or self._settings.named or not self._heard:

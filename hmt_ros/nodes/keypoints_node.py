@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Iterable
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
@@ -24,9 +23,6 @@ class KeypointsNode(SessionNode[KeypointsSession, KeypointsParameters]):
     def _offered_topics(self) -> Iterable[str]:
         masks = self._settings.publish_mask
         return (topic for topic in self.SESSION.TOPICS if masks or topic != MASK)
-
-    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
-        return ()
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield image_topic(self._settings.image_transport)

@@ -6,6 +6,7 @@ import difflib
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Set
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +18,41 @@ from hmt_ros.sessions.declared_parameters import (
     AT_LAUNCH,
     EFFECTS,
     DeclaredParameter,
-    Value,
+    Settings,
+    declared_parameters,
+    values_of,
+    with_values,
 )
+from hmt_ros.sessions.parameter_file import LARGEST_FILE, PARAMETERS_KEY
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 QOS_OVERRIDES = 'qos_overrides.'
-_LARGEST_FILE = 1_000_000  # bytes
-_KEY = 'ros__parameters'
 # Least likeness of a name to the one that is meant; more for nodes, as their names are alike.
 _ALIKE, _ALIKE_NODE = 0.5, 0.8
 
 
-def as_in_ros(value: Value) -> Any:
-    """A value of a parameter as ROS takes it."""
-    return list(value) if isinstance(value, tuple) else value
+def declare(node: Node, defaults: Settings) -> Settings:
+    """Declares the parameters of a settings dataclass.
+
+    Args:
+        defaults: their default values.
+
+    Returns:
+        The values that the node was given.
+
+    Raises:
+        ValueError: values that do not go together.
+    """
+    declared = declared_parameters(defaults)
+    as_in_ros = values_of(defaults)
+    node.declare_parameters('', [(p.name, as_in_ros[p.name], descriptor(p)) for p in declared])
+    values = {p.name: node.get_parameter(p.name).value for p in declared}
+    settings = with_values(defaults, values)
+    lists = {p.name for p in declared if isinstance(p.default, tuple)}
+    node.add_pre_set_parameters_callback(partial(with_empty_lists, names=lists))
+    # An empty list of a parameter file has come as no value, too.
+    node.set_parameters([Parameter(name) for name in lists if values[name] is None])
+    return settings
 
 
 def descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
@@ -112,18 +134,20 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
         if option != '--params-file':
             continue
         try:
-            document = read_plain_yaml(Path(path), _LARGEST_FILE)
+            document = read_plain_yaml(Path(path), LARGEST_FILE)
         except ValueError:
             # ROS has read it: it is no plain YAML, but nothing is wrong with it.
             continue
         sections = list(_sections(document, '')) if isinstance(document, Mapping) else []
         if any(re.fullmatch(_pattern(section), node) for section in sections):
             continue
-        near = next((section for section in sections if _is_meant(section, node)), None)
-        if near is not None:
+        own = node.rpartition('/')[2]
+        named = {section.rpartition('/')[2]: section for section in sections}
+        near = difflib.get_close_matches(own, named, n=1, cutoff=_ALIKE_NODE)
+        if near:
             texts.append(
-                f'{path}: its parameters are for {near!r}, and this node is {node!r}: none is '
-                f'used; name the section {"/**/" + node.rpartition("/")[2]!r}'
+                f'{path}: its parameters are for {named[near[0]]!r}, and this node is {node!r}: '
+                f'none is used; name the section {"/**/" + own!r}'
             )
     return texts
 
@@ -132,7 +156,7 @@ def _sections(document: Mapping[Any, Any], prefix: str) -> Iterator[str]:
     """Names of the nodes that a parameter file is for, with namespaces."""
     for key, value in document.items():
         name = f'{prefix}/{str(key).strip("/")}'
-        if key == _KEY:
+        if key == PARAMETERS_KEY:
             yield prefix
         elif isinstance(value, Mapping):
             yield from _sections(value, name)
@@ -142,9 +166,3 @@ def _pattern(section: str) -> str:
     """Regular expression over full names of nodes that a section matches."""
     parts = {'*': '/[^/]+', '**': '(/[^/]+)*'}
     return ''.join(parts.get(part, f'/{re.escape(part)}') for part in section.split('/')[1:])
-
-
-def _is_meant(section: str, node: str) -> bool:
-    """Whether this section is probably meant for the node."""
-    name, own = section.rpartition('/')[2], node.rpartition('/')[2]
-    return difflib.SequenceMatcher(None, name, own).ratio() >= _ALIKE_NODE

@@ -26,7 +26,7 @@ from hmt_ros.sessions.tracking_parameters import PeopleParameters
 STAYS_OPEN = 5
 
 
-class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
+class PeopleNode(TrackingNode):
     """The node; its parameters are the fields of `PeopleParameters`."""
 
     NAME = 'people_node'
@@ -63,8 +63,6 @@ class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
 
     def _open(self, topic: str) -> None:
         """Opens a topic of a person, once."""
-        if topic in self._outputs:
-            return
         with self._opening:
             if topic in self._outputs:
                 return
@@ -84,8 +82,6 @@ class PeopleNode(TrackingNode[PeopleSession, PeopleParameters]):
 
     def _close_topics(self, people: set[str]) -> None:
         """Closes the topics of people who have left."""
-        if not people:
-            return
         with self._opening:
             closed = {topic: x for topic, x in self._outputs.items() if person_of(topic) in people}
             self._outputs = {

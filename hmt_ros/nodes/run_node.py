@@ -6,7 +6,6 @@ With --help it prints how a node is run, and its parameters.
 from __future__ import annotations
 
 import ctypes
-import math
 import os
 import sys
 import textwrap
@@ -178,8 +177,8 @@ def described(settings: Any) -> list[str]:
 
 def _described(parameter: DeclaredParameter) -> list[str]:
     kind = _TYPES[type(parameter.default)]
-    default = yaml_scalar(parameter.default)
-    facts = [kind, *_range(parameter), f'default {default}', parameter.effect]
+    default = f'default {yaml_scalar(parameter.default)}'
+    facts = filter(None, (kind, parameter.bounds, default, parameter.effect))
     text = textwrap.wrap(
         parameter.description,
         _WIDTH,
@@ -188,14 +187,3 @@ def _described(parameter: DeclaredParameter) -> list[str]:
         break_on_hyphens=False,
     )
     return ['', f'  {parameter.name} ({"; ".join(facts)})', *text]
-
-
-def _range(parameter: DeclaredParameter) -> list[str]:
-    if parameter.limits is None:
-        return []
-    low, high = parameter.limits
-    if high == math.inf:
-        return [f'at least {low:g}']
-    if isinstance(parameter.default, int):
-        return [f'{low:.0f} to {high:.0f}']
-    return [f'{low:g} to {high:g}']

@@ -14,11 +14,11 @@ has been published. A player that waits for it feeds the node in lock step.
 from __future__ import annotations
 
 import time
+import traceback
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -35,17 +35,14 @@ from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, trouble_of_period
 from hmt_ros.nodes.estimating_thread import (
     EstimatingThreads,
     Estimator,
-    InnerFaults,
     Waiting,
     received,
 )
 from hmt_ros.nodes.node_parameters import (
     QOS_OVERRIDES,
-    as_in_ros,
-    descriptor,
+    declare,
     next_step,
     unknown_parameters,
-    with_empty_lists,
 )
 from hmt_ros.nodes.own_messages import OwnMessages
 from hmt_ros.nodes.silent_topics import SilentTopics
@@ -59,7 +56,7 @@ from hmt_ros.nodes.subscribed_topic import (
 )
 from hmt_ros.sessions.declared_parameters import (
     NodeParameters,
-    declared_parameters,
+    values_of,
     with_values,
 )
 from hmt_ros.sessions.handled import HANDLED, Handled, Output, handled_message
@@ -109,18 +106,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if self.get_parameter('use_sim_time').value:
             # A bag that is played again.
             defaults = replace(defaults, reset_on_time_jump=True)
-        declared = declared_parameters(defaults)
-        self.declare_parameters(
-            '', [(p.name, as_in_ros(p.default), descriptor(p)) for p in declared]
-        )
-        values = {p.name: self.get_parameter(p.name).value for p in declared}
-        self._settings: Parameters = with_values(defaults, values)
-        self._names = values.keys()
+        self._settings: Parameters = declare(self, defaults)
+        self._names = values_of(defaults).keys()
         self._warn_of_unknown(qos=False)
-        lists = {p.name for p in declared if isinstance(p.default, tuple)}
-        self.add_pre_set_parameters_callback(partial(with_empty_lists, names=lists))
-        # An empty list of a parameter file has come as no value, too.
-        self.set_parameters([Parameter(name) for name in lists if values[name] is None])
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._refuse_impossible_transitions()
         self.preparing = False
@@ -144,13 +132,13 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         # On topics that the node both publishes and subscribes to.
         self._own = OwnMessages()
         self._failure = ''
-        self._inner_faults = InnerFaults()
+        # Errors of the node itself.
+        self._errors, self._last_error = 0, ''
         self._told_at = self._untold = 0
         self._told_status = ''
         self._events = MiddlewareEvents(self.get_logger().warn)
         self._silent = SilentTopics(self, self.get_logger().warn)
-        self._counted = f'{self.SESSION.UNIT}s'
-        self._rates = Rates(self._counted, self.SESSION.DONE)
+        self._rates = Rates(f'{self.SESSION.UNIT}s', self.SESSION.DONE)
         self._diagnostics = self.create_publisher(
             DiagnosticArray,
             '/diagnostics',
@@ -277,8 +265,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             place=self._nodes.index(self),
             tell=self._tell,
             tell_change=self._diagnose,
-            inner_faults=self._inner_faults,
-            log_error=self.get_logger().error,
+            tell_error=self._tell_error,
         )
         session.topic_names = {one.source: self.resolve_topic_name(one.topic) for one in inputs}
         self._silent.listen(inputs, self.SESSION.COUNTED)
@@ -287,7 +274,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._warn_of_unknown(qos=True)
         topic = session.topic_names[inputs[-1].source]
         wants = session.state.wants
-        self.get_logger().info(f'{self._counted} from {topic}; waits for {wants}')
+        self.get_logger().info(f'{self._rates.name} from {topic}; waits for {wants}')
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -299,19 +286,11 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forgets the estimate, closes topics."""
+        """Forgets the estimate, closes topics; also at shutdown and after an error."""
         self._close()
         return super().on_cleanup(state)
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """As cleanup, from any state."""
-        self._close()
-        return super().on_shutdown(state)
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Back to the state before configuration."""
-        self._close()
-        return super().on_error(state)
+    on_shutdown = on_error = on_cleanup
 
     def _subscribe(self, wanted: SubscribedTopic) -> None:
         assert self._estimator is not None
@@ -436,6 +415,12 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if self._handled.get_subscription_count():
             self._handled.publish(serialise(handled_message(RosbagsMessages(), handled)))
 
+    def _tell_error(self, error: Exception) -> str:
+        self._errors += 1
+        self._last_error = f'{type(error).__name__}: {error_line(error)}'
+        self.get_logger().error(''.join(traceback.format_exception(error)))
+        return self._last_error
+
     def _publish(self, output: Output) -> None:
         publisher, name = self._outputs[output.topic], self._local_name(output.topic)
         if name in self._heard:
@@ -532,14 +517,14 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             values += [
                 ('status', state.status),
                 *(
-                    (f'{self._counted} {what}', str(state.counts[what]))
+                    (f'{self._rates.name} {what}', str(state.counts[what]))
                     for what in ('received', self.SESSION.DONE, 'skipped', 'dropped')
                 ),
                 *state.values(),
                 *((f'faults: {kind}', str(count)) for kind, count in sorted(state.faults.items())),
                 ('last fault', state.last_fault),
-                ('errors of the node itself', str(self._inner_faults.count)),
-                ('last error of the node itself', self._inner_faults.last),
+                ('errors of the node itself', str(self._errors)),
+                ('last error of the node itself', self._last_error),
                 *((f'nothing on {topics}', why) for topics, why in self._silent.texts.items()),
                 *self._events.values(),
                 *self._rates.values(),

@@ -48,13 +48,8 @@ class SilentTopics:
     """
 
     def __init__(self, node: Node, warn: Callable[[str], None]) -> None:
-        self.texts: Mapping[str, str] = {}
         self._node, self._warn = node, warn
-        self._inputs: dict[str, SubscribedTopic] = {}
-        self._arrivals: dict[str, float] = {}
-        self._began = time.monotonic()
-        self._pace = ''
-        self._warned: dict[str, tuple[str, float]] = {}
+        self.listen(())
 
     @property
     def silence(self) -> float:
@@ -71,9 +66,9 @@ class SilentTopics:
         """
         self._pace = pace
         self._inputs = {one.source: one for one in inputs}
-        self.texts = {}
-        self._arrivals.clear()
-        self._warned.clear()
+        self.texts: Mapping[str, str] = {}
+        self._arrivals: dict[str, float] = {}
+        self._warned: dict[str, tuple[str, float]] = {}
         self._began = time.monotonic()
 
     def arrived(self, source: str, now: float) -> None:
@@ -97,8 +92,7 @@ class SilentTopics:
             if text != before or now - at >= REPEAT:
                 self._warned[topics] = text, now
                 self._warn(text)
-        for topics in self._warned.keys() - texts.keys():
-            del self._warned[topics]
+        self._warned = {topics: self._warned[topics] for topics in texts}
 
     def _is_silent(self, needed: NeededInput, now: float) -> bool:
         last = max(self._arrivals.get(source, self._began) for source in needed.sources)

@@ -9,7 +9,7 @@ import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 from hmt_msgs.srv import Reset
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -28,14 +28,11 @@ from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.files.error_line import error_line
 
-AnySession = TypeVar('AnySession', bound=TrackingSession)
-Parameters = TypeVar('Parameters', bound=FilterParameters)
-
 # Period of the watchdog, s.
 _GLANCE = 0.05
 
 
-class TrackingNode(SessionNode[AnySession, Parameters]):
+class TrackingNode(SessionNode[Any, Any]):
     """A node of a session that tracks; see `SessionNode`."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -56,23 +53,16 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
 
     def stop(self, timeout: float | None = None) -> bool:
         """See `SessionNode`; nobody is watched any more."""
-        self._end_watch()
-        return super().stop(timeout)
-
-    def _unsubscribe(self) -> None:
-        super()._unsubscribe()
-        self._end_watch()
-
-    def _end_watch(self) -> None:
         self._inactive.set()
         if self._watchdog is not None:
             self._watchdog.join()
             self._watchdog = None
+        return super().stop(timeout)
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield Reset, '~/reset', self._on_reset
 
-    def _messages_of_others(self, settings: Parameters) -> Mapping[str, str]:
+    def _messages_of_others(self, settings: FilterParameters) -> Mapping[str, str]:
         return types_of_others(self.SESSION.inputs_of(settings), settings.source)
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
@@ -110,7 +100,7 @@ class TrackingNode(SessionNode[AnySession, Parameters]):
 
     # Called by a thread of its own.
 
-    def _watch(self, session: AnySession, inactive: threading.Event) -> None:
+    def _watch(self, session: TrackingSession, inactive: threading.Event) -> None:
         """Tells robots of images that are not answered."""
         count, answered = session.answered, time.monotonic()
         while not inactive.wait(_GLANCE):

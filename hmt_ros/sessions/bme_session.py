@@ -62,9 +62,9 @@ from hmt_ros.sessions.bme_parameters import (
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
-    CAMERA_MOVED,
     FRAME_ID,
     CameraSession,
+    CameraState,
     WaitingImage,
     check_size,
     read_picture,
@@ -73,9 +73,7 @@ from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK_INPUT, PREDICTION, Ima
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input, known_lifter
 from hmt_ros.sessions.session import (
     NeededInput,
-    Order,
     PublishedTopic,
-    SessionState,
     frame_id_of,
 )
 from hmt_ros.sessions.warm_up import film
@@ -106,7 +104,7 @@ _MEASURED_SPREAD = 0.02
 
 
 @dataclass(frozen=True)
-class BmeState(SessionState):
+class BmeState(CameraState):
     """State of the prediction: its status is 'no camera', 'learning', 'nobody' or 'predicting'.
 
     Of the counts 'predicted' are images with or without somebody, 'empty' those without, and
@@ -116,21 +114,15 @@ class BmeState(SessionState):
         modes: components of the last prediction.
         height: of the last silhouette, px.
         support: likeness of the silhouette to those of the training set, 0 to 1.
-        moved: whether the camera has moved since the background was taken.
     """
 
     modes: int = 0
     height: int = 0
     support: float = math.nan
-    moved: bool = False
 
     def summary(self) -> str:
         """The present estimate in a few words."""
         return f'{self.modes} modes'
-
-    def trouble(self) -> str:
-        """Whether the background is of no use."""
-        return CAMERA_MOVED if self.moved else ''
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -159,18 +151,16 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         super()._set_up()
         p = self.parameters
         self._predictor, self._size_spread = _predictor_of(p)
-        background = BackgroundModel()
-        if p.background_file:
-            background = BackgroundModel.from_image(read_picture(p.background_file))
-        self._scene = EmptyScene(background)
+        file = p.background_file
+        self._scene = EmptyScene(
+            BackgroundModel.from_image(read_picture(file)) if file else BackgroundModel()
+        )
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
         self._height, self._support, self._reason = 0, math.nan, ''
         # Whether the last prediction needed no background.
         self._without_background = p.predict_from == FROM_KEYPOINTS
-        self._lifter = None
-        if p.predict_from != FROM_SILHOUETTES:
-            self._lifter = known_lifter(p.lifter)
+        self._lifter = None if p.predict_from == FROM_SILHOUETTES else known_lifter(p.lifter)
         self._cue = p.predict_from
         self._keypoints = KeypointReader(p.source, self._log)
         self.restart()
@@ -218,8 +208,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return [own, *(x for x in needed if x.sources == (CAMERA_INFO,))]
 
     def _jump_back(self, stamp: int) -> None:
-        self._keypoints.forget()
         super()._jump_back(stamp)
+        self._keypoints.chosen.forget()
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
         if row.name != KEYPOINTS:
@@ -245,11 +235,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         """Predicts from keypoints and those of the last second, without an image."""
         self._log.counts['received'] += 1
         self._frame_id = frame_id_of(message)
-        order = self._order(stamp, self._newest)
-        if order is Order.SKIPPED:
+        if not self._is_next(stamp, self._newest):
             return
-        if order is Order.JUMP:
-            self._jump_back(stamp)
         camera = self._camera
         if camera is None:
             self._log.skip(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,18 +26,6 @@ _SHORTEST = 1e-6
 UP_SIGMA = 0.01
 
 
-class SeenGravity(NamedTuple):
-    """Gravity and height of a camera, from the transforms at a time.
-
-    Attributes:
-        up: (3,) unit vector against gravity, camera frame.
-        height: of the camera above z = 0 of the frame, m.
-    """
-
-    up: Array
-    height: float
-
-
 class CameraFrames:
     """The frames that transforms lead to from the camera, with gravity and pose.
 
@@ -47,7 +35,6 @@ class CameraFrames:
         floor: whether z = 0 of `gravity_frame` is the floor.
 
     Attributes:
-        gravity: the newest from transforms; None: none yet.
         newest: whether that was at the image that was looked up last.
         heard: whether any transform has come.
         pose: of the camera in `fixed_frame` at the image that was looked up last; None: unknown.
@@ -58,7 +45,8 @@ class CameraFrames:
     ) -> None:
         self.gravity_frame = gravity_frame
         self.fixed_frame = fixed_frame
-        self.gravity: SeenGravity | None = None
+        # The newest direction against gravity and height above z = 0 of its frame; None: none yet.
+        self._gravity: tuple[Array, float] | None = None
         self.newest = False
         self.pose: Transform | None = None
         self._floor = floor
@@ -78,7 +66,7 @@ class CameraFrames:
     def forget_after(self, stamp_ns: int) -> None:
         """See `TransformBuffer.forget_after`; gravity and pose are forgotten, too."""
         self._transforms.forget_after(stamp_ns)
-        self.gravity, self.newest, self.pose = None, False, None
+        self._gravity, self.newest, self.pose = None, False, None
 
     def is_settled(self, camera_frame: str, stamp_ns: int, timeout_ns: float) -> bool:
         """Whether an image need not wait: its transforms are there, or those of a later time."""
@@ -98,21 +86,17 @@ class CameraFrames:
         Returns:
             The faults; for a missing transform, the one that was wanted and those there are.
         """
-        faults = []
-        if self.gravity_frame:
-            faults += self._look_for_gravity(camera_frame, stamp_ns)
-        if self.fixed_frame:
-            faults += self._look_for_pose(camera_frame, stamp_ns)
-        return faults
+        gravity = self._look_for_gravity(camera_frame, stamp_ns) if self.gravity_frame else []
+        pose = self._look_for_pose(camera_frame, stamp_ns) if self.fixed_frame else []
+        return gravity + pose
 
     def known_ground(self, otherwise: KnownGround) -> KnownGround:
         """The ground known otherwise, with gravity and height from the newest transforms."""
-        if self.gravity is None:
+        if self._gravity is None:
             return otherwise
-        height = otherwise.camera_height
-        if self._floor and self.gravity.height > 0:
-            height = self.gravity.height
-        return KnownGround(self.gravity.up, height, UP_SIGMA)
+        up, height = self._gravity
+        known = height if self._floor and height > 0 else otherwise.camera_height
+        return KnownGround(up, known, UP_SIGMA)
 
     def _look_for_gravity(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
         name, self.newest = self.gravity_frame, False
@@ -126,7 +110,7 @@ class CameraFrames:
             return [('no transform', text)]
         up = found.rotation[:, 2]
         height = float(found.inverse().translation[2])
-        self.gravity, self.newest = SeenGravity(up / np.linalg.norm(up), height), True
+        self._gravity, self.newest = (up / np.linalg.norm(up), height), True
         if height > 0 or not self._floor:
             return []
         text = (
@@ -160,5 +144,4 @@ def unit_vector(vector: Sequence[float], name: str) -> Array:
     length = float(np.linalg.norm(v)) if v.shape == (3,) else math.nan
     if not _SHORTEST < length < math.inf:
         raise ValueError(f'{name} must be three finite numbers, not all zero, saw {v.tolist()}')
-    result: Array = v / length
-    return result
+    return v / length

@@ -16,6 +16,7 @@ import math
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
 from types import MappingProxyType
@@ -37,9 +38,8 @@ from hmt_ros.sessions.image_inputs import (
     REMEMBERED,
     ImageInput,
     ImageInputs,
-    Taken,
 )
-from hmt_ros.sessions.session import NeededInput, Order, Session, State
+from hmt_ros.sessions.session import NeededInput, Session, SessionState, State
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, UncalibratedError, camera_from_info
@@ -68,29 +68,42 @@ class WaitingImage(NamedTuple):
         image: (H, W, 3) BGR.
         stamp_ns: of the image.
         frame_id: optical frame of the camera.
-        given: inputs that have come with it, by name.
+        given: content of the inputs that have come with it, by name; None: nothing.
     """
 
     image: Image
     stamp_ns: int
     frame_id: str
-    given: Mapping[str, Taken] = MappingProxyType({})
+    given: Mapping[str, Any] = MappingProxyType({})
 
     def content(self, name: str) -> Any:
         """Content of an input for the image; None: nothing."""
-        return self.given[name].content if name in self.given else None
+        return self.given.get(name)
 
     @property
     def mask(self) -> Mask | None:
         """Where a segmenter sees the person, (H, W); without a pixel: nobody was seen."""
-        mask: Mask | None = self.content(MASK)
-        return mask
+        return self.content(MASK)
 
     @property
     def depth(self) -> NDArray[np.float32] | None:
         """Depth of the surface at each pixel, (H, W) m; None: unknown."""
-        depth: NDArray[np.float32] | None = self.content(DEPTH)
-        return depth
+        return self.content(DEPTH)
+
+
+@dataclass(frozen=True)
+class CameraState(SessionState):
+    """State of a session that estimates from images.
+
+    Attributes:
+        moved: whether the camera has moved since the background was taken.
+    """
+
+    moved: bool = False
+
+    def trouble(self) -> str:
+        """Whether the background is of no use."""
+        return CAMERA_MOVED if self.moved else ''
 
 
 class CameraSession(Session[CameraParameters, State]):
@@ -186,7 +199,11 @@ class CameraSession(Session[CameraParameters, State]):
         )
 
     def _jump_back(self, stamp: int) -> None:
-        """Forgets inputs and estimate, as time begins again at a stamp."""
+        """See `Session`; images that wait are used or dropped, and inputs are forgotten."""
+        self._end()
+        self._log.counts['dropped'] += len(self._waiting)
+        self._waiting.clear()
+        self._newest = None
         self._inputs.clear()
         self.frames.forget_after(stamp)
         self.restart()
@@ -248,33 +265,27 @@ class CameraSession(Session[CameraParameters, State]):
             return
         seen.append(frame)
         images, infos = self._named_frames[IMAGE], self._named_frames[CAMERA_INFO]
-        text = ''
         if len(seen) > 1:
-            text = (
+            self._log.note(
+                'frame_id',
                 f'{self._on_topic(source)} has messages of the frames {seen[-2]!r} and {frame!r}: '
-                'wanted those of one camera; stop or remap one of the publishers'
+                'wanted those of one camera; stop or remap one of the publishers',
+                warn=True,
             )
         elif images and infos and frame not in (images if source == CAMERA_INFO else infos):
-            text = (
+            self._log.note(
+                'frame_id',
                 f'{self._on_topic(IMAGE)} has frame_id {images[-1]!r}, '
                 f'{self._on_topic(CAMERA_INFO)} has {infos[-1]!r}: results are in that of the '
                 'image; if both are of one camera, set one frame_id in its driver, else remap '
-                'camera_info'
+                'camera_info',
+                warn=True,
             )
-        if text:
-            self._log.note('frame_id', text, warn=True)
 
     def _take_image(self, message: Any, stamp: int) -> None:
         self._see_frame(IMAGE, message)
-        order = self._order(stamp, self._newest)
-        if order is Order.SKIPPED:
+        if not self._is_next(stamp, self._newest):
             return
-        if order is Order.JUMP:
-            self._end()
-            self._log.counts['dropped'] += len(self._waiting)
-            self._waiting.clear()
-            self._newest = None
-            self._jump_back(stamp)
         try:
             image = self.decode_image(message)
         except ImageError as error:

@@ -179,6 +179,14 @@ class DeclaredParameter:
     effect: str
     path: tuple[str, ...]
 
+    @property
+    def bounds(self) -> str:
+        """Lowest and highest value in words; '' without limits."""
+        if self.limits is None:
+            return ''
+        digits = '.0f' if isinstance(self.default, int) else 'g'
+        return ' to '.join(format(limit, digits) for limit in self.limits)
+
     def checked(self, value: Any) -> Value:
         """A value from a file or a command line, with the type of the parameter.
 
@@ -197,17 +205,16 @@ class DeclaredParameter:
             raise ParameterError(
                 f'{self.name} must lie between {low:g} and {high:g}, saw {value!r}'
             )
-        result: Value = wanted(value)
-        return result
+        return wanted(value)
 
     def _numbers(self, value: Any) -> tuple[float, ...]:
         """A list of numbers; to ROS an empty list is no value at all."""
         numbers = () if value is None else value
         # ROS has bytes, whole numbers and texts in lists, too.
-        if not isinstance(numbers, list | tuple | array):
+        if not isinstance(numbers, list | tuple | array) or not all(
+            type(number) in (int, float) for number in numbers
+        ):
             raise ParameterError(f'{self.name} must be a list of numbers, saw {value!r}')
-        if not all(type(number) in (int, float) for number in numbers):
-            raise ParameterError(f'{self.name} must be a list of numbers, saw {list(numbers)!r}')
         return tuple(map(float, numbers))
 
 
@@ -267,8 +274,7 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
     for field, inside in changes.items():
         if isinstance(inside, dict):
             changes[field] = replace(getattr(settings, field), **inside)
-    result: Settings = replace(settings, **changes)  # type: ignore[type-var]
-    return result
+    return replace(settings, **changes)  # type: ignore[type-var]
 
 
 def described_fields(cls: type) -> dict[str, str]:

@@ -28,7 +28,6 @@ from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, camera_info_faul
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.session import (
     NeededInput,
-    Order,
     PublishedTopic,
     Session,
     SessionState,
@@ -168,7 +167,6 @@ class HriSession(Session[HriParameters, HriState]):
     UNIT = 'mixture'
     DONE = 'converted'
     ESTIMATE = 'every body'
-    CHECKED = ()
 
     def _set_up(self) -> None:
         self._camera: Camera | None = None
@@ -231,16 +229,13 @@ class HriSession(Session[HriParameters, HriState]):
 
     def _take_mixture(self, namespace: str, message: Any, stamp: int) -> None:
         known = self._people.get(namespace)
-        order = self._order(stamp, None if known is None else known.newest)
-        if order is Order.SKIPPED:
+        if not self._is_next(stamp, None if known is None else known.newest):
             return
         try:
             content = pose_mixture_of(message)
         except MessageError as error:
             self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
-        if order is Order.JUMP:
-            self.restart()
         person = self._person_in(namespace)
         if self._camera is None:
             self._now = stamp

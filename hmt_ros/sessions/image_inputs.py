@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 from hmt_ros.image.terms.depth import FURTHEST, NEAREST, usable_depths
 from hmt_ros.inference.arrays import Image
@@ -158,11 +158,12 @@ class StampedInputs(Generic[T]):
 
     def __init__(self, most: int = REMEMBERED) -> None:
         self._most = most
+        self.clear()
+
+    def clear(self) -> None:
+        """Drops all inputs."""
         self._content: dict[int, T | None] = {}
         self._newest = -1
-
-    def __contains__(self, stamp_ns: int) -> bool:
-        return stamp_ns in self._content
 
     def put(self, stamp_ns: int, content: T | None) -> None:
         """Keeps an input for its image."""
@@ -175,35 +176,10 @@ class StampedInputs(Generic[T]):
         """Whether the input for an image has come, or a later one."""
         return stamp_ns in self._content or self._newest > stamp_ns
 
-    def before(self, stamp_ns: int) -> list[int]:
-        """Stamps of the inputs that are older than an image."""
-        return [stamp for stamp in self._content if stamp < stamp_ns]
-
-    def take(self, stamp_ns: int) -> T | None:
-        """The input for an image, None where there is none; drops it and all that are older."""
-        return self.take_all(stamp_ns).get(stamp_ns)
-
     def take_all(self, stamp_ns: int) -> dict[int, T | None]:
         """The inputs by stamp, in order, for an image and all that are older; drops them."""
         taken = sorted(stamp for stamp in self._content if stamp <= stamp_ns)
         return {stamp: self._content.pop(stamp) for stamp in taken}
-
-    def clear(self) -> None:
-        """Drops all inputs."""
-        self._content.clear()
-        self._newest = -1
-
-
-class Taken(NamedTuple):
-    """An input for an image.
-
-    Attributes:
-        content: of its stamp; None: no message, or one without content.
-        answered: whether a message has come.
-    """
-
-    content: Any
-    answered: bool
 
 
 class ImageInputs:
@@ -237,38 +213,40 @@ class ImageInputs:
             self._log.fault(row.name, error_line(error))
         self._waiting[row.name].put(stamp_ns, content)
 
-    def take(self, row: ImageInput, stamp_ns: int, image: Image, dropped: Container[int]) -> Taken:
+    def take(self, row: ImageInput, stamp_ns: int, image: Image, dropped: Container[int]) -> Any:
         """The input for an image; reports a missing one, and those that belong to no image.
 
         Args:
             image: (H, W, 3).
             dropped: stamps of images that were dropped, whose inputs are not missed.
+
+        Returns:
+            Content of its stamp; None: no message, or one without content.
         """
-        waiting = self._waiting[row.name]
+        taken = self._waiting[row.name].take_all(stamp_ns)
+        content = taken.get(stamp_ns)
         if row.told:
-            for each in (x for x in waiting.before(stamp_ns) if x not in dropped):
+            for each in (x for x in taken if x != stamp_ns and x not in dropped):
                 verb, what = ('belong', 'come') if row.name.endswith('s') else ('belongs', 'comes')
                 self._log.note(
                     f'{row.name} without an image',
                     f'{row.name} of {each} ns {verb} to no image, or {what} too late: wanted the '
                     'stamp of an image',
                 )
-        answered = stamp_ns in waiting
-        content = waiting.take(stamp_ns)
-        if row.told and not answered:
+        if row.told and stamp_ns not in taken:
             verb = 'have' if row.name.endswith('s') else 'has'
             self._log.note(
                 f'no {row.name}', f'no {row.name} {verb} come for the image of {stamp_ns} ns'
             )
         if content is None or row.pixels is None or content.shape == image.shape[:2]:
-            return Taken(content, answered)
+            return content
         (height, width), (rows, columns) = content.shape, image.shape[:2]
         self._log.fault(
             row.name,
             f'{row.name} of {stamp_ns} ns has {width}x{height} pixels, wanted the {columns}x{rows} '
             f'of its image{row.pixels}',
         )
-        return Taken(None, answered)
+        return None
 
     def clear(self) -> None:
         """Drops all inputs that have come."""

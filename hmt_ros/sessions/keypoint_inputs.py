@@ -14,7 +14,7 @@ stamp by name.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from hmt_ros.body import Body, Camera
 from hmt_ros.experts.lifter import Lifter, load_lifter
-from hmt_ros.image.keypoint_schemes import AUTO, JOINTS
+from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, Scheme
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, CameraNodeParameters
 from hmt_ros.sessions.handled import HandlingLog
@@ -32,13 +32,17 @@ from msg_tools.files.error_line import error_line
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,
     DetectedPerson,
+    people_of_boxes,
     people_of_floats,
+    people_of_message,
     people_of_yolo,
     person_of_skeleton,
 )
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keypoints import Positions, keypoints_of
 
+# Value of `source` for the messages of one person, in units of the image.
+SKELETON = 'skeleton2d'
 # Time without the person after which the largest one is chosen anew, s.
 LONGEST_ABSENCE = 1.0
 # Largest motion of a person between two images, in sizes of the person.
@@ -66,6 +70,26 @@ def keypoints_input(source: str) -> ImageInput:
     if source == OWN_KEYPOINTS:
         return KEYPOINTS_INPUT
     return replace(KEYPOINTS_INPUT, types={DETECTIONS: SOURCES[source]})
+
+
+def _person_of_skeleton(
+    message: Any, _order: Scheme, camera: Camera | None
+) -> list[DetectedPerson]:
+    if camera is None:
+        raise MessageError(
+            'it comes before a calibrated camera_info, which tells the size of the image'
+        )
+    return [person_of_skeleton(message, camera.width, camera.height)]
+
+
+# The people in a message, by the parameter `source`.
+_READERS: dict[str, Callable[[Any, Scheme, Camera | None], list[DetectedPerson]]] = {
+    'people': lambda message, _order, _camera: people_of_message(message),
+    'boxes': lambda message, _order, _camera: people_of_boxes(message),
+    'yolo': lambda message, order, _camera: people_of_yolo(message, order),
+    'floats': lambda message, order, _camera: people_of_floats(message, order),
+    SKELETON: _person_of_skeleton,
+}
 
 
 class ChosenPerson:
@@ -126,13 +150,59 @@ def _distance(one: Keypoints, other: Keypoints) -> float:
     return float(np.hypot(*(middles[0] - middles[1])))
 
 
-class KeypointReader:
-    """Reads the keypoints of the person who is tracked."""
+class DetectionReader:
+    """Reads the messages of a detector; of each kind of unknown names it warns once.
+
+    Args:
+        source: type of the messages, see `CameraNodeParameters.source`.
+    """
 
     def __init__(self, source: str, log: HandlingLog) -> None:
         self._source, self._log = source, log
-        self._chosen = ChosenPerson()
         self._unknown: set[frozenset[str]] = set()
+
+    def _people(
+        self, message: Any, stamp: int, order: Scheme, camera: Camera | None = None
+    ) -> list[DetectedPerson]:
+        """The people in a message.
+
+        Args:
+            order: of keypoints that come without names.
+            camera: that took the image; None: it is not known.
+
+        Raises:
+            MessageError: it can not be used.
+        """
+        try:
+            return _READERS[self._source](message, order, camera)
+        except MessageError as error:
+            raise MessageError(f'detections of {stamp} ns: {error}') from error
+
+    def _report(self, unknown: list[str], scheme: str) -> None:
+        """Counts names of keypoints that are not known."""
+        names = frozenset(unknown)
+        new = names not in self._unknown and len(self._unknown) < _MOST_WARNINGS
+        if new:
+            self._unknown.add(names)
+        known = {AUTO: 'of the body or of a known scheme', JOINTS: 'of the body'}
+        self._log.note(
+            'names of keypoints',
+            f'keypoints {unknown} are not used: wanted names of joints '
+            f'{known.get(scheme, f"in the scheme {scheme}")}',
+            warn=new,
+        )
+
+
+class KeypointReader(DetectionReader):
+    """Reads the keypoints of the person who is tracked.
+
+    Attributes:
+        chosen: one of several people.
+    """
+
+    def __init__(self, source: str, log: HandlingLog) -> None:
+        super().__init__(source, log)
+        self.chosen = ChosenPerson()
 
     def read(
         self,
@@ -167,26 +237,17 @@ class KeypointReader:
     ) -> Keypoints | None:
         if self._source == OWN_KEYPOINTS:
             return keypoints_of(message)
-        try:
-            if self._source == 'skeleton2d':
-                if camera is None:
-                    raise MessageError(
-                        'it comes before a calibrated camera_info, which tells the size of the '
-                        'image'
-                    )
-                person = person_of_skeleton(message, camera.width, camera.height).keypoints
-                return person[np.flatnonzero(person.seen)]
-            if stamp == 0:
-                raise MessageError('it comes before a camera_info, which tells its stamp')
-            read = people_of_yolo if self._source == 'yolo' else people_of_floats
-            people = read(message, p.order)
-        except MessageError as error:
-            raise MessageError(f'detection of {stamp} ns: {error}') from error
-        if p.person_id:
+        if stamp == 0 and self._source != SKELETON:
+            raise MessageError('it comes before a camera_info, which tells its stamp')
+        people = self._people(message, stamp, p.order, camera)
+        chosen: Keypoints | None
+        if self._source == SKELETON:
+            chosen = people[0].keypoints
+        elif p.person_id:
             own = (x.keypoints for x in people if x.name == p.person_id and x.keypoints.seen.any())
             chosen = next(own, None)
         else:
-            chosen = self._chosen.choose(people, stamp, LONGEST_ABSENCE)
+            chosen = self.chosen.choose(people, stamp, LONGEST_ABSENCE)
         return None if chosen is None else chosen[np.flatnonzero(chosen.seen)]
 
     def at_joints(
@@ -215,20 +276,3 @@ class KeypointReader:
                 )
         known, _ = found.named_for(body, scheme)
         return known[np.flatnonzero(known.seen)] if known.names else None
-
-    def forget(self) -> None:
-        """Forgets the chosen person; the next one is chosen anew."""
-        self._chosen.forget()
-
-    def _report(self, unknown: list[str], scheme: str) -> None:
-        names = frozenset(unknown)
-        new = names not in self._unknown and len(self._unknown) < _MOST_WARNINGS
-        if new:
-            self._unknown.add(names)
-        known = {AUTO: 'of the body or of a known scheme', JOINTS: 'of the body'}
-        self._log.note(
-            'names of keypoints',
-            f'keypoints {unknown} are not used: wanted names of joints '
-            f'{known.get(scheme, f"in the scheme {scheme}")}',
-            warn=new,
-        )

@@ -25,7 +25,7 @@ from hmt_ros.sessions.declared_parameters import (
     parameter_field,
 )
 from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D, MASK
-from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState
+from hmt_ros.sessions.session import PublishedTopic, Session, SessionState
 from msg_tools.messages import keypoints
 from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.images import ImageError, image_message
@@ -87,7 +87,6 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
     UNIT = 'image'
     DONE = 'detected'
     ESTIMATE = 'the sequence'
-    CHECKED = ()
 
     def _set_up(self) -> None:
         kind = DETECTORS[self.parameters.detector]
@@ -102,11 +101,8 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
         super().restart()
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
-        order = self._order(stamp, self._newest)
-        if order is Order.SKIPPED:
+        if not self._is_next(stamp, self._newest):
             return
-        if order is Order.JUMP:
-            self.restart()
         try:
             image = self.decode_image(message)
             found = self._detector.detect(image, stamp)

@@ -11,16 +11,15 @@ import yaml
 
 from hmt_ros.sessions.declared_parameters import (
     EFFECTS,
-    DeclaredParameter,
     ParameterError,
     Value,
     declared_parameters,
 )
 from msg_tools.files.plain_yaml import read_plain_yaml
 
-_KEY = 'ros__parameters'
+PARAMETERS_KEY = 'ros__parameters'
 _WIDTH, _INDENT = 100, '    '
-_LARGEST_FILE = 1_000_000  # bytes
+LARGEST_FILE = 1_000_000  # bytes
 
 
 def parameter_file_text(node: str, settings: Any, like: str = '', others: Any = None) -> str:
@@ -49,12 +48,13 @@ def parameter_file_text(node: str, settings: Any, like: str = '', others: Any = 
             if name in used
         ),
         f'/**/{node}:',
-        f'  {_KEY}:',
+        f'  {PARAMETERS_KEY}:',
     ]
     for parameter in declared:
+        facts = parameter.bounds, parameter.effect
         lines.extend(
             textwrap.wrap(
-                f'{parameter.description} [{_bounds(parameter)}{parameter.effect}]',
+                f'{parameter.description} [{"; ".join(filter(None, facts))}]',
                 _WIDTH,
                 initial_indent=f'{_INDENT}# ',
                 subsequent_indent=f'{_INDENT}# ',
@@ -72,8 +72,7 @@ def yaml_scalar(value: Value) -> str:
         return "'" + value.replace("'", "''") + "'"
     if isinstance(value, list | tuple):
         return f'[{", ".join(yaml_scalar(each) for each in value)}]'
-    text: str = yaml.safe_dump(value)
-    return text.removesuffix('\n...\n').strip()
+    return yaml.safe_dump(value).removesuffix('\n...\n').strip()
 
 
 def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -> dict[str, Any]:
@@ -90,7 +89,7 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     """
     path = Path(path)
     try:
-        document = read_plain_yaml(path, _LARGEST_FILE)
+        document = read_plain_yaml(path, LARGEST_FILE)
     except ValueError as error:
         raise ParameterError(f'{path}: {error}') from error
     if document is None:
@@ -100,19 +99,18 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     sections = {
         str(key): value
         for key, value in document.items()
-        if isinstance(value, dict) and _KEY in value
+        if isinstance(value, dict) and PARAMETERS_KEY in value
     }
     if not sections:
-        values = dict(_flattened(document, '', path))
-        return {} if by_name else values
+        return {} if by_name else dict(_flattened(document, '', path))
     result: dict[str, Any] = {}
     for key in document:
         if str(key) not in sections:
-            raise ParameterError(f'{path}: section {key!r} has no {_KEY}')
+            raise ParameterError(f'{path}: section {key!r} has no {PARAMETERS_KEY}')
     # As in ROS, a section for one node overrides a section for all.
     for key in sorted(sections, key=lambda key: '*' not in key):
         if key.rpartition('/')[2] in ((node,) if by_name else (node, '*', '**')):
-            result.update(_flattened(sections[key][_KEY] or {}, '', path))
+            result.update(_flattened(sections[key][PARAMETERS_KEY] or {}, '', path))
     return result
 
 
@@ -125,12 +123,3 @@ def _flattened(values: Any, prefix: str, path: Path) -> Iterator[tuple[str, Any]
             yield from _flattened(value, f'{name}.', path)
         else:
             yield name, value
-
-
-def _bounds(parameter: DeclaredParameter) -> str:
-    if parameter.limits is None:
-        return ''
-    low, high = parameter.limits
-    if isinstance(parameter.default, int):
-        return f'{low:.0f} to {high:.0f}; '
-    return f'{low:g} to {high:g}; '

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,27 +11,14 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.image.association import Sighting
 from hmt_ros.image.keypoint_evidence import FEWEST_KEYPOINTS
-from hmt_ros.image.keypoint_schemes import Scheme
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.handled import HandlingLog
+from hmt_ros.sessions.keypoint_inputs import DetectionReader
 from hmt_ros.sessions.tracking_parameters import PeopleParameters
-from msg_tools import MessageError
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,
     DetectedPerson,
-    people_of_boxes,
-    people_of_floats,
-    people_of_message,
-    people_of_yolo,
 )
-
-# The people in a message, by the parameter `source`, where keypoints without names have an order.
-_READERS: dict[str, Callable[[Any, Scheme], list[DetectedPerson]]] = {
-    'people': lambda message, _: people_of_message(message),
-    'boxes': lambda message, _: people_of_boxes(message),
-    'yolo': people_of_yolo,
-    'floats': people_of_floats,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,17 +41,16 @@ class Found:
         return self.detected.box is not None or len(self.keypoints.names) >= FEWEST_KEYPOINTS
 
 
-class PeopleReader:
-    """Reads the detections.
+class PeopleReader(DetectionReader):
+    """Reads the detections of several people.
 
     Args:
         parameters: `source` and `keypoint_scheme` say how.
     """
 
     def __init__(self, parameters: PeopleParameters, log: HandlingLog) -> None:
-        self._source, self._scheme = parameters.source, parameters.order
-        self._log = log
-        self._unknown: set[frozenset[str]] = set()
+        super().__init__(parameters.source, log)
+        self._order = parameters.order
 
     def people(self, message: Any, stamp: int) -> list[DetectedPerson]:
         """The people in a message.
@@ -72,10 +58,7 @@ class PeopleReader:
         Raises:
             MessageError: it can not be used.
         """
-        try:
-            people = _READERS[self._source](message, self._scheme)
-        except MessageError as error:
-            raise MessageError(f'detections of {stamp} ns: {error}') from error
+        people = self._people(message, stamp, self._order)
         names: set[str] = set()
         for i, person in enumerate(people):
             if person.name and person.name in names:
@@ -105,16 +88,7 @@ class PeopleReader:
             if use_keypoints and person.keypoints.names:
                 known, unknown = person.keypoints.named_for(body, scheme)
                 keypoints = known[np.flatnonzero(known.seen)]
-                self._report(frozenset(unknown))
+                if unknown and frozenset(unknown) not in self._unknown:
+                    self._report(sorted(unknown), scheme)
             result.append(Found(person, keypoints, Sighting.of(keypoints, corners)))
         return result
-
-    def _report(self, unknown: frozenset[str]) -> None:
-        if not unknown or unknown in self._unknown:
-            return
-        self._unknown.add(unknown)
-        self._log.note(
-            'names of keypoints',
-            f'keypoints {sorted(unknown)} are not used: wanted names of joints of the body or of '
-            'a known scheme',
-        )

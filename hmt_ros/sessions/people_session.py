@@ -39,7 +39,7 @@ from hmt_ros.image.person_shape import covered
 from hmt_ros.image.silhouettes import Silhouettes, region_of
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
-from hmt_ros.sessions.camera_session import CAMERA_MOVED, WaitingImage
+from hmt_ros.sessions.camera_session import CameraState, WaitingImage
 from hmt_ros.sessions.image_inputs import (
     DEPTH_INPUT,
     DETECTIONS,
@@ -49,7 +49,7 @@ from hmt_ros.sessions.image_inputs import (
     ImageInput,
 )
 from hmt_ros.sessions.people_inputs import Found, PeopleReader
-from hmt_ros.sessions.session import PublishedTopic, SessionState
+from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.sessions.track import BODIES, Seen, Track, person_of
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
 from hmt_ros.sessions.track_start import TrackStart
@@ -87,28 +87,22 @@ UNSTARTED = 0.5
 
 
 @dataclass(frozen=True)
-class PeopleState(SessionState):
+class PeopleState(CameraState):
     """State of the node: its status is 'no camera', 'waiting', 'nobody' or 'tracking'.
 
     Attributes:
         people: identities of those who are tracked.
         followed: identities of those who are tracked, or about to be.
         detected: number of people in the last detections.
-        moved: whether the camera has moved since the background was taken.
     """
 
     people: tuple[str, ...] = ()
     followed: tuple[str, ...] = ()
     detected: int = 0
-    moved: bool = False
 
     def summary(self) -> str:
         """The present estimate in a few words."""
         return f'{len(self.people)} of {self.detected} people'
-
-    def trouble(self) -> str:
-        """Whether the background is of no use."""
-        return CAMERA_MOVED if self.moved else ''
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -253,14 +247,9 @@ class PeopleSession(TrackingSession):
         self, found: Sequence[Found], stamp: int
     ) -> tuple[dict[_Person, Found], list[Found]]:
         """Detections of the people who are followed, by person, and the detections left over."""
-        own: dict[_Person, Found] = {}
-        left = list(found)
-        for person in self.tracks:
-            for one in left:
-                if person.known_as and one.detected.name == person.known_as:
-                    own[person] = one
-                    left.remove(one)
-                    break
+        named = {one.detected.name: one for one in found if one.detected.name}
+        own = {x: named[x.known_as] for x in self.tracks if x.known_as in named}
+        left = [one for one in found if one not in own.values()]
         others = [person for person in self.tracks if person not in own]
         pairs = assigned([x.place for x in others], [x.sighting for x in left], stamp)
         for row, column in pairs.items():

@@ -86,8 +86,7 @@ class RobotOutputs:
     """
 
     def __init__(self) -> None:
-        self._told = _Told()
-        self._forecast_until = 0
+        self.forget()
 
     def forget(self) -> None:
         """Forgets the images, as time begins anew."""

@@ -14,11 +14,11 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import entr
 
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.declared_parameters import NodeParameters
@@ -54,14 +54,6 @@ class NeededInput(NamedTuple):
 
     sources: tuple[str, ...]
     with_each: bool = False
-
-
-class Order(Enum):
-    """How the stamp of a message relates to those before."""
-
-    NEXT = 'next'
-    SKIPPED = 'skipped'
-    JUMP = 'jump'
 
 
 @dataclass(frozen=True)
@@ -156,7 +148,7 @@ class Session(ABC, Generic[Parameters, State]):
     UNIT: ClassVar[str]
     DONE: ClassVar[str]
     ESTIMATE: ClassVar[str]
-    CHECKED: ClassVar[tuple[str, ...]]
+    CHECKED: ClassVar[tuple[str, ...]] = ()
 
     state: State
 
@@ -297,22 +289,30 @@ class Session(ABC, Generic[Parameters, State]):
         topic = self.topic_names.get(source)
         return f'{source} on {topic}' if topic else source
 
-    def _order(self, stamp: int, newest: int | None) -> Order:
-        """How a stamp relates to the newest before; faults are reported here."""
+    def _is_next(self, stamp: int, newest: int | None) -> bool:
+        """Whether a message is to be used, as it is younger than the newest before; or time jumps.
+
+        Faults are reported here; where time jumps back the estimate starts anew.
+        """
         if newest is None or stamp > newest:
-            return Order.NEXT
+            return True
         text = f'{self.UNIT} of {stamp} ns comes after one of {newest} ns'
         if stamp == newest:
             self._log.skip('time stands still', f'{text}, wanted stamps that increase')
-            return Order.SKIPPED
+            return False
         if not self.parameters.reset_on_time_jump:
             self._log.skip(
                 'time jumps back',
                 f'{text}: skipped; with reset_on_time_jump {self.ESTIMATE} would start anew',
             )
-            return Order.SKIPPED
+            return False
         self._log.note('time jumps back', f'{text}: {self.ESTIMATE} starts anew')
-        return Order.JUMP
+        self._jump_back(stamp)
+        return True
+
+    def _jump_back(self, stamp: int) -> None:
+        """Starts the estimate anew, as time begins again at a stamp."""
+        self.restart()
 
     def _publish(self, topic: str, stamp: int, message: Any) -> None:
         began = time.perf_counter()
@@ -329,5 +329,4 @@ def frame_id_of(message: Any) -> str:
 
 def entropy(weights: NDArray[np.float64]) -> float:
     """Entropy of the weights of a mixture, nats; NaN where there are none."""
-    positive = weights[weights > 0]
-    return abs(float(-(positive * np.log(positive)).sum())) if len(positive) else math.nan
+    return float(entr(weights).sum()) if len(weights) else math.nan

@@ -80,7 +80,7 @@ def trajectory_content(
         covariances: whether they are part of the message.
         shapes: (d, d) by stamp, added to covariances: of errors shared by poses of all images.
     """
-    content = found.message_content() if covariances else _without_covariances(found)
+    content = found.message_content(covariances=covariances)
     if covariances:
         wide = _symmetric(content['marginal_covariances'])
         for t, stamp in enumerate(content['stamps_ns']):
@@ -227,24 +227,6 @@ def _joints(means: Array, body: Body) -> Array:
     return joints.reshape(*means.shape[:2], len(body.joint_names), 3)
 
 
-def _without_covariances(found: TrajectoryMixture) -> dict[str, Any]:
-    """As `TrajectoryMixture.message_content`, which would compute them."""
-    assert found.stamps_ns is not None
-    before = found.stamps_ns[0] - 1
-    return {
-        'weights': found.weights,
-        'means': found.means,
-        'marginal_covariances': None,
-        'log_joint': found.log_joint,
-        'inflation': found.inflation,
-        'stamps_ns': found.stamps_ns,
-        'final_until_ns': before if found.final_until_ns is None else found.final_until_ns,
-        'free_energy': found.free_energy,
-        'identities': np.array(found.identities) if found.identities else None,
-    }
-
-
 def _symmetric(covariances: Array) -> Array:
     """The covariances without the asymmetry of rounding."""
-    result: Array = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
-    return result
+    return 0.5 * (covariances + np.swapaxes(covariances, -1, -2))

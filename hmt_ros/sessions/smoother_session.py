@@ -24,7 +24,7 @@ The rules, besides those of `Session`:
   smoothed as a camera sees them that is turned by quarter turns; then a new window begins.
 - Angles that go round are taken from mixture to mixture without whole turns, each mode from the
   nearest one before: to the dynamics a turn more would be a jump.
-- The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
+- The dynamics bridge gaps. One that is longer than `LONGEST_INTERVAL` is reported.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.body.mirror import clear_level, free_limits, relevelled, without_turns
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.image_evidence import Evidence, KeptMixtures, evidence_of
-from hmt_ros.sessions.session import Order, Session, SessionState
+from hmt_ros.sessions.session import Session, SessionState
 from hmt_ros.sessions.smoothed_messages import (
     TOPICS,
     OpenPose,
@@ -51,6 +52,7 @@ from hmt_ros.sessions.smoothed_messages import (
     window_messages,
 )
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.track import resembles
 from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow, TrajectoryMixture
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
@@ -75,6 +77,13 @@ NOBODY = 'nobody'  # status while nobody is in view
 SAME_PERSON = 0.02
 # Time between two smoothings, as a share of the lag, and at most, s: neighbours hardly differ.
 SHARE_OF_LAG, RARELY = 0.2, 0.1
+# Maximum number of components of a mixture over trajectories.
+MAX_TRAJECTORIES = 16
+# Interval between two mixtures above which a gap is reported, s.
+LONGEST_INTERVAL = 0.25
+# Factor on the variance that the motion prior of the filter gains in a second. Sudden motion is
+# more frequent than under a Gaussian of the mean variance; chosen on clips (docs/smoothing.md).
+LIVELINESS = 2.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +93,7 @@ class SmootherState(SessionState):
     Attributes:
         window: poses in the window.
         trajectories: components of the mixture over them.
-        gaps: intervals between mixtures that were longer than `longest_interval`.
+        gaps: intervals between mixtures that were longer than `LONGEST_INTERVAL`.
         longest_gap: s.
     """
 
@@ -164,6 +173,10 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self.kept = KeptMixtures(self._of, ())
         super().restart()
 
+    def _jump_back(self, stamp: int) -> None:
+        self._end_window()
+        self._first_identity = 1
+
     def _take(self, source: str, message: Any, stamp: int) -> None:
         try:
             content = pose_mixture_of(message)
@@ -181,19 +194,15 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
                 'say counts more than once',
             )
-        order = self._order(stamp, self._newest)
-        if order is Order.SKIPPED:
+        if not self._is_next(stamp, self._newest):
             return
-        if order is Order.JUMP:
-            self._end_window()
-            self._first_identity = 1
         self._begin_track(of)
         evidence = _levelled(evidence, of.body)
         evidence = self._without_turns(evidence, of.body)
         p = self.parameters
         if self._newest is not None:
             interval = (stamp - self._newest) / SECOND_NS
-            if interval > p.longest_interval:
+            if interval > LONGEST_INTERVAL:
                 self._gaps += 1
                 self._longest_gap = max(self._longest_gap, interval)
                 self._log.note(
@@ -201,7 +210,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                     f'no mixture for {interval:.2f} s before {stamp} ns: the dynamics bridge it',
                 )
         if self._window is None:
-            self._window = self._new_window(of.body)
+            self._window = SlidingWindow(
+                self._smoother(of.body),
+                p.fixed_lag,
+                p.random_seed,
+                first_identity=self._first_identity,
+                every=min(SHARE_OF_LAG * p.fixed_lag, RARELY),
+            )
         try:
             update = self._window.step(
                 stamp, self._counted(evidence, self._newest, of), evidence.lasting(self._newest)
@@ -244,9 +259,9 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
     def _take_nobody(self, stamp: int, existence: float) -> None:
         """Ends the window: the person is no longer in view."""
-        if self._order(stamp, self._newest) is Order.SKIPPED:
-            return
         of, smooths = self._of, self._window is not None
+        if not self._is_next(stamp, self._newest):
+            return
         self._end_window()
         self._nobody = True
         if of is not None and smooths:
@@ -305,30 +320,16 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._of, self._first_identity = of, 1
         self.kept = KeptMixtures(of, ())
 
-    def _new_window(self, body: Body) -> SlidingWindow:
-        p = self.parameters
-        return SlidingWindow(
-            self._smoother(body),
-            p.fixed_lag,
-            p.random_seed,
-            first_identity=self._first_identity,
-            every=min(SHARE_OF_LAG * p.fixed_lag, RARELY),
-        )
-
     def _smoother(self, body: Body) -> MixtureSmoother:
         """The smoother that the parameters ask for."""
         p = self.parameters
-        kind = PathSmoother if p.method == 'paths' else MixtureSmoother
-        smoother = kind(
-            p.dynamics.of(body),
-            *free_limits(body),
-            p.max_trajectories,
-            through_modes=p.through_modes,
-            points=body.relative_joints,
-        )
-        if p.resting_feet and isinstance(smoother, PathSmoother):
-            return replace(smoother, resting=RestingPoints.of_soles(body))
-        return smoother
+        prior = motion_prior(body)
+        livelier = replace(prior, diffusion=LIVELINESS * prior.diffusion)
+        settings = livelier, *free_limits(body), MAX_TRAJECTORIES
+        if p.method != 'paths':
+            return MixtureSmoother(*settings, points=body.relative_joints)
+        resting = RestingPoints.of_soles(body) if p.resting_feet else None
+        return PathSmoother(*settings, points=body.relative_joints, resting=resting)
 
     def _end_window(self) -> None:
         """Publishes the poses that are still open, and forgets the window."""
@@ -443,11 +444,10 @@ def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:
     """Whether two bodies are one person, whose lengths are estimated from image to image."""
-    if (one.body.name, one.frame_id) != (other.body.name, other.frame_id):
-        return False
-    if not np.array_equal(one.body.level, other.body.level):
-        return False
-    if 0 not in (one.track_id, other.track_id) and one.track_id != other.track_id:
-        return False
-    change = np.abs(one.body.skeleton.lengths - other.body.skeleton.lengths)
-    return bool(change.max(initial=0.0) <= SAME_PERSON)
+    same_track = 0 in (one.track_id, other.track_id) or one.track_id == other.track_id
+    return (
+        same_track
+        and one.frame_id == other.frame_id
+        and np.array_equal(one.body.level, other.body.level)
+        and resembles(one.body, other.body, SAME_PERSON)
+    )

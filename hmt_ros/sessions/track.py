@@ -25,11 +25,10 @@ from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.focal_length import with_depth_error
-from hmt_ros.sessions.handled import HandlingLog
+from hmt_ros.sessions.handled import HandlingLog, Output
 from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
 from hmt_ros.sessions.track_messages import (
     TOPICS_OF_NODE,
-    Made,
     TrackedImage,
     nobody_messages,
     robot_messages,
@@ -217,14 +216,14 @@ class Track:
             return False
         return published
 
-    def stale(self, silence: float) -> Iterator[Made]:
+    def stale(self, silence: float) -> Iterator[Output]:
         """Messages for a robot where no image is answered; may be called by any thread.
 
         Args:
             silence: time since the newest image was answered, s.
         """
         for made in robot_messages(self.robot, self._parameters, self._wants, silence):
-            yield made._replace(topic=topic_of(self.person, made.topic))
+            yield replace(made, topic=topic_of(self.person, made.topic))
 
     def _placed_tracker(self, camera: Camera) -> Tracker:
         """The tracker, which knows gravity and the pose of the camera at the image.
@@ -268,7 +267,7 @@ class Track:
         likelihood: GaussianMixture,
     ) -> bool:
         p, fixed = self._parameters, self._fixed_frame()
-        starts = self.body is None or not _looks_like(tracker.estimate.body, self.body)
+        starts = self.body is None or not resembles(tracker.estimate.body, self.body, RESHAPED)
         if starts:
             self.body = tracker.estimate.body
         if fixed is not None:
@@ -351,13 +350,13 @@ class Track:
         with self._shared.answering:
             self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen, reason)
             for made in robot_messages(self.robot, p, self._wants):
-                self._put_out(*made)
+                self._put_out(made.topic, made.stamp_ns, made.message)
             self._shared.answered += 1
 
 
-def _looks_like(body: Body, shown: Body) -> bool:
-    """Whether a body is the one that has been described, up to small changes of its estimate."""
-    if body.dof_names != shown.dof_names:
+def resembles(body: Body, other: Body, tolerance: float) -> bool:
+    """Whether two bodies are of one model, and their lengths differ by a tolerance, m, at most."""
+    if (body.name, body.dof_names) != (other.name, other.dof_names):
         return False
-    change = np.abs(body.skeleton.lengths - shown.skeleton.lengths)
-    return bool(change.max(initial=0.0) <= RESHAPED)
+    change = np.abs(body.skeleton.lengths - other.skeleton.lengths)
+    return bool(change.max(initial=0.0) <= tolerance)

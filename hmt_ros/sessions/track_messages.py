@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.focal_length import depth_covariances
+from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.robot_outputs import RobotOutputs
 from hmt_ros.sessions.session import PublishedTopic
@@ -69,14 +70,6 @@ UPRIGHT = 'camera_upright'
 MESSAGES = RosbagsMessages()
 # Modes that are drawn on the image, the heaviest.
 OVERLAY_MODES = 3
-
-
-class Made(NamedTuple):
-    """A message that is to be published on a topic, with the stamp that it is about, ns."""
-
-    topic: str
-    stamp_ns: int
-    message: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,8 +205,8 @@ def robot_messages(
     parameters: FilterParameters,
     wanted: Callable[[str], bool],
     silence: float | None = None,
-) -> Iterator[Made]:
-    """Topics, stamps and messages that robots act on.
+) -> Iterator[Output]:
+    """Messages that robots act on.
 
     Args:
         silence: time since the newest image was answered, s, where none comes any more; None: it
@@ -222,13 +215,13 @@ def robot_messages(
     if wanted('keep_out') or wanted('keep_out_markers'):
         content = robot.keep_out(parameters.keep_out_probability, silence)
         if wanted('keep_out'):
-            yield Made('keep_out', content.stamp_ns, keep_out_message(MESSAGES, content))
+            yield Output('keep_out', content.stamp_ns, keep_out_message(MESSAGES, content))
         if wanted('keep_out_markers'):
-            yield Made('keep_out_markers', content.stamp_ns, keep_out_markers(MESSAGES, content))
+            yield Output('keep_out_markers', content.stamp_ns, keep_out_markers(MESSAGES, content))
     if silence is None and wanted('pose_forecast'):
         for stamp in robot.due(parameters.forecast_rate, parameters.forecast_horizon):
             forecast = pose_mixture_message(MESSAGES, robot.forecast(stamp))
-            yield Made('pose_forecast', stamp, forecast)
+            yield Output('pose_forecast', stamp, forecast)
 
 
 def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
@@ -320,18 +313,15 @@ def _in_range(probabilities: Mapping[str, float]) -> dict[str, float]:
 def _link_transforms(track: TrackedImage) -> Any:
     """Every link of the URDF in the point estimate, and frames with z up, from the camera."""
     tracker, camera, prefix = track.tracker, track.waiting.frame_id, track.frame_prefix
-    names, rotations, origins = links_of(*_against_camera(tracker))
-    parents = [camera] * len(names)
-    children = [f'{prefix}{name}' for name in names]
-    more = []
+    links = zip(*links_of(*_against_camera(tracker)), strict=True)
+    frames = [(camera, f'{prefix}{name}', *place) for name, *place in links]
     if tracker.estimate.vertical is not None:
-        more.append((camera, f'{prefix}{UPRIGHT}', upright(tracker.estimate.vertical)))
+        frames.append(
+            (camera, f'{prefix}{UPRIGHT}', upright(tracker.estimate.vertical), np.zeros(3))
+        )
     if track.fixed is not None:
-        more.append((track.fixed.name, track.fixed.optical, FROM_OPTICAL))
-    for parent, child, rotation in more:
-        parents, children = [*parents, parent], [*children, child]
-        rotations = np.concatenate([rotations, rotation[None]])
-        origins = np.concatenate([origins, np.zeros((1, 3))])
+        frames.append((track.fixed.name, track.fixed.optical, FROM_OPTICAL, np.zeros(3)))
+    parents, children, rotations, origins = zip(*frames, strict=True)
     stamp = track.waiting.stamp_ns
     return transforms_message(MESSAGES, parents, children, rotations, origins, stamp)
 

@@ -137,20 +137,17 @@ def _report_status(
         )
         log.tell(f'{track} starts from {origin} {at}')
         if isinstance(initial, Subject) and before.status is Status.WAITING:
-            _report_age(log, stamp_ns - initial.stamp_ns)
+            age = stamp_ns - initial.stamp_ns
+            # Warns of a start from joints that were seen long before.
+            if age > _SAME_MOMENT_NS:
+                log.note(
+                    'old start',
+                    f'the joints that start the track were seen {age / SECOND_NS:.1f} s before its '
+                    'first image',
+                )
     if now is Status.LOST:
         log.note(
             'loss of the track',
             f'{track} is lost {at}: {tracker.estimate.reason}; it is searched for',
             warn=True,
-        )
-
-
-def _report_age(log: HandlingLog, age_ns: int) -> None:
-    """Warns of a start from joints that were seen long before."""
-    if age_ns > _SAME_MOMENT_NS:
-        log.note(
-            'old start',
-            f'the joints that start the track were seen {age_ns / SECOND_NS:.1f} s before its '
-            'first image',
         )

@@ -62,13 +62,13 @@ class TrackStart:
     def tracker(
         self,
         camera: Camera,
-        ground: KnownGround | None = None,
+        ground: KnownGround,
         shared: BackgroundModel | None = None,
     ) -> Tracker:
         """A tracker that waits for its first image.
 
         Args:
-            ground: gravity and floor, as far as they are known; None: by the parameters.
+            ground: gravity and floor, as far as they are known.
             shared: background of several people, which is learned elsewhere; None: an own one.
 
         Raises:
@@ -76,14 +76,13 @@ class TrackStart:
         """
         p = self.parameters
         background = self.background_model(camera) if shared is None else shared
-        known = p.known_ground if ground is None else ground
         tracker = Tracker(
             self.body,
             camera,
             p.tracker,
             background,
             p.random_seed,
-            known_ground=known,
+            known_ground=ground,
             shared_background=shared is not None,
         )
         tracker.reset(self.initial, box=self.box)
@@ -95,16 +94,15 @@ class TrackStart:
         Raises:
             ValueError: it was taken by another camera.
         """
-        background, file = BackgroundModel(), self.parameters.background_file
-        if self.background is not None:
-            height, width = self.background.shape[:2]
-            if (width, height) != (camera.width, camera.height):
-                raise ValueError(
-                    f'{file} has {width}x{height} pixels, but the camera gives '
-                    f'{camera.width}x{camera.height}'
-                )
-            background = BackgroundModel.from_image(self.background)
-        return background
+        if self.background is None:
+            return BackgroundModel()
+        height, width = self.background.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise ValueError(
+                f'{self.parameters.background_file} has {width}x{height} pixels, but the camera '
+                f'gives {camera.width}x{camera.height}'
+            )
+        return BackgroundModel.from_image(self.background)
 
 
 def prepare_start(

@@ -20,6 +20,7 @@ from hmt_ros.sessions.camera_session import (
     CAMERA_MOVED,
     IN_BACKGROUND,
     CameraSession,
+    CameraState,
     WaitingImage,
 )
 from hmt_ros.sessions.handled import Output
@@ -42,11 +43,11 @@ from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.warm_up import warm_up_tracking
 from hmt_ros.tracking import PosePrediction, Status
 from msg_tools.messages.bodies import body_of
-from msg_tools.messages.pose_mixtures import PoseMixture, TrackState, pose_mixture_of
+from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_message, pose_mixture_of
 
 
 @dataclass(frozen=True)
-class TrackingState(SessionState):
+class TrackingState(CameraState):
     """State of the filter: its status is 'no camera', or a value of `Status`.
 
     Attributes:
@@ -56,7 +57,6 @@ class TrackingState(SessionState):
         evaluations: of the likelihood in the last image.
         background: its state, in a few words.
         doubted: whether it was learned with the person in it, and is not known again.
-        moved: whether the camera has moved since it was taken.
         track_id: number of the present track, or of the last one; 0 before the first.
         started_from: input that this track began from; '' before the first.
         existence: probability that a person is in view; NaN: no image yet.
@@ -69,7 +69,6 @@ class TrackingState(SessionState):
     evaluations: int = 0
     background: str = 'unknown'
     doubted: bool = False
-    moved: bool = False
     track_id: int = 0
     started_from: str = ''
     existence: float = math.nan
@@ -86,9 +85,8 @@ class TrackingState(SessionState):
         if self.status == Status.LOST.value:
             lost = f'lost: misfit {self.misfit:.2f}, existence {self.existence:.2f}'
             return f'{lost}; {CAMERA_MOVED}' if self.moved else lost
-        if self.moved:
-            return CAMERA_MOVED
-        return f'{IN_BACKGROUND}; {self.background}' if self.doubted else ''
+        learned = f'{IN_BACKGROUND}; {self.background}' if self.doubted else ''
+        return super().trouble() or learned
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -173,12 +171,11 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         with self._shared.answering:
             if answered != self.answered:
                 return []
-            made = (one for track in self.tracks for one in track.stale(silence))
-            return [Output(topic, stamp, message) for topic, stamp, message in made]
+            return [made for track in self.tracks for made in track.stale(silence)]
 
-    def forecast(self, stamp_ns: int) -> PoseMixture:
-        """See `RobotOutputs`; may be called by any thread."""
-        return self.tracks[0].robot.forecast(stamp_ns)
+    def forecast(self, stamp_ns: int) -> Any:
+        """hmt_msgs/PoseMixture at a time, see `RobotOutputs`; may be called by any thread."""
+        return pose_mixture_message(self._messages, self.tracks[0].robot.forecast(stamp_ns))
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
         for kind, text in self.frames.look(waiting.frame_id, waiting.stamp_ns):
@@ -195,10 +192,10 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             self._log.counts['skipped'] += 1
 
     def _jump_back(self, stamp: int) -> None:
-        # Where time begins again, so do the numbers of the tracks.
-        self._keypoints.forget()
-        self._begin()
         super()._jump_back(stamp)
+        # Where time begins again, so do the numbers of the tracks.
+        self._keypoints.chosen.forget()
+        self._begin()
 
     # One person; several override these.
 

@@ -72,30 +72,37 @@ class _Sample(NamedTuple):
         return Transform(rotation_matrix(self.quaternion), self.position)
 
 
-class _Moving:
+class _Frame:
     """Places of a frame.
 
     Attributes:
-        places: stamps, ns, increasing, with the places then.
+        static: place at all times; None: the frame moves.
+        places: of a frame that moves: stamps, ns, increasing, with the places then.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, static: _Sample | None = None) -> None:
+        self.static = static
         self.places: list[tuple[int, _Sample]] = []
+
+    @property
+    def parent(self) -> str:
+        """The newest parent."""
+        newest = self.places[-1][1] if self.static is None else self.static
+        return newest.parent
 
     def put(self, stamp: int, sample: _Sample) -> None:
         if self.places and stamp < self.places[-1][0] - REMEMBERED * SECOND_NS:
             # Time has jumped back.
             self.places.clear()
-        self.places[self._first(stamp) : self._first(stamp + 1)] = [(stamp, sample)]
-        old = self._first(self.places[-1][0] - round(REMEMBERED * SECOND_NS))
+        self.places[self.first(stamp) : self.first(stamp + 1)] = [(stamp, sample)]
+        old = self.first(self.places[-1][0] - round(REMEMBERED * SECOND_NS))
         del self.places[: max(old, len(self.places) - MOST_STAMPS)]
-
-    def forget_after(self, stamp: int) -> None:
-        del self.places[self._first(stamp + 1) :]
 
     def at(self, stamp: int) -> _Sample | None:
         """The place at a time; None: it lies outside of the known ones."""
-        after = self._first(stamp)
+        if self.static is not None:
+            return self.static
+        after = self.first(stamp)
         if after < len(self.places) and self.places[after][0] == stamp:
             return self.places[after][1]
         if after in (0, len(self.places)):
@@ -110,7 +117,7 @@ class _Moving:
             slerp(one.quaternion, other.quaternion, share),
         )
 
-    def _first(self, stamp: int) -> int:
+    def first(self, stamp: int) -> int:
         """Index of the first place that is not older."""
         return bisect_left(self.places, stamp, key=lambda place: place[0])
 
@@ -123,8 +130,7 @@ class TransformBuffer:
     """
 
     def __init__(self) -> None:
-        self._moving: dict[str, _Moving] = {}
-        self._static: dict[str, _Sample] = {}
+        self._frames: dict[str, _Frame] = {}
         self.newest_ns: int | None = None
 
     def put(self, message: Any, *, static: bool) -> list[str]:
@@ -148,17 +154,15 @@ class TransformBuffer:
 
     def forget_after(self, stamp_ns: int) -> None:
         """Forgets places of moving frames after a time, to which time has jumped back."""
-        for child, moving in list(self._moving.items()):
-            moving.forget_after(stamp_ns)
-            if not moving.places:
-                del self._moving[child]
-        self.newest_ns = max((x.places[-1][0] for x in self._moving.values()), default=None)
+        for frame in self._frames.values():
+            del frame.places[frame.first(stamp_ns + 1) :]
+        self._frames = {name: x for name, x in self._frames.items() if x.static or x.places}
+        stamps = (frame.places[-1][0] for frame in self._frames.values() if frame.places)
+        self.newest_ns = max(stamps, default=None)
 
     def frames(self) -> list[str]:
         """Names of all frames, sorted."""
-        parents = {sample.parent for sample in self._static.values()}
-        parents.update(moving.places[-1][1].parent for moving in self._moving.values())
-        return sorted(parents | self._static.keys() | self._moving.keys())
+        return sorted(self._frames.keys() | {frame.parent for frame in self._frames.values()})
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
         """The transform p_target = R p_source + t at a time.
@@ -195,41 +199,36 @@ class TransformBuffer:
         length = math.hypot(*quaternion)
         if abs(length - 1.0) > _NOT_UNIT:
             raise ValueError(f'its quaternion has length {length:.3g}, wanted 1')
-        known = child in self._static or child in self._moving
-        if not known and len(self._static) + len(self._moving) >= MOST_FRAMES:
+        known = self._frames.get(child)
+        if known is None and len(self._frames) >= MOST_FRAMES:
             raise ValueError(f'there are {MOST_FRAMES} frames already')
         sample = _Sample(parent, position, quaternion / length)
         if static:
-            self._moving.pop(child, None)
-            self._static[child] = sample
+            self._frames[child] = _Frame(sample)
             return
+        if known is None or known.static is not None:
+            known = self._frames[child] = _Frame()
         stamp = time_ns(stamped.header.stamp)
-        self._static.pop(child, None)
-        self._moving.setdefault(child, _Moving()).put(stamp, sample)
-        if self.newest_ns is None or stamp > self.newest_ns:
-            self.newest_ns = stamp
+        known.put(stamp, sample)
+        self.newest_ns = max(self.newest_ns or stamp, stamp)
 
     def _to_root(self, frame: str, stamp_ns: int) -> tuple[dict[str, Transform], str]:
         """Transforms from a frame to each frame above it; why there are no more, '' at the root."""
         reached = {frame: Transform(np.eye(3), np.zeros(3))}
         here, total = frame, reached[frame]
-        while True:
-            sample = self._static.get(here)
+        while (known := self._frames.get(here)) is not None:
+            sample = known.at(stamp_ns)
             if sample is None:
-                moving = self._moving.get(here)
-                if moving is None:
-                    return reached, ''
-                sample = moving.at(stamp_ns)
-                if sample is None:
-                    first, last = moving.places[0][0], moving.places[-1][0]
-                    return reached, (
-                        f'{here!r} has transforms of {first} to {last} ns, wanted {stamp_ns} ns'
-                    )
+                first, last = known.places[0][0], known.places[-1][0]
+                return reached, (
+                    f'{here!r} has transforms of {first} to {last} ns, wanted {stamp_ns} ns'
+                )
             if sample.parent in reached:
                 return reached, f'the frames {_listed([*reached, sample.parent])} form a loop'
             total = sample.transform().after(total)
             here = sample.parent
             reached[here] = total
+        return reached, ''
 
 
 def rotation_matrix(quaternion: Array) -> Array:
@@ -254,8 +253,7 @@ def slerp(start: Array, end: Array, share: float) -> Array:
     else:
         angle = np.arccos(cosine)
         between = np.sin((1 - share) * angle) * start + np.sin(share * angle) * end
-    result: Array = between / np.linalg.norm(between)
-    return result
+    return between / np.linalg.norm(between)
 
 
 def _name(frame: Any) -> str:

@@ -9,12 +9,12 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.keep_out import keep_out_capsules
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.person_shape import covered
 from hmt_ros.image.terms.depth import usable_depths
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
@@ -28,7 +28,7 @@ IMAGES, RATE, DISTANCE = 5, 10.0, 3.5
 
 
 class Film(NamedTuple):
-    """Somebody of rods before a grey wall, and a camera that stands still.
+    """Somebody before a grey wall, and a camera that stands still.
 
     Attributes:
         body, camera: the person, and the camera that sees the person.
@@ -53,21 +53,14 @@ class Film(NamedTuple):
 
 @lru_cache(maxsize=1)
 def film() -> Film:
-    """The film, of 240 x 180 px: the renderer would take longer than all that is to be prepared."""
+    """The film, of 240 x 180 px, drawn of hulls: a renderer would take longer than all the rest."""
     body, camera = load_body('human37'), Camera(220.0, 220.0, 119.5, 89.5, 240, 180)
     empty = np.random.default_rng(0).integers(120, 140, (180, 240, 3), dtype=np.uint8)
     poses = np.tile(body.prior_mean, (IMAGES, 1)) + 0.02 * np.arange(IMAGES)[:, None]
     poses[:, 2] = DISTANCE
-    images, masks = [], []
-    for joints in camera.project(body.joint_positions(poses)):
-        points = np.rint(joints).astype(int).tolist()
-        mask = np.zeros(empty.shape[:2], np.uint8)
-        for start, end in body.skeleton.bones:
-            cv2.line(mask, points[start], points[end], 1, thickness=10)
-        image = empty.copy()
-        image[mask > 0] = (40, 60, 80)
-        images.append(image)
-        masks.append(mask > 0)
+    masks = [covered(body, camera, pose) for pose in poses]
+    clothes = np.array((40, 60, 80), np.uint8)
+    images = [np.where(mask[:, :, None], clothes, empty) for mask in masks]
     return Film(body, camera, empty, poses, images, masks)
 
 

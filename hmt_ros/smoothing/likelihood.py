@@ -1,14 +1,14 @@
 """Likelihoods of observations for a smoother: -log p(r_t | x_t), its gradient and its curvature.
 
-The mixtures that a filter made, `MixtureLikelihood`, or the images themselves, `ImageSequence`, or
-any other `EnergyTerm` whose rows are times (VMS 5).
+The mixtures that a filter made, `MixtureLikelihood`, or any other `EnergyTerm` whose rows are
+times, such as the images themselves (VMS 5).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -21,11 +21,6 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
 from hmt_ros.inference.exact_sums import dot
 from hmt_ros.inference.reduction import merged_if_close
-
-if TYPE_CHECKING:
-    from hmt_ros.image.likelihood import ImageLikelihood
-    from hmt_ros.image.observation import Observation
-
 
 # Modes whose density is below exp(-60) of the greatest are left out: less than rounding.
 NEGLIGIBLE = 60.0
@@ -188,36 +183,6 @@ class WindowLikelihood:
             value[at], gradient[at, :d] = found.value, found.gradient
             if hessian is not None:
                 hessian[at, :d, :d] = found.hessian
-        return Energy(value, gradient, hessian)
-
-
-@dataclass(frozen=True, eq=False)
-class ImageSequence:
-    """p(r_t | x_t) of the images themselves, the likelihood that the tracker minimises.
-
-    Attributes:
-        likelihood: the terms and the soft prior.
-        observations: of the T images.
-    """
-
-    likelihood: ImageLikelihood
-    observations: Sequence[Observation]
-
-    @property
-    def times(self) -> int:
-        """T."""
-        return len(self.observations)
-
-    def energy(
-        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        """See `EnergyTerm`; the rows are times, the Hessian is that of Gauss-Newton."""
-        n, d = x.shape
-        value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
-        for t in np.unique(rows):
-            at = rows == t
-            found = self.likelihood.given(self.observations[t]).energy(x[at])
-            value[at], gradient[at], hessian[at] = found.value, *found.derivatives()
         return Energy(value, gradient, hessian)
 
 

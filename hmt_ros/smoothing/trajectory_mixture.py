@@ -191,8 +191,11 @@ class TrajectoryMixture:
         """Expected poses, (T, d)."""
         return np.asarray(np.einsum('m,mtd->td', self.weights, self.means))
 
-    def message_content(self) -> dict[str, Any]:
+    def message_content(self, *, covariances: bool = True) -> dict[str, Any]:
         """Content of a message besides names and frame (`msg_tools.messages`).
+
+        Args:
+            covariances: whether they are part of it; else they are not computed.
 
         Raises:
             ValueError: the stamps are not known.
@@ -203,7 +206,7 @@ class TrajectoryMixture:
         return {
             'weights': self.weights,
             'means': self.means,
-            'marginal_covariances': self.marginal_covariances,
+            'marginal_covariances': self.marginal_covariances if covariances else None,
             'log_joint': self.log_joint,
             'inflation': self.inflation,
             'stamps_ns': self.stamps_ns,

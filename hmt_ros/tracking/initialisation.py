@@ -296,7 +296,8 @@ def _fit_with_lengths(
     length_precision = np.asarray(np.linalg.inv(body.length_covariance), dtype=np.float64)
     leaning, lean = body, None
     if upright is not None:
-        leaning, lean = without_root_lean(body), upright.term(body)
+        leaning = without_root_lean(body)
+        lean = PoseEnergy(ImageLikelihood(body, camera), (upright.term(body),))
     prior_precision = leaning.prior_sigma**-2.0
     default = skeleton.lengths
 
@@ -334,20 +335,16 @@ def _fit_with_lengths(
             gradient[i] = np.concatenate([error, pull]) @ jacobian
             curvature = np.concatenate([np.ones(len(error)), curvature])
             hessian[i] = (jacobian * curvature[:, None]).T @ jacobian
-            if lean is not None:
-                of_lean = lean.energy(frames, rows[i : i + 1])
-                slope, curvature = of_lean.derivatives()
-                value[i] += of_lean.value[0]
-                gradient[i, :d] += slope[0]
-                hessian[i, :d, :d] += curvature[0]
-        angles = of_angles.energy(poses, rows)
-        slope, curvature = angles.derivatives()
+        for own_term in (lean, of_angles):
+            if own_term is not None:
+                found = own_term.energy(poses, rows)
+                slope, curvature = found.derivatives()
+                value += found.value
+                gradient[:, :d] += slope
+                hessian[:, :d, :d] += curvature
         change = lengths - default
-        value += angles.value
         value += 0.5 * np.einsum('nl,lm,nm->n', change, length_precision, change)
-        gradient[:, :d] += slope
         gradient[:, d:] += change @ length_precision
-        hessian[:, :d, :d] += curvature
         hessian[:, d:, d:] += length_precision
         return value, gradient, hessian
 

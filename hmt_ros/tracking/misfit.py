@@ -20,8 +20,9 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.joint_depths import moved_to_depth
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, ObservedImage
 from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.depth import DEPTH
@@ -132,7 +133,8 @@ def outline_costs(
         return np.empty((len(poses), 0))
     likelihood = ImageLikelihood(body, camera, LikelihoodSettings.of_terms(coverage=term))
     seen = observe(np.zeros((*foreground.shape, 3), np.uint8), foreground, wanted=('coverage',))
-    return likelihood.energies(forward(body.skeleton, poses), seen, derivatives=False).costs
+    image = PoseEnergy(likelihood, (ObservedImage(likelihood, seen),))
+    return image.by_cue(poses, derivatives=False).outline_costs
 
 
 def of_keypoints(term: KeypointTerm, poses: Array) -> Misfit:
@@ -155,9 +157,10 @@ def of_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap) -> Arra
     """Share of the visible surface (N,) that poses (N, d) have elsewhere than depths show it."""
     likelihood = ImageLikelihood(body, camera, LikelihoodSettings.of_terms(depth=DEPTH.settings))
     seen = Observation(evidence={DEPTH.name: depths})
-    found = likelihood.energies(forward(body.skeleton, poses), seen, derivatives=False)
+    image = PoseEnergy(likelihood, (ObservedImage(likelihood, seen),))
     s = DEPTH.settings
-    result: Array = found.terms[DEPTH.name] / (0.5 * s.weight * s.scale**2)
+    found = image.by_cue(poses, derivatives=False).energy.value
+    result: Array = found / (0.5 * s.weight * s.scale**2)
     return result
 
 

@@ -132,7 +132,7 @@ class Posterior:
         return PoseEnergy(self.likelihood, terms, counted=self.spent.append)
 
     @property
-    def known(self) -> tuple[FrameTerm, ...]:
+    def known(self) -> tuple[FrameTerm | GroundTerm, ...]:
         """Terms besides those of image and body: those that were added, gravity and floor."""
         if self.ground is None:
             return self.extra

@@ -17,7 +17,6 @@ from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.pose_energy import PoseEnergy
-from hmt_ros.image.surface import lens_of
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.energy import Quadratic
@@ -134,11 +133,10 @@ def follow_flow(
         observation: of the image.
         posterior: of the body.
     """
-    s, body = posterior.settings, posterior.body
+    s = posterior.settings
     if observation.flow is None or points is None:
         return predicted
-    lens = lens_of(posterior.camera)
-    flow = FlowTerm(body.skeleton, lens, points, observation.flow, s.flow_weight)
+    flow = FlowTerm(points, observation.flow, float(s.flow_weight))
     term = PoseEnergy(
         posterior.likelihood,
         (flow, posterior.likelihood.pose_prior),

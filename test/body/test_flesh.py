@@ -1,14 +1,12 @@
 """Superquadric flesh: surface, normals, contours and mesh against their definitions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
 from hmt_ros.body.flesh import Flesh, Superquadric
 from hmt_ros.body.kinematics import Frames, forward
-from test.oracles.numpy_contour import occluding_contour
+from test.oracles.numpy_contour import occluding_contour, surface
 
 HUMAN = load_body('human37')
 
@@ -27,11 +25,11 @@ PARTS = {
 
 
 @pytest.fixture(params=PARTS)
-def part(request) -> Superquadric:
+def part(request):
     return PARTS[request.param]
 
 
-def implicit(part: Superquadric, points: np.ndarray) -> np.ndarray:
+def implicit(part, points):
     """Inside-outside function of points (..., 3): 1 on the surface, less inside."""
     s = (part.centre[2] - points[..., 2]) / part.radii[2]
     e1, e2 = part.exponents
@@ -43,7 +41,7 @@ def implicit(part: Superquadric, points: np.ndarray) -> np.ndarray:
     return total ** (e2 / e1) + np.abs(s) ** (2 / e1)
 
 
-def looks(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def looks(n, seed):
     """Rotations (n, 3, 3) and places (n, 3) of a segment before the camera."""
     rng = np.random.default_rng(seed)
     q, r = np.linalg.qr(rng.normal(size=(n, 3, 3)))
@@ -55,7 +53,7 @@ def looks(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return q, places
 
 
-def frames_of(rotations: np.ndarray, places: np.ndarray) -> Frames:
+def frames_of(rotations, places):
     columns = rotations.transpose(2, 1, 0)[None]  # (1, axis, coordinate, n)
     empty = np.empty((0, 3, len(places)))
     return Frames(HUMAN.skeleton, empty, columns, places.T[None], empty, empty)
@@ -64,7 +62,7 @@ def frames_of(rotations: np.ndarray, places: np.ndarray) -> Frames:
 def test_surface_points_satisfy_the_implicit_equation(part):
     rng = np.random.default_rng(0)
     s, w = rng.uniform(-0.99, 0.99, 500), rng.uniform(-np.pi, np.pi, 500)
-    point, normal = part.surface(s, w)
+    point, normal = surface(part, s, w)
     np.testing.assert_allclose(implicit(part, point), 1.0, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
     assert (implicit(part, point + 1e-4 * normal) > 1).all()
@@ -78,7 +76,7 @@ def test_contour_equals_a_search_over_all_angles(part):
     rings = np.sin(np.linspace(-0.42, 0.42, 5) * np.pi)
     w = np.linspace(-np.pi, np.pi, 7201)
     for ring, s in enumerate(rings):
-        local, normal = part.surface(np.full(len(w), s), w)
+        local, normal = surface(part, np.full(len(w), s), w)
         for n in range(len(places)):
             point = local @ rotations[n].T + places[n]
             facing = (normal @ rotations[n].T * point).sum(1)

@@ -1,7 +1,5 @@
 """Gravity and floor as energies of poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +20,7 @@ from hmt_ros.body.ground_terms import (
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_angles, root_rotations
 from hmt_ros.inference.energy import Derivatives
+from test.oracles.single_terms import energy_of
 
 TERMS = ('upright', 'floor')
 UP = np.array([0.1, -0.95, -0.25]) / np.linalg.norm([0.1, -0.95, -0.25])
@@ -29,7 +28,7 @@ PLANE = FloorPlane(UP, 0.01, 0.8, 0.02)
 LEVEL = np.array([0.0, -1.0, 0.0])
 
 
-def only(name: str) -> GroundSettings:
+def only(name):
     off = {f'{term}_weight': 0.0 for term in TERMS}
     return GroundSettings(**{**off, f'{name}_weight': 1.0})
 
@@ -40,7 +39,7 @@ def body():
 
 
 @pytest.fixture(scope='module')
-def poses(body) -> np.ndarray:
+def poses(body):
     """(12, d) some that lean, stand badly, and have feet below the floor."""
     rng = np.random.default_rng(0)
     sigma = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.0)
@@ -51,14 +50,14 @@ def poses(body) -> np.ndarray:
 
 
 @pytest.fixture(scope='module')
-def standing(body) -> np.ndarray:
+def standing(body):
     """(1, d) upright, both feet on the floor below a level camera."""
     pose = np.zeros((1, body.dimension))
     pose[0, 2] = 3.0
     return pose
 
 
-def level_plane(body, pose: np.ndarray) -> FloorPlane:
+def level_plane(body, pose):
     """The floor under the soles of a pose (1, d), before a level camera."""
     feet = soles(body)
     points = forward(body.skeleton, pose).points(feet.segments, feet.local)[..., 0]
@@ -67,14 +66,14 @@ def level_plane(body, pose: np.ndarray) -> FloorPlane:
 
 @pytest.mark.parametrize('name', TERMS)
 def test_derivatives_are_those_of_finite_differences(name, body, poses):
-    term, rows = GroundTerm(body, only(name), PLANE), np.arange(len(poses))
+    term = GroundTerm(body, only(name), PLANE)
 
-    def value(x: np.ndarray) -> np.ndarray:
-        found = term.energy(forward(body.skeleton, x), rows, derivatives=Derivatives.NONE)
+    def value(x):
+        found = energy_of(term, body, x, derivatives=Derivatives.NONE)
         assert found.gradient is None
         return found.value
 
-    energy = term.energy(forward(body.skeleton, poses), rows)
+    energy = energy_of(term, body, poses)
     assert energy.value == pytest.approx(value(poses))
     assert (energy.value > 0.1).sum() >= len(poses) // 2
     step, numeric = 1e-6, np.empty_like(poses)
@@ -93,20 +92,20 @@ def test_a_camera_that_turns_with_the_vertical_changes_nothing(name, body, poses
     turned[:, :3] = poses[:, :3] @ turn.T
     which = body.skeleton.dof_index(('root_z', 'root_y', 'root_x'))
     turned[:, which] = root_angles(body, turn @ root_rotations(body, poses))
-    rows = np.arange(len(poses))
     before = GroundTerm(body, only(name), PLANE)
     after = GroundTerm(body, only(name), replace(PLANE, up=turn @ UP))
-    assert after.energy(forward(body.skeleton, turned), rows).value == pytest.approx(
-        before.energy(forward(body.skeleton, poses), rows).value
+    assert energy_of(after, body, turned).value == pytest.approx(
+        energy_of(before, body, poses).value
     )
 
 
 def test_who_stands_on_both_feet_costs_nothing_but_the_lean(body, standing):
-    term = GroundTerm(body, GroundSettings(), level_plane(body, standing))
-    parts = term.parts(forward(body.skeleton, standing))
-    assert list(parts) == list(TERMS)
-    assert parts['upright'] > 0
-    assert parts['floor'] == pytest.approx(0.0, abs=1e-9)
+    plane = level_plane(body, standing)
+    upright, floor = (energy_of(GroundTerm(body, only(x), plane), body, standing) for x in TERMS)
+    both = energy_of(GroundTerm(body, GroundSettings(), plane), body, standing)
+    assert upright.value > 0
+    assert floor.value == pytest.approx(0.0, abs=1e-9)
+    assert both.value == pytest.approx(upright.value + floor.value)
 
 
 @pytest.mark.parametrize('name', ['human32', 'human34', 'human37'])
@@ -118,7 +117,7 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
     term = GroundTerm(body, only('upright'), FloorPlane(LEVEL, 0.0, None, np.inf))
     bends = bool(skeleton.segment_dofs[trunk])
 
-    def leaning(pelvis: np.ndarray, spine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def leaning(pelvis, spine):
         """Cost and lean of the trunk (N,), of leans of the pelvis and angles of the spine."""
         poses = np.zeros((len(pelvis), body.dimension))
         poses[:, 2] = 3.0
@@ -128,7 +127,7 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
         frames = forward(skeleton, poses)
         axis = frames.joints()[neck] - frames.origins[trunk]
         # The person at rest faces the camera: forwards is -z.
-        cost = term.energy(frames, np.zeros(len(poses), dtype=np.intp)).value
+        cost = energy_of(term, body, poses).value
         return cost, np.arctan2(-axis[2], -axis[1])
 
     # Two degrees apart over all leans, then ever closer around the best.

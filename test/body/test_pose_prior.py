@@ -9,15 +9,14 @@ from scipy.stats import multivariate_normal
 
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.angle_mixture import AngleMixture, read_pose_prior, shipped_prior
-from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import mirror
-from hmt_ros.body.pose_prior import MixturePrior, pose_prior
-from hmt_ros.body.pose_terms import AnglePrior
+from hmt_ros.body.pose_prior import AnglePrior, MixturePrior, pose_prior, prior_energies
 from hmt_ros.experts.model_file import write_arrays
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction
 from hmt_ros.inference.mixture import GaussianMixture
+from test.oracles.single_terms import energy_of
 
 HUMAN = load_body('human37')
 ARMS = tuple(
@@ -47,8 +46,10 @@ def poses(count: int, seed: int = 1, body: Body = HUMAN) -> np.ndarray:
 
 
 def energy(prior, x, derivatives=Derivatives.POSITIVE):
-    frames = forward(prior.body.skeleton, x)
-    return prior.energy(frames, np.arange(len(x)), derivatives=derivatives)
+    found = energy_of(prior, prior.body, x, derivatives=derivatives)
+    if derivatives == Derivatives.POSITIVE:
+        assert all(map(np.array_equal, found, prior_energies(prior, x)))
+    return found
 
 
 def plain_log_density(mixture: AngleMixture, x: np.ndarray) -> np.ndarray:

@@ -17,11 +17,12 @@ from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
 from hmt_ros.image.terms.depth import (
     ASIDE,
     DEPTH,
-    FEWEST,
     JUMP,
     LEAST_COSINE,
     usable_depths,
 )
+from hmt_ros.image.terms.residuals import FEWEST
+from test.oracles.single_terms import image_energy
 
 ALONE = LikelihoodSettings.of_terms(depth=DEPTH.settings)
 
@@ -45,10 +46,6 @@ def likelihood(shot):
 
 def seen(shot, depth, **more):
     return observe(shot.images[1], shot.masks[1], depth=depth, **more)
-
-
-def energies(likelihood, poses, observation, **more):
-    return likelihood.energies(forward(likelihood.body.skeleton, poses), observation, **more)
 
 
 # A plain numpy twin, one pose and one point at a time.
@@ -138,10 +135,10 @@ def test_the_kernel_equals_numpy(shot, sensed, distortion):
     camera = Camera(c.fx, c.fy, c.cx, c.cy, c.width, c.height, distortion)
     likelihood = ImageLikelihood(shot.body, camera, ALONE)
     poses = np.concatenate([shot.near(5, 1), shot.near(3, 2, spread=0.5)])
-    found = energies(likelihood, poses, seen(shot, sensed)).value
+    found = image_energy(likelihood, poses, seen(shot, sensed)).value
     # Beyond the window that evidence is taken from nothing is known.
     whole = observe(shot.images[1], depth=sensed)
-    found = energies(likelihood, poses, whole).value
+    found = image_energy(likelihood, poses, whole).value
     depth = usable_depths(sensed)
     wanted = [oracle_energy(shot.body, camera, DEPTH.settings, depth, pose) for pose in poses]
     assert np.allclose(found, wanted, rtol=1e-9)
@@ -152,7 +149,7 @@ def test_gradient_at_material_points(shot, sensed, likelihood):
     """The gradient is that of points which stay on the skin, with their deviations."""
     poses, step = shot.near(2, 7), 1e-6
     depth = usable_depths(sensed)
-    found = energies(likelihood, poses, observe(shot.images[1], depth=sensed)).gradient
+    found = image_energy(likelihood, poses, observe(shot.images[1], depth=sensed)).gradient
     for pose, gradient in zip(poses, found):
         held = oracle_points(shot.body, shot.camera, DEPTH.settings, depth, pose)
         wanted = np.empty(len(pose))
@@ -167,7 +164,7 @@ def test_gradient_at_material_points(shot, sensed, likelihood):
 
 
 def test_the_hessian_is_positive_semidefinite(shot, sensed, likelihood):
-    found = energies(likelihood, shot.near(6, 5, spread=0.3), seen(shot, sensed)).hessian
+    found = image_energy(likelihood, shot.near(6, 5, spread=0.3), seen(shot, sensed)).hessian
     assert np.allclose(found, found.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(found).min() > -1e-8 * np.abs(found).max()
 
@@ -182,7 +179,7 @@ def test_the_noise_grows_with_the_square_of_the_distance(shot, true_depth):
         settings = replace(ALONE, depth=replace(DEPTH.settings, growth=growth))
         likelihood = ImageLikelihood(shot.body, shot.camera, settings)
         depth = np.where(np.isfinite(true_depth), true_depth + 0.05, 0.0)
-        costs.append(energies(likelihood, shot.poses[1:], seen(shot, depth)).value[0])
+        costs.append(image_energy(likelihood, shot.poses[1:], seen(shot, depth)).value[0])
     z = shot.poses[1, 2]
     assert costs[0] > costs[1] > costs[2]
     # At growth 0.02 the deviation is 0.2 m, which is all that counts; the rest is what is cut off.
@@ -193,10 +190,12 @@ def test_the_noise_grows_with_the_square_of_the_distance(shot, true_depth):
 def test_other_surfaces_cost_at_most_what_the_kernel_allows(shot, sensed, likelihood, other):
     """A pose that is hidden, or before an empty place, is not pulled there."""
     depth = np.full_like(sensed, other)
-    found = energies(likelihood, shot.poses[1:], seen(shot, depth))
+    found = image_energy(likelihood, shot.poses[1:], seen(shot, depth))
     most = 0.5 * DEPTH.settings.weight * DEPTH.settings.scale**2
     assert 0.9 * most < found.value[0] <= most
-    right = energies(likelihood, shot.poses[1:] + 0.05 * (np.arange(37) == 2), seen(shot, sensed))
+    right = image_energy(
+        likelihood, shot.poses[1:] + 0.05 * (np.arange(37) == 2), seen(shot, sensed)
+    )
     assert np.abs(found.gradient).max() < 0.05 * np.abs(right.gradient).max()
 
 
@@ -211,7 +210,7 @@ def test_depth_tells_which_way_a_forearm_points(shot, true_depth, likelihood):
     away[names.index('left_shoulder_x')] = -0.6
     seen_depth = render(body, towards, camera, Scene(seed=1)).depth
     observation = observe(shot.images[1], depth=np.where(np.isfinite(seen_depth), seen_depth, 5.0))
-    value = energies(likelihood, np.stack([towards, away]), observation).value
+    value = image_energy(likelihood, np.stack([towards, away]), observation).value
     assert value[1] - value[0] > 5.0
 
 

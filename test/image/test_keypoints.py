@@ -13,6 +13,8 @@ from hmt_ros.body.skeleton import other_side
 from hmt_ros.experts.lifter import lifted_positions
 from hmt_ros.image.keypoint_schemes import schemes, usual_exchanges
 from hmt_ros.image.terms.keypoints import KEYPOINTS, Keypoints, KeypointTerm
+from hmt_ros.inference.energy import Derivatives
+from test.oracles.single_terms import energy_of
 
 CAMERA = Camera(600.0, 600.0, 320.0, 240.0, 640, 480)
 BODY = load_body('human37')
@@ -58,6 +60,10 @@ def exchanged(keypoints, words):
     return replace(keypoints, names=names, offsets=keypoints.offsets * (-1, 1, 1))
 
 
+def energy(one, poses, rows=EVERYONE, **more):
+    return energy_of(one, BODY, poses, rows, camera=CAMERA, **more)
+
+
 def term(keypoints, *, exchanges=True):
     log_prior = usual_exchanges() if exchanges else None
     return KeypointTerm(BODY.skeleton, CAMERA, keypoints, KEYPOINTS, 150.0, log_prior)
@@ -71,9 +77,9 @@ def test_derivatives(pose, exchanges):
 
     def value(poses):
         rows = np.zeros(len(poses), dtype=np.intp)
-        return one.energy(forward(BODY.skeleton, poses), rows, derivatives=False).value
+        return energy(one, poses, rows, derivatives=Derivatives.NONE).value
 
-    found = one.energy(forward(BODY.skeleton, x[None]), EVERYONE)
+    found = energy(one, x)
     step = 1e-6 * np.eye(BODY.dimension)
     numerical = (value(x + step) - value(x - step)) / 2e-6
     np.testing.assert_allclose(found.gradient[0], numerical, rtol=1e-5, atol=1e-4)
@@ -98,17 +104,13 @@ def test_exchanged_sides_are_recognised(pose, words, kind):
 
 
 def test_an_exchange_costs_its_prior_and_no_more(pose):
-    frames = forward(BODY.skeleton, pose[None])
     plain = seen(pose, lifted=False)
     words = ('shoulder', 'elbow', 'wrist', 'hand', 'hip', 'knee', 'ankle', 'toe')
-    cost = (
-        term(exchanged(plain, words)).energy(frames, EVERYONE).value
-        - term(plain).energy(frames, EVERYONE).value
-    )
+    cost = energy(term(exchanged(plain, words)), pose).value - energy(term(plain), pose).value
     usual = usual_exchanges()[0]
     assert cost == pytest.approx(usual[NONE] - usual[ALL], abs=1.0)
     # Believed, they would cost more than any prior.
-    assert term(exchanged(plain, words), exchanges=False).energy(frames, EVERYONE).value > 50.0
+    assert energy(term(exchanged(plain, words), exchanges=False), pose).value > 50.0
 
 
 def test_lifted_poses_tell_towards_from_away(pose):
@@ -116,9 +118,8 @@ def test_lifted_poses_tell_towards_from_away(pose):
     elbow = BODY.dof_names.index('right_elbow')
     other = pose.copy()
     other[elbow] += 0.6
-    frames = forward(BODY.skeleton, np.stack([pose, other]))
-    rows = np.zeros(2, dtype=np.intp)
-    flat, lifted = (term(seen(pose, lifted=x)).energy(frames, rows).value for x in (False, True))
+    both, rows = np.stack([pose, other]), np.zeros(2, dtype=np.intp)
+    flat, lifted = (energy(term(seen(pose, lifted=x)), both, rows).value for x in (False, True))
     assert lifted[1] - lifted[0] > flat[1] - flat[0]
 
 
@@ -129,5 +130,5 @@ def test_residuals_have_the_derivatives_of_the_energy(pose):
     joints, _, directions, pull, curvature = one.residuals(frames)
     assert len(joints) == 2 * len(one.keypoints.names)
     # A translation of the whole person moves all landmarks alike.
-    np.testing.assert_allclose(directions.T @ pull, one.energy(frames, EVERYONE).gradient[0, :3])
+    np.testing.assert_allclose(directions.T @ pull, energy(one, pose).gradient[0, :3])
     assert (curvature > 0).all()

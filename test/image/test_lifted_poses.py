@@ -5,7 +5,6 @@ import pytest
 from scipy.special import logsumexp
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.kinematics import forward
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths
 from hmt_ros.image.terms.keypoints import (
@@ -15,6 +14,7 @@ from hmt_ros.image.terms.keypoints import (
     Keypoints,
     KeypointTerm,
 )
+from test.oracles.single_terms import energy_of
 
 JOINTS = (
     'neck', 'head', 'left_shoulder', 'right_shoulder', 'left_elbow', 'right_elbow', 'left_wrist',
@@ -51,8 +51,11 @@ def term(poses, exchanges):
 
 
 def energy(poses, x, exchanges):
-    frames = forward(BODY.skeleton, x[None])
-    return float(term(poses, exchanges).energy(frames, np.zeros(1, np.intp)).value[0])
+    return float(energies(poses, x, exchanges).value[0])
+
+
+def energies(poses, x, exchanges):
+    return energy_of(term(poses, exchanges), BODY, x, camera=CAMERA)
 
 
 def density(poses, x):
@@ -77,8 +80,7 @@ def test_energy_is_the_log_density_of_depths():
 @pytest.mark.parametrize('exchanges', [NOT_EXCHANGED, usual_exchanges()])
 def test_gradient(exchanges):
     poses, x = lifted(), pose()
-    found = term(poses, exchanges).energy(forward(BODY.skeleton, x[None]), np.zeros(1, np.intp))
-    gradient, hessian = found.derivatives()
+    gradient, hessian = energies(poses, x, exchanges).derivatives()
     numeric = np.array(
         [
             (energy(poses, x + d, exchanges) - energy(poses, x - d, exchanges)) / (2 * STEP)
@@ -104,16 +106,10 @@ def test_hessian_of_one_component_is_that_of_squares():
         JOINTS, one.log_weights, relative[None], sure.deviations, one.axes,
         bone_lengths(BODY.skeleton, JOINTS),
     )  # fmt: skip
-    rows = np.zeros(1, np.intp)
-    hessian = (
-        term(at, NOT_EXCHANGED).energy(forward(BODY.skeleton, x[None]), rows).derivatives()[1][0]
-    )
+    hessian = energies(at, x, NOT_EXCHANGED).derivatives()[1][0]
     step, numeric = 1e-5, []
     for d in step * np.eye(len(x)):
-        up, down = (
-            term(at, NOT_EXCHANGED).energy(forward(BODY.skeleton, (x + s * d)[None]), rows)
-            for s in (1, -1)
-        )
+        up, down = (energies(at, x + s * d, NOT_EXCHANGED) for s in (1, -1))
         numeric.append((up.derivatives()[0][0] - down.derivatives()[0][0]) / (2 * step))
     assert np.allclose(hessian, numeric, atol=2e-3 * np.abs(hessian).max())
 

@@ -7,15 +7,17 @@ import pytest
 
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import directed_derivatives, forward
-from hmt_ros.body.pose_terms import AnglePrior
-from hmt_ros.image.likelihood import OFF, ImageLikelihood
+from hmt_ros.body.pose_prior import AnglePrior
+from hmt_ros.image.likelihood import OFF, ImageLikelihood, ObservedImage
 from hmt_ros.image.observation import observe
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.surface import COVER, HIDDEN
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
 from hmt_ros.inference.energy import Derivatives
 from test.oracles import numpy_likelihood as oracle
 from test.oracles.numpy_contour import occluding_contour
+from test.oracles.single_terms import OneByOne, energy_of, image_energy
 
 IMAGE_TERMS = ('coverage', 'edges')
 MAGNIFICATION = 100.0  # px/m
@@ -51,11 +53,6 @@ def only(likelihood, *names):
     return replace(likelihood, settings=replace(likelihood.settings, **terms))
 
 
-def evaluate(likelihood, poses, observation, **more):
-    frames = forward(likelihood.body.skeleton, poses)
-    return likelihood.energies(frames, observation, **more)
-
-
 def relative_difference(found, wanted):
     """The largest, relative to the largest entry of each pose."""
     axes = tuple(range(1, found.ndim))
@@ -70,14 +67,13 @@ def largest_difference(body, camera, poses, observation):
     assert tuple(wanted) == IMAGE_TERMS
     differences = []
     for name, energy in wanted.items():
-        found = evaluate(only(likelihood, name), poses, observation)
-        assert list(found.terms) == [name]
+        found = image_energy(only(likelihood, name), poses, observation)
         differences += [
             relative_difference(found.value, energy.value),
             relative_difference(found.gradient, energy.gradient),
             relative_difference(found.hessian, energy.hessian),
         ]
-    together = evaluate(only(likelihood, *IMAGE_TERMS), poses, observation)
+    together = image_energy(only(likelihood, *IMAGE_TERMS), poses, observation)
     differences += [
         relative_difference(together.value, sum(e.value for e in wanted.values())),
         relative_difference(together.hessian, sum(e.hessian for e in wanted.values())),
@@ -161,17 +157,17 @@ def test_gradients_of_contour_terms_at_material_points(shot, observation, name):
             return oracle.coverage(held, observation.outline, term, sigma).value
         return oracle.edges(held, observation.evidence[name], term, sigma).value
 
-    found = likelihood.energies(frames, observation).gradient
+    found = image_energy(likelihood, poses, observation).gradient
     errors = relative_errors(found, numerical_gradient(value, poses))
     assert np.quantile(errors, 0.99) < 1e-6
     assert errors.max() < 1e-3
 
 
 def test_gradient_and_hessian_of_the_soft_prior(shot):
-    prior, rows = AnglePrior(shot.body).quadratic, np.arange(5)
+    prior = AnglePrior(shot.body)
     poses = shot.near(5, 10, spread=0.4)
-    value, gradient, hessian = prior.energy(poses, rows)
-    wanted = numerical_gradient(lambda x: prior.energy(x, rows).value, poses)
+    value, gradient, hessian = energy_of(prior, shot.body, poses)
+    wanted = numerical_gradient(lambda x: energy_of(prior, shot.body, x).value, poses)
     assert np.allclose(gradient, wanted, atol=1e-6)
     known = np.isfinite(shot.body.prior_sigma)
     offset = (poses - shot.body.prior_mean)[:, known] / shot.body.prior_sigma[known]
@@ -205,7 +201,7 @@ def test_listed_residuals_sum_to_gradient_and_hessian(shot, observation, names):
             frames, listed[:, 0].astype(int), listed[:, 1:4], listed[:, 4:7],
             listed[:, 7], listed[:, 8],
         )  # fmt: skip
-        wanted = likelihood.energies(frames, observation)
+        wanted = image_energy(likelihood, frames.poses, observation)
         assert np.allclose(gradient, wanted.gradient[0], rtol=1e-9, atol=1e-9)
         assert np.allclose(hessian, wanted.hessian[0], rtol=1e-9, atol=1e-9)
 
@@ -228,7 +224,7 @@ def test_listed_residuals_of_keypoints_sum_to_gradient_and_hessian(shot):
         assert np.array_equal(recorded[1 : 1 + len(rows)], rows)
         segments = shot.body.skeleton.joint_segments[joints]
         gradient, hessian = summed(frames, segments, *found)
-        wanted = term.energy(frames, np.arange(1))
+        wanted = energy_of(term, shot.body, frames.poses, camera=shot.camera)
         assert np.allclose(gradient, wanted.gradient[0], rtol=1e-9, atol=1e-7)
         assert np.allclose(hessian, wanted.hessian[0], rtol=1e-9, atol=1e-7)
 
@@ -275,8 +271,7 @@ def test_the_number_of_threads_does_not_matter(shot, observation):
     results = []
     for count in (1, 2, 3):
         likelihood = ImageLikelihood(shot.body, shot.camera, threads=count)
-        found = evaluate(likelihood, poses, observation)
-        results.append((found.value, found.gradient, found.hessian, found.costs))
+        results.append(image_energy(likelihood, poses, observation))
     for other in results[1:]:
         assert all(np.array_equal(a, b) for a, b in zip(results[0], other))
 
@@ -284,20 +279,19 @@ def test_the_number_of_threads_does_not_matter(shot, observation):
 def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(shot, observation):
     poses = shot.near(9, 14)
     likelihood = ImageLikelihood(shot.body, shot.camera)
-    together = likelihood.given(observation).energy(poses)
+    terms = OneByOne(likelihood, (*likelihood.seen(observation), *likelihood.priors))
+    together = terms.energy(poses)
     for n in (0, 4, 8):
-        alone = likelihood.given(observation).energy(poses[n : n + 1])
+        alone = terms.energy(poses[n : n + 1])
         for a, b in zip(together, alone):
             assert relative_difference(a[n : n + 1], b) <= 1e-12
 
 
 def test_the_truth_is_better_than_its_neighbours(shot, observation):
     likelihood = ImageLikelihood(shot.body, shot.camera)
-    near, truth = shot.near(40, 17, spread=0.15), shot.poses[1:]
-    frames = forward(shot.body.skeleton, np.concatenate([truth, near]))
-    found = likelihood.energies(frames, observation, derivatives=False)
-    terms = {name: found.terms[name] for name in IMAGE_TERMS}
-    terms['keypoints'] = keypoint_energy(shot, observation.keypoints, frames.poses).value
+    poses = np.concatenate([shot.poses[1:], shot.near(40, 17, spread=0.15)])
+    terms = {x: image_energy(only(likelihood, x), poses, observation).value for x in IMAGE_TERMS}
+    terms['keypoints'] = keypoint_energy(shot, observation.keypoints, poses).value
     for name, value in terms.items():
         assert np.mean(value[1:] > value[0]) > 0.95, name
 
@@ -305,14 +299,20 @@ def test_the_truth_is_better_than_its_neighbours(shot, observation):
 def test_what_others_explain_costs_no_more_than_that(shot, observation):
     likelihood = only(ImageLikelihood(shot.body, shot.camera), 'coverage')
     poses = shot.near(4, 18)
-    free = evaluate(likelihood, poses, observation)
-    assert np.allclose(free.costs.sum(1), free.value)
-    limit = np.random.default_rng(0).uniform(0, 2 * free.costs.mean(), free.costs.shape)
+
+    def found(explained):
+        image = ObservedImage(likelihood, observation, explained)
+        return PoseEnergy(likelihood, (image,)).by_cue(poses)
+
+    free = found(None)
+    costs = free.outline_costs
+    assert np.allclose(costs.sum(1), free.energy.value)
+    limit = np.random.default_rng(0).uniform(0, 2 * costs.mean(), costs.shape)
     for explained in (limit, limit[:1]):
-        found = evaluate(likelihood, poses, observation, explained=explained)
-        assert np.allclose(found.costs, np.minimum(free.costs, explained))
-        assert np.allclose(found.value, found.costs.sum(1))
-    nothing = evaluate(likelihood, poses, observation, explained=np.zeros_like(limit))
+        some = found(explained)
+        assert np.allclose(some.outline_costs, np.minimum(costs, explained))
+        assert np.allclose(some.energy.value, some.outline_costs.sum(1))
+    nothing = found(np.zeros_like(limit)).energy
     assert not nothing.value.any()
     assert not nothing.hessian.any()
 
@@ -321,8 +321,7 @@ def keypoint_energy(shot, keypoints, poses, settings=None, derivatives=Derivativ
     term = KeypointTerm(
         shot.body.skeleton, shot.camera, keypoints, settings or TermSettings(1.0, 1.0, 5.0)
     )
-    frames = forward(shot.body.skeleton, poses)
-    return term.energy(frames, np.arange(len(poses)), derivatives=derivatives)
+    return energy_of(term, shot.body, poses, camera=shot.camera, derivatives=derivatives)
 
 
 def test_keypoints_are_least_squares_with_their_covariances(shot):

@@ -11,10 +11,10 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.image.observation import observe
 from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import lens_of
 from hmt_ros.image.surface_points import seen_points
 from hmt_ros.inference.energy import Derivatives
 from test.oracles import numpy_likelihood as oracle
+from test.oracles.single_terms import energy_of
 
 WEIGHT = 5.0
 LENSES = {
@@ -27,7 +27,7 @@ LENSES = {
 def term_of(shot, camera, flow, poses):
     frames = forward(shot.body.skeleton, poses)
     points = seen_points(shot.body, camera, frames)
-    return FlowTerm(shot.body.skeleton, lens_of(camera), points, flow, WEIGHT)
+    return FlowTerm(points, flow, WEIGHT)
 
 
 @pytest.fixture(scope='module')
@@ -65,11 +65,11 @@ def test_energies_equal_numpy(shot, flow, before, lens, spread):
     poses, rows = shot.near(24, 1, spread=spread), np.arange(24) % 3
     poses[:4, 2] -= 3.0
     frames = forward(shot.body.skeleton, poses)
-    found = term.energy(frames, rows)
+    found = energy_of(term, shot.body, poses, rows, camera=camera)
     wanted = oracle.flow_energy(frames, camera, term.points, rows, flow, WEIGHT)
     for a, b in zip(found, wanted):
         assert relative_difference(a, b) <= 1e-9
-    values = term.energy(frames, rows, derivatives=Derivatives.NONE)
+    values = energy_of(term, shot.body, poses, rows, camera=camera, derivatives=Derivatives.NONE)
     assert np.array_equal(values.value, found.value)
     assert values.gradient is None
 
@@ -79,10 +79,9 @@ def test_the_gradient_is_that_of_the_energy(shot, flow, before):
     poses, rows, step = shot.near(8, 6), np.zeros(8, dtype=np.intp), 1e-6
 
     def value(x):
-        frames = forward(shot.body.skeleton, x)
-        return term.energy(frames, rows, derivatives=Derivatives.NONE).value
+        return energy_of(term, shot.body, x, rows, camera=shot.camera).value
 
-    found = term.energy(forward(shot.body.skeleton, poses), rows).gradient
+    found = energy_of(term, shot.body, poses, rows, camera=shot.camera).gradient
     wanted = np.empty_like(poses)
     for j, shift in enumerate(step * np.eye(poses.shape[1])):
         wanted[:, j] = (value(poses + shift) - value(poses - shift)) / (2 * step)
@@ -98,10 +97,9 @@ def test_where_the_points_went_costs_nothing(shot, before):
     shift = shot.camera.fx * 0.05 / pose[0, 2]
     flow = np.zeros((2, shot.camera.height, shot.camera.width), np.float32)
     flow[0] = shift
-    term = FlowTerm(term.skeleton, term.lens, term.points, ImageMap(flow), WEIGHT)
-    rows = np.zeros(1, dtype=np.intp)
+    term = FlowTerm(term.points, ImageMap(flow), WEIGHT)
     there, stayed = (
-        term.energy(forward(shot.body.skeleton, x), rows).value[0] for x in (moved, pose)
+        energy_of(term, shot.body, x, camera=shot.camera).value[0] for x in (moved, pose)
     )
     assert there < 0.05 * stayed
 

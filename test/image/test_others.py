@@ -9,10 +9,11 @@ from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.renderer import render, render_people
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.kinematics import forward
 from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import observe
+from hmt_ros.image.terms.registry import TERMS
+from test.oracles.single_terms import image_energy
 
 VIEW = Viewpoint(distance=3.2)
 SCENE = Scene(viewpoint=VIEW, seed=2)
@@ -39,11 +40,14 @@ def seen(human32, camera, pose):
 
 
 def energies(human32, camera, poses, image, mask, others):
-    likelihood = ImageLikelihood(human32, camera)
+    """By name of the term."""
     silhouette = mask if others is None else mask & ~others
     observation = observe(image, silhouette, others=others)
-    frames = forward(human32.skeleton, poses)
-    return likelihood.energies(frames, observation, derivatives=False)
+    alone = {x.name: LikelihoodSettings.of_terms(**{x.name: x.settings}) for x in TERMS}
+    return {
+        name: image_energy(ImageLikelihood(human32, camera, settings), poses, observation).value
+        for name, settings in alone.items()
+    }
 
 
 def test_nothing_changes_where_others_change(human32, camera, pose, seen):
@@ -58,16 +62,16 @@ def test_nothing_changes_where_others_change(human32, camera, pose, seen):
         # Blurs and edges reach a little over the border of what is unknown.
         inner = cv2.erode(others.astype(np.uint8), np.ones((41, 41), np.uint8)) > 0
         other[inner] = fill
-        found.append(energies(human32, camera, poses, other, mask, others).terms['edges'])
+        found.append(energies(human32, camera, poses, other, mask, others)['edges'])
     np.testing.assert_allclose(*found, rtol=1e-6)
     assert np.ptp(found[0]) > 0.1
 
 
 def test_half_a_silhouette_does_not_punish_the_other_half(human32, camera, pose, seen):
     image, mask, others = seen
-    known = energies(human32, camera, pose[None], image, mask & ~others, None).terms
-    unknown = energies(human32, camera, pose[None], image, mask, others).terms
-    whole = energies(human32, camera, pose[None], image, mask, None).terms
+    known = energies(human32, camera, pose[None], image, mask & ~others, None)
+    unknown = energies(human32, camera, pose[None], image, mask, others)
+    whole = energies(human32, camera, pose[None], image, mask, None)
     # The cut through the person is no outline.
     assert unknown['coverage'] - whole['coverage'] < 0.2 * (known['coverage'] - whole['coverage'])
 

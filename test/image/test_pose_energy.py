@@ -14,18 +14,17 @@ from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.pose_terms import Posed
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import observe
 from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import lens_of
 from hmt_ros.image.surface_points import seen_points
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, Sum
 from test.inference.restricted import Restricted
+from test.oracles.single_terms import OneByOne
 
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
 SOLVER = {'step_scale': 0.3, 'damping': 1.0, 'tolerance': 0.02}
@@ -72,7 +71,7 @@ def terms(body, seen):
     samples = len(seen[0].outline.pixels)
     before = seen[1] + 0.02 * rng.normal(size=(COUNT, body.dimension))
     flow = FlowTerm(
-        body.skeleton, lens_of(CAMERA), seen_points(body, CAMERA, forward(body.skeleton, before)),
+        seen_points(body, CAMERA, forward(body.skeleton, before)),
         ImageMap(rng.normal(0.0, 3.0, (2, 240, 320)).astype(np.float32)), 5.0,
     )  # fmt: skip
     explained = np.full((1, samples), 0.2)
@@ -112,7 +111,7 @@ def motion_of(poses, kind, f):
 
 
 def plain(likelihood, terms, motion, point=None, free=None):
-    posed = Posed(likelihood.body.skeleton, terms)
+    posed = OneByOne(likelihood, terms)
     if point is not None:
         posed = Restricted(posed, point, free)
     return posed if motion is None else Sum((posed, motion))
@@ -151,12 +150,9 @@ def test_energies_by_cue_are_those_of_the_terms(terms, poses, strange):
     found = own.by_cue(poses)
     for cue, some in enumerate(([image], [keypoints], known)):
         wanted = plain(likelihood, tuple(some), None).energy(poses, np.arange(COUNT))
-        cues = (found.values[:, cue], found.gradients[:, cue], found.hessians[:, cue])
-        check_same(cues, wanted)
+        check_same((found.values[:, cue], found.hessians[:, cue]), (wanted.value, wanted.hessian))
     check_same(found.energy, own.energy(poses))
-    costs = likelihood.energies(
-        forward(likelihood.body.skeleton, poses), image.observation, derivatives=False
-    ).costs
+    costs = PoseEnergy(likelihood, (image,)).by_cue(poses, derivatives=False).outline_costs
     assert np.array_equal(found.outline_costs, costs)
     values = own.by_cue(poses, derivatives=False)
     np.testing.assert_allclose(values.values, found.values, rtol=1e-12)

@@ -13,7 +13,6 @@ from hmt_ros.nodes.estimating_thread import (
     Arrived,
     EstimatingThreads,
     Estimator,
-    InnerFaults,
     InputQueue,
     Waiting,
     received,
@@ -97,8 +96,7 @@ class Busy:
     def serve(self, name, place, *, later=False):
         return Estimator(
             self.session(name), self.threads.later if later else self.threads.poses, place=place,
-            tell=lambda handled: None, tell_change=lambda: None, inner_faults=InnerFaults(),
-            log_error=pytest.fail,
+            tell=lambda handled: None, tell_change=lambda: None, tell_error=pytest.fail,
         )  # fmt: skip
 
     def until(self, *turns):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.body.flesh import Flesh, signed_power
+from hmt_ros.body.flesh import Flesh, Superquadric, signed_power, surfaces
 from hmt_ros.body.kinematics import Frames
 
 Array = NDArray[np.float64]
@@ -122,3 +122,9 @@ def _bracketed_angles(
             high, at_high = w, at
         roots.append(w)
     return np.stack(roots), exists
+
+
+def surface(part: Superquadric, s: Array, w: Array) -> tuple[Array, Array]:
+    """Points and normals (R, 3) of a part at heights s (R,) and angles w (R,)."""
+    points, normals = surfaces((part,), s, w)
+    return points[0], normals[0]

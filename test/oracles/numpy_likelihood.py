@@ -21,8 +21,8 @@ from hmt_ros.image.optical_flow import SCALE, SHARE, SIGMA
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
 from hmt_ros.image.surface_points import FACING, SurfacePoints, coarse_mesh
-from hmt_ros.image.terms.edges import FEWEST
 from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.residuals import FEWEST
 from hmt_ros.image.terms.silhouette import SPACING, TURN, Outline
 from test.oracles.numpy_contour import occluding_contour
 

@@ -13,7 +13,8 @@ import pytest
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
-from hmt_ros.sessions import bme_session, camera_session, track_start
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
+from hmt_ros.sessions import bme_session, camera_session, smoother_session, track_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import Ground
@@ -388,6 +389,12 @@ class Likelihoods:
             error_share=errors.independent, error_time=errors.time,
         )  # fmt: skip
         return pose_mixture_message(self.messages, content)
+
+
+@pytest.fixture(scope='session')
+def random_walk():
+    """A motion prior of bodies whose poses walk randomly at their rates in the smoother."""
+    return lambda body: LinearGaussianDynamics.random_walk(body.rates / smoother_session.LIVELINESS)
 
 
 @pytest.fixture(scope='session')

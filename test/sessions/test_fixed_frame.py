@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.body import load_body
 from hmt_ros.body.mirror import root_rotations
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions import smoother_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
-from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
@@ -214,20 +215,19 @@ def test_no_track_starts_from_a_mixture_in_the_fixed_frame(session, small_camera
     assert prepare_start(one.parameters, mixture).initial is not None
 
 
-def test_the_smoother_smooths_a_person_before_a_camera_that_moves(outputs):
+def test_the_smoother_smooths_a_person_before_a_camera_that_moves(
+    outputs, monkeypatch, random_walk
+):
     """Who stands still in the room stands still, behind the origin of odom, too."""
+    monkeypatch.setattr(smoother_session, 'motion_prior', random_walk)
+    monkeypatch.setattr(smoother_session, 'MAX_TRAJECTORIES', 1)
     body = load_body('human37')
     stands = np.tile(body.prior_mean, (1, 1))
     stands[:, 2], stands[:, 3] = -2.0, 2.0
     rng = np.random.default_rng(0)
     speeds = {}
     for in_room in (True, False):
-        one = SmootherSession(
-            SmootherParameters(
-                dynamics=SmootherDynamics(model='random_walk'), fixed_lag=0.3, max_trajectories=1
-            ),
-            outputs.append,
-        )
+        one = SmootherSession(SmootherParameters(fixed_lag=0.3), outputs.append)
         outputs.clear()
         for index in range(8):
             fixed = FixedFrame('odom', camera_at(index))

@@ -123,13 +123,12 @@ def test_an_input_of_no_image_is_told(small_camera):
     for stamp in (1, 2, 3):
         given.put('mask', small_camera.mask(0), stamp, MASK_INPUT.read)
         given.put('detections', None, stamp, lambda message, stamp: ['somebody'])
-    assert given.take(MASK_INPUT, 3, image, dropped={2}).answered
+    assert given.take(MASK_INPUT, 3, image, dropped={2}) is not None
     assert log.faults == {'mask without an image': 1}
     assert log.last_fault.startswith('mask of 1 ns belongs to no image, or comes too late')
     given.take(DETECTIONS_INPUT, 2, image, dropped=())
     assert log.last_fault.startswith('detections of 1 ns belong to no image, or come too late')
-    taken = given.take(DETECTIONS_INPUT, 5, image, dropped={3})
-    assert taken == (None, False)
+    assert given.take(DETECTIONS_INPUT, 5, image, dropped={3}) is None
     assert log.last_fault == 'no detections have come for the image of 5 ns'
     with pytest.raises(KeyError):
         given.put('tail', None, 1, MASK_INPUT.read)

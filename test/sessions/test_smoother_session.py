@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from hmt_ros.body.camera import roll
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.sessions import smoother_session
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.session import FINISH
 from hmt_ros.sessions.smoothed_messages import TOPICS
-from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.track_messages import links_of
 from msg_tools.messages.cdr import deserialise
@@ -22,17 +24,19 @@ INDEPENDENT, UNKNOWN = CueErrors(1.0, 0.0), CueErrors(np.nan, np.nan)
 WINDOW = ['trajectory_mixture', 'trajectory_markers']
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 
-RANDOM_WALK = SmootherDynamics(model='random_walk')
-# Settings that are no parameters of the node.
-OF_PROGRAMS = ('max_trajectories', 'longest_interval')
+# Constants of the session that tests change.
+CONSTANTS = ('max_trajectories', 'longest_interval')
 
 
 @pytest.fixture
-def session(outputs):
-    def make(wanted=lambda topic: True, dynamics=RANDOM_WALK, **values):
+def session(outputs, monkeypatch, random_walk):
+    def make(wanted=lambda topic: True, prior=random_walk, **values):
         values.setdefault('fixed_lag', SECONDS)
-        own = {name: values.pop(name) for name in OF_PROGRAMS if name in values}
-        parameters = with_values(SmootherParameters(dynamics=dynamics, **own), values)
+        monkeypatch.setattr(smoother_session, 'motion_prior', prior)
+        for name in CONSTANTS:
+            if name in values:
+                monkeypatch.setattr(smoother_session, name.upper(), values.pop(name))
+        parameters = with_values(SmootherParameters(), values)
         return SmootherSession(parameters, outputs.append, wanted)
 
     return make
@@ -186,7 +190,7 @@ def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihood
 
 def test_a_camera_that_jumps(session, outputs, likelihoods):
     """From one image to the next everybody is 2 m farther and turned: so are smoothed poses."""
-    body, one = likelihoods.body, session(fixed_lag=0.5, dynamics=SmootherDynamics())
+    body, one = likelihoods.body, session(fixed_lag=0.5, prior=motion_prior)
     yaw = body.dof_names.index('root_z')
     for index in range(24):
         mixture = likelihoods.mixture(index)
@@ -243,7 +247,7 @@ def test_an_unknown_shape_is_added_once(session, outputs, likelihoods):
 def test_a_motion_passes_over_an_image_that_is_all_wrong(session, outputs, likelihoods):
     """Its modes show somebody who faces the other way."""
     yaw = likelihoods.body.dof_names.index('root_z')
-    one = session(fixed_lag=1.5, dynamics=SmootherDynamics())
+    one = session(fixed_lag=1.5, prior=motion_prior)
     for index in range(30):
         mixture = likelihoods.mixture(index)
         means = mixture.means.copy()
@@ -336,9 +340,8 @@ def test_transforms_are_the_links_of_the_heaviest_pose(session, outputs, likelih
     assert len(read(outputs, '/tf')) == 4
 
 
-@pytest.mark.parametrize('model', ['constant_velocity', 'learned'])
-def test_motion_models_with_velocities(model, session, outputs, likelihoods):
-    one = session(dynamics=SmootherDynamics(model=model))
+def test_poses_have_the_motion_prior_of_the_body(session, outputs, likelihoods):
+    one = session(prior=motion_prior)
     for index in range(4):
         assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
     assert len(smoothed(outputs)) == 2
@@ -553,7 +556,7 @@ def test_a_camera_on_its_side_is_smoothed_as_an_upright_one(session, outputs, li
     found, trajectories = [], []
     for one in (likelihoods.body, body):
         outputs.clear()
-        made = session(dynamics=SmootherDynamics(model='learned'))
+        made = session(prior=motion_prior)
         for index in range(8):
             mixture = likelihoods.mixture(index)
             turn = np.where(np.arange(37) == 3, 0.1, 0.0)  # nobody faces the camera exactly

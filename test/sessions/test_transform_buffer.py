@@ -94,7 +94,7 @@ def test_memory_is_bounded(buffer, monkeypatch):
     monkeypatch.setattr(transform_buffer, 'MOST_FRAMES', 3)
 
     def kept(frame):
-        return len(buffer._moving[frame].places)
+        return len(buffer._frames[frame].places)
 
     for k in range(200):
         buffer.put(message('world', 'camera', stamp=START + k * SECOND // 10), static=False)

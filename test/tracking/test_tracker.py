@@ -1,16 +1,19 @@
 """The tracker on short motions whose poses are known: joints as keypoints, and rendered images."""
 
+from __future__ import annotations
+
 from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hmt_ros.body.kinematics import forward
+from hmt_ros.body import Body
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.bounded_newton import resting
@@ -34,7 +37,7 @@ OFF = GroundSettings(0.0, 0.0)
 FRAME = 100_000_000  # ns
 
 
-def keypoint_settings(**values):
+def keypoint_settings(**values) -> TrackerSettings:
     return TrackerSettings(
         **{
             'candidates': 8,
@@ -48,17 +51,17 @@ def keypoint_settings(**values):
 
 
 @pytest.fixture(scope='module')
-def black(camera):
+def black(camera) -> np.ndarray:
     return np.zeros((camera.height, camera.width, 3), np.uint8)
 
 
 @pytest.fixture(scope='module')
-def subject(human32, motion, keypoints_of):
+def subject(human32, motion, keypoints_of) -> Subject:
     return Subject(0, keypoints_of(human32, motion[0]), dict(human32.segment_lengths))
 
 
 @pytest.fixture
-def mixture(motion):
+def mixture(motion) -> GaussianMixture:
     """A start around the first pose: the truth, and another that is 60 cm away."""
     means = np.stack([motion[0], motion[0]])
     means[1, 0] += 0.6
@@ -68,7 +71,7 @@ def mixture(motion):
 
 
 @pytest.fixture(scope='module')
-def begun(human32, camera, black, motion, keypoints_of, subject):
+def begun(human32, camera, black, motion, keypoints_of, subject) -> tuple[Body, GaussianMixture]:
     """The person's body and the poses at the first image, from the subject."""
     tracker = Tracker(human32, camera, keypoint_settings())
     tracker.reset(subject)
@@ -80,7 +83,7 @@ def begun(human32, camera, black, motion, keypoints_of, subject):
 def started(begun, camera):
     """Function (seed, tracker settings) -> a tracker that starts from there."""
 
-    def make(seed=0, **values):
+    def make(seed=0, **values) -> Tracker:
         body, posterior = begun
         tracker = Tracker(body, camera, keypoint_settings(**values), seed=seed)
         tracker.reset(posterior)
@@ -157,8 +160,9 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     keypoints = keypoints_of(human32, motion[3], 1.0, 3)
     posterior, likelihood = tracker.step(black, 3 * FRAME, keypoints)
     seen = Observation(keypoints=keypoints, beliefs=validity.beliefs)
-    likelihood_of = ImageLikelihood(tracker.estimate.body, camera, ONLY_KEYPOINTS).given(seen)
-    energy = likelihood_of.energy(posterior.means)
+    of_keypoints = ImageLikelihood(tracker.estimate.body, camera, ONLY_KEYPOINTS)
+    terms = (*of_keypoints.seen(seen), *of_keypoints.priors)
+    energy = PoseEnergy(of_keypoints, terms).energy(posterior.means)
     gradient, hessian = energy.derivatives()
     free = ~resting(posterior.means, gradient, human32.lower, human32.upper)
     volumes = np.sqrt(np.linalg.det(1e3 * free_covariances(hessian, free)))
@@ -180,9 +184,8 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     assert np.linalg.eigvalsh(unknown).min() > -1e-9
     assert np.diagonal(unknown)[:3].argmax() == 2
     # Its log at the means is that of the image, without the prior of the body.
-    frames = forward(tracker.estimate.body.skeleton, likelihood.means)
-    term = ImageLikelihood(tracker.estimate.body, camera, ONLY_KEYPOINTS).keypoint_term(seen, None)
-    values = term.energy(frames, np.arange(len(likelihood))).value
+    term = of_keypoints.keypoint_term(seen, None)
+    values = PoseEnergy(of_keypoints, (term,)).energy(likelihood.means).value
     assert len(likelihood) > 1
     assert np.allclose(tracker.estimate.likelihood.values, -values, rtol=1e-9)
 
@@ -348,7 +351,7 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert abs(places[found][2] - other[2]) < 0.4
 
 
-def predicted(body, pose):
+def predicted(body, pose) -> PosePrediction:
     """What a regression may say of a pose: near it, or its back to the front."""
     means = np.stack([pose, pose])
     means[0, 6:] += 0.05
@@ -514,7 +517,7 @@ def test_images_alone(film, human32, camera, keypoints_of):
 class KnownHeight:
     """A term that only knows how high above the floor the root is."""
 
-    def __init__(self, height):
+    def __init__(self, height: float) -> None:
         self.height = height
 
     def energy(self, frames, rows, *, derivatives=Derivatives.POSITIVE):

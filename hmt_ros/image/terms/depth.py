@@ -23,7 +23,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import mark_visibility, project, signed_power
+from hmt_ros.image.surface import (
+    mark_visibility,
+    project,
+    ring_deviation,
+    ring_point,
+    ring_seen,
+)
 from hmt_ros.image.terms.image_term import (
     ImageTerm,
     ImageWindow,
@@ -31,7 +37,7 @@ from hmt_ros.image.terms.image_term import (
     TermSettings,
     Weighting,
 )
-from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
+from hmt_ros.image.terms.residuals import add_residual, geman_mcclure, weight_of_each
 
 # Depths that sensors measure, m; nearer and further ones are no evidence.
 NEAREST, FURTHEST = 0.2, 20.0
@@ -42,8 +48,6 @@ COS, SIN = float(np.cos(ASIDE)), float(np.sin(ASIDE))
 LEAST_COSINE = 0.3
 # Neighbouring depths that differ by more, as a share of the depth, lie on two surfaces.
 JUMP = 0.03
-# Fewer visible points than this do not make each of them count more.
-FEWEST = 20
 
 
 class DepthInputs(NamedTuple):
@@ -121,19 +125,10 @@ def trace_front(flesh, wanted, lens, columns, origins, parts, points, cosines, n
     for r in range(rings):
         part = ring_parts[r]
         s = part_segments[part]
-        x0, x1, x2 = columns[s, 0, 0], columns[s, 0, 1], columns[s, 0, 2]
-        y0, y1, y2 = columns[s, 1, 0], columns[s, 1, 1], columns[s, 1, 2]
-        z0, z1, z2 = columns[s, 2, 0], columns[s, 2, 1], columns[s, 2, 2]
-        o0, o1, o2 = origins[s, 0], origins[s, 1], origins[s, 2]
-        cx, cy, cz = ring_centres[r, 0], ring_centres[r, 1], ring_centres[r, 2]
-        ux = x0 * o0 + x1 * o1 + x2 * o2 + cx
-        uy = y0 * o0 + y1 * o1 + y2 * o2 + cy
-        uz = z0 * o0 + z1 * o1 + z2 * o2 + cz
-        rx, ry = ring_radii[r, 0], ring_radii[r, 1]
-        kx, ky = ring_slopes[r, 0], ring_slopes[r, 1]
-        lx, ly = ring_leans[r, 0], ring_leans[r, 1]
+        ux, uy, uz = ring_seen(r, s, ring_centres, columns, origins)
         e = ring_exponents[r]
-        fx, fy = -(ux - uz * lx) / rx, -(uy - uz * ly) / ry
+        fx = -(ux - uz * ring_leans[r, 0]) / ring_radii[r, 0]
+        fy = -(uy - uz * ring_leans[r, 1]) / ring_radii[r, 1]
         size = max(np.sqrt(fx * fx + fy * fy), 1e-12)
         fx, fy = fx / size, fy / size
         for side in range(2):
@@ -144,24 +139,13 @@ def trace_front(flesh, wanted, lens, columns, origins, parts, points, cosines, n
                 continue
             turn = -SIN if side == 0 else SIN
             c, sn = fx * COS - fy * turn, fy * COS + fx * turn
-            outline_x, outline_y, lateral_x, lateral_y = c, sn, c, sn
-            if e != 1.0:
-                outline_x, outline_y = signed_power(c, e), signed_power(sn, e)
-                lateral_x, lateral_y = signed_power(c, 2.0 - e), signed_power(sn, 2.0 - e)
-            px, py = cx + rx * outline_x, cy + ry * outline_y
-            nx, ny = lateral_x / rx, lateral_y / ry
-            nz = -(kx * c * c + ky * sn * sn) - (nx * lx + ny * ly)
-            p0 = o0 + x0 * px + y0 * py + z0 * cz
-            p1 = o1 + x1 * px + y1 * py + z1 * cz
-            p2 = o2 + x2 * px + y2 * py + z2 * cz
+            p0, p1, p2, n0, n1, n2 = ring_point(
+                r, s, c, sn, ring_centres, ring_radii, ring_slopes, ring_leans, e, columns, origins
+            )
             points[i, 0], points[i, 1], points[i, 2] = p0, p1, p2
-            n0 = x0 * nx + y0 * ny + z0 * nz
-            n1 = x1 * nx + y1 * ny + z1 * nz
-            n2 = x2 * nx + y2 * ny + z2 * nz
             sizes = np.sqrt((n0 * n0 + n1 * n1 + n2 * n2) * (p0 * p0 + p1 * p1 + p2 * p2))
             cosines[i] = -(n0 * p0 + n1 * p1 + n2 * p2) / max(sizes, 1e-12)
-            across, ahead = c * ring_noise[r, 0], sn * ring_noise[r, 1]
-            noise[i] = np.sqrt(across * across + ahead * ahead)
+            noise[i] = ring_deviation(r, c, sn, ring_noise)
             valid[i] = cosines[i] > LEAST_COSINE
 
 
@@ -194,12 +178,7 @@ def add_depth(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
     mark_visibility(
         flesh, view.occluders, view.columns, view.origins, parts, points, valid, covered, hidden
     )
-    visible = view.contour_points * 5 // 10
-    if visible == 0:
-        for i in range(count):
-            if valid[i] and not hidden[i]:
-                visible += 1
-    each = term.weight / max(visible, FEWEST)
+    each = weight_of_each(term.weight, view.contour_points * 5 // 10, valid, hidden)
     unknown, _, _ = geman_mcclure(1.0, term.scale, each)
     energy = 0.0
     for i in range(count):

@@ -23,7 +23,12 @@ from hmt_ros.image.terms.image_term import (
     TermSettings,
     Weighting,
 )
-from hmt_ros.image.terms.residuals import add_contour_residual, contour_sigma, geman_mcclure
+from hmt_ros.image.terms.residuals import (
+    add_contour_residual,
+    contour_sigma,
+    geman_mcclure,
+    weight_of_each,
+)
 
 ORIENTATIONS = 4
 HALF_BIN = np.tan(np.pi / 8.0)
@@ -40,8 +45,6 @@ _DISC = np.array(
 )
 # Distance to an edge that is assumed where somebody else hides the edges, px.
 HIDDEN = 2.0
-# Fewer visible points than this do not make each of them count more.
-FEWEST = 20
 
 
 class EdgeInputs(NamedTuple):
@@ -112,12 +115,8 @@ def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
         contour.projections,
     )
     normals, valid, hidden, noise = contour.normals, contour.valid, contour.hidden, contour.noise
-    owners, count = view.owners, view.contour_points * 6 // 10
-    if count == 0:
-        for i in range(len(parts)):
-            if valid[i] and not hidden[i]:
-                count += 1
-    each = term.weight / max(count, FEWEST)
+    owners = view.owners
+    each = weight_of_each(term.weight, view.contour_points * 6 // 10, valid, hidden)
     energy = 0.0
     for i in range(len(parts)):
         if not valid[i] or hidden[i]:

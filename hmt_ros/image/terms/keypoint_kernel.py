@@ -107,6 +107,13 @@ def point_residual(  # type: ignore[no-untyped-def]
     return project(lens, place[0], place[1], place[2], 0, pixels, projections)
 
 
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def whitened_error(whiteners, seen, k, i, pixels):  # type: ignore[no-untyped-def]
+    """Component i of the error of keypoint k whose landmark is at a pixel."""
+    across = whiteners[k, i, 0] * (pixels[0, 0] - seen[k, 0])
+    return across + whiteners[k, i, 1] * (pixels[0, 1] - seen[k, 1])
+
+
 @njit(cache=True, nogil=True, error_model='numpy')
 def group_energies(points, lens, scale, columns, origins, result):  # type: ignore[no-untyped-def]
     """Energies (G, 2) of the groups at one pose, as they are called and exchanged."""
@@ -119,26 +126,22 @@ def group_energies(points, lens, scale, columns, origins, result):  # type: igno
                 segments, offsets, k, e, lens, columns, origins, pixels, projections, place
             )
             for i in range(2):
-                residual = BEHIND
-                if shown:
-                    residual = whiteners[k, i, 0] * (pixels[0, 0] - seen[k, 0])
-                    residual += whiteners[k, i, 1] * (pixels[0, 1] - seen[k, 1])
+                residual = whitened_error(whiteners, seen, k, i, pixels) if shown else BEHIND
                 result[groups[k], e] += geman_mcclure(residual, scale, 1.0)[0]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def lifted_energies(lifted, columns, origins, behind, places, shares, result):  # type: ignore[no-untyped-def]
+def lifted_energies(lifted, columns, origins, room, result):  # type: ignore[no-untyped-def]
     """Minus the log densities of the mixture at one pose, as the sides are called and exchanged.
 
     Args:
         lifted: the mixture.
         columns, origins: frames of the pose.
-        behind: (J,) becomes how far the joints are behind the middle of the hips.
-        places: (1 + J, 3) become the middle of the hips and the joints.
-        shares: (2, C) become the posterior probabilities of the components.
+        room: `LiftedRoom`, filled.
         result: (2,).
     """
     segments, offsets, ray = lifted.segments, lifted.offsets, lifted.ray
+    behind, places, shares = room
     for i in range(3):
         places[0, i] = origins[0, i]
         for j in range(3):
@@ -170,7 +173,7 @@ def lifted_energies(lifted, columns, origins, behind, places, shares, result):  
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def add_lifted(  # type: ignore[no-untyped-def]
-    lifted, tree, readings, behind, places, shares, axes, dof_origins, gradient, hessian
+    lifted, tree, readings, room, axes, dof_origins, gradient, hessian
 ):
     """Adds the derivatives of the mixture at one pose.
 
@@ -180,10 +183,11 @@ def add_lifted(  # type: ignore[no-untyped-def]
     Args:
         lifted, tree: the mixture, and the skeleton.
         readings: (2,) probabilities of the readings.
-        behind, places, shares: of `lifted_energies`.
+        room: of `lifted_energies`.
         axes, dof_origins: (d, 3) of the degrees of freedom.
         gradient, hessian: (d,), (d, d) results.
     """
+    behind, places, shares = room
     own_axes, own_origins = axes.copy(), dof_origins.copy()
     for j in range(len(axes)):
         if tree.dof_segments[j] == 0:
@@ -220,19 +224,45 @@ def add_lifted(  # type: ignore[no-untyped-def]
     assemble_pose(tree, own_axes, own_origins, wrenches, stiffnesses, gradient, hessian)
 
 
+class LiftedRoom(NamedTuple):
+    """Room for `lifted_energies` of one pose.
+
+    Attributes:
+        behind: (J,) how far the joints are behind the middle of the hips.
+        places: (1 + J, 3) the middle of the hips and the joints.
+        shares: (2, C) posterior probabilities of the components.
+    """
+
+    behind: Array
+    places: Array
+    shares: Array
+
+
+@njit(cache=True, nogil=True)
+def _lifted_room(lifted):  # type: ignore[no-untyped-def]
+    joints = len(lifted.segments)
+    return LiftedRoom(
+        np.empty(joints), np.empty((1 + joints, 3)), np.empty((2, len(lifted.log_weights)))
+    )
+
+
 @njit(cache=True, nogil=True, error_model='numpy')
-def exchange_log_posterior(energies, lifted, weights, exchanged, readings, log_prior, result):  # type: ignore[no-untyped-def]
-    """Log probabilities (E,) of exchanges; returns minus the log of their sum before.
+def weigh_exchanges(inputs, log_prior, columns, origins, room, result):  # type: ignore[no-untyped-def]
+    """Log probabilities (E,) of exchanges at one pose; returns minus the log of their sum before.
 
     Args:
-        energies: (G, 2) of the groups, as they are called and exchanged, of weight 1.
-        lifted: (2,) of the whole pose, as it is called and exchanged.
-        weights: (G,) factors on the energies.
-        exchanged: (E, G) 1 where an exchange exchanges a group.
-        readings: (E,) 1 where it exchanges the whole pose.
-        log_prior: (E,).
+        inputs: of the keypoints.
+        log_prior: (E,) of the exchanges.
+        columns, origins: frames of the pose.
+        room: `LiftedRoom`.
         result: (E,).
     """
+    weights, exchanged, readings = inputs.weights, inputs.exchanged, inputs.lifted.readings
+    energies, lifted = np.empty((exchanged.shape[1], 2)), np.zeros(2)
+    group_energies(inputs.points, inputs.lens, inputs.scale, columns, origins, energies)
+    if inputs.lifted.weight > 0.0:
+        lifted_energies(inputs.lifted, columns, origins, room, lifted)
+        lifted *= inputs.lifted.weight
     top = -np.inf
     for e in range(len(exchanged)):
         total = log_prior[e] - lifted[readings[e]]
@@ -247,6 +277,14 @@ def exchange_log_posterior(energies, lifted, weights, exchanged, readings, log_p
     for e in range(len(exchanged)):
         result[e] -= total
     return -total
+
+
+@njit(cache=True, nogil=True)
+def exchange_posteriors(inputs, log_priors, columns, origins, result):  # type: ignore[no-untyped-def]
+    """Log probabilities (N, E) of exchanges at N poses, with a row of priors for each."""
+    room = _lifted_room(inputs.lifted)
+    for n in range(len(columns)):
+        weigh_exchanges(inputs, log_priors[n], columns[n], origins[n], room, result[n])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -266,38 +304,24 @@ def list_keypoints(  # type: ignore[no-untyped-def]
     Returns:
         The number of residuals, two a landmark before the camera.
     """
-    points, lens, scale = inputs.points, inputs.lens, inputs.scale
-    weights, exchanged = inputs.weights, inputs.exchanged
-    energies, posterior = np.empty((exchanged.shape[1], 2)), np.empty(len(exchanged))
+    scale, weights, exchanged = inputs.scale, inputs.weights, inputs.exchanged
+    posterior = np.empty(len(exchanged))
     pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
-    segments, offsets, seen, whiteners, groups = points
-    group_energies(points, lens, scale, columns, origins, energies)
-    lifted = np.zeros(2)
-    if inputs.lifted.weight > 0.0:
-        behind, joints, shares = lifted_room(inputs.lifted)
-        lifted_energies(inputs.lifted, columns, origins, behind, joints, shares, lifted)
-        lifted *= inputs.lifted.weight
-    exchange_log_posterior(
-        energies,
-        lifted,
-        weights,
-        exchanged,
-        inputs.lifted.readings,
-        inputs.log_priors[0],
-        posterior,
-    )
+    segments, offsets, seen, whiteners, groups = inputs.points
+    room = _lifted_room(inputs.lifted)
+    weigh_exchanges(inputs, inputs.log_priors[0], columns, origins, room, posterior)
     likeliest = exchanged[np.argmax(posterior)]
     m = 0
     for k in range(len(groups)):
         e = likeliest[groups[k]]
         if not point_residual(
-            segments, offsets, k, e, lens, columns, origins, pixels, projections, place
+            segments, offsets, k, e, inputs.lens, columns, origins, pixels, projections, place
         ):
             errors[k] = np.nan
             continue
         for i in range(2):
             w0, w1 = whiteners[k, i, 0], whiteners[k, i, 1]
-            error = w0 * (pixels[0, 0] - seen[k, 0]) + w1 * (pixels[0, 1] - seen[k, 1])
+            error = whitened_error(whiteners, seen, k, i, pixels)
             errors[k, i] = error
             shrink = 1.0 / (1.0 + error * error / (scale * scale))
             curvatures[m] = weights[groups[k]] * shrink * shrink
@@ -308,13 +332,6 @@ def list_keypoints(  # type: ignore[no-untyped-def]
                 directions[m, x] = w0 * projections[0, 0, x] + w1 * projections[0, 1, x]
             m += 1
     return m
-
-
-@njit(cache=True, nogil=True)
-def lifted_room(lifted):  # type: ignore[no-untyped-def]
-    """Room for `lifted_energies` of one pose."""
-    joints = len(lifted.segments)
-    return np.empty(joints), np.empty((1 + joints, 3)), np.empty((2, len(lifted.log_weights)))
 
 
 @njit(cache=True, nogil=True)
@@ -367,87 +384,61 @@ def record_keypoints(inputs, joints, columns, origins, residuals):  # type: igno
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def add_keypoints(  # type: ignore[no-untyped-def]
-    inputs, log_priors, columns, origins, axes, dof_origins, value, gradient, hessian
+    inputs, log_prior, columns, origins, axes, dof_origins, wanted, gradient, hessian
 ):
-    """Adds energy, gradient and Hessian of poses (N,), with priors (N, E) of the exchanges.
+    """The energy of one pose; adds gradient (d,) and Hessian (d, d).
 
-    Hessians of no pose: no derivatives are wanted.
+    Args:
+        inputs: of the keypoints.
+        log_prior: (E,) of the exchanges.
+        columns, origins: (S, 3, 3), (S, 3) frames of the segments.
+        axes, dof_origins: (d, 3) of the degrees of freedom.
+        wanted: whether derivatives are wanted.
+        gradient, hessian: added to.
     """
-    points, lifted, tree, lens = inputs.points, inputs.lifted, inputs.tree, inputs.lens
+    lifted, tree, lens = inputs.lifted, inputs.tree, inputs.lens
     scale, weights, exchanged = inputs.scale, inputs.weights, inputs.exchanged
     groups = exchanged.shape[1]
-    energies, posterior = np.empty((groups, 2)), np.empty(len(exchanged))
-    shares = np.empty((groups, 2))
-    wrenches = np.empty((len(tree.parents), 6))
-    stiffnesses = np.empty((len(tree.parents), 6, 6))
+    posterior, room = np.empty(len(exchanged)), _lifted_room(lifted)
+    value = weigh_exchanges(inputs, log_prior, columns, origins, room, posterior)
+    if not wanted:
+        return value
+    shares = np.zeros((groups, 2))
+    for e in range(len(exchanged)):
+        for g in range(groups):
+            shares[g, exchanged[e, g]] += np.exp(posterior[e])
+    wrenches = np.zeros((len(tree.parents), 6))
+    stiffnesses = np.zeros((len(tree.parents), 6, 6))
     pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
-    segments, offsets, seen, whiteners, point_groups = points
-    whole, readings = np.zeros(2), np.empty(2)
-    behind, joints, components = lifted_room(lifted)
-    for n in range(len(value)):
-        group_energies(points, lens, scale, columns[n], origins[n], energies)
-        if lifted.weight > 0.0:
-            lifted_energies(lifted, columns[n], origins[n], behind, joints, components, whole)
-            whole *= lifted.weight
-        value[n] += exchange_log_posterior(
-            energies, whole, weights, exchanged, lifted.readings, log_priors[n], posterior
-        )
-        if len(hessian) == 0:
-            continue
-        shares[:] = 0.0
+    segments, offsets, seen, whiteners, point_groups = inputs.points
+    for k in range(len(point_groups)):
+        for e in range(2):
+            share = weights[point_groups[k]] * shares[point_groups[k], e]
+            if share < 1e-6 or not point_residual(
+                segments, offsets, k, e, lens, columns, origins, pixels, projections, place
+            ):
+                continue
+            for i in range(2):
+                w0, w1 = whiteners[k, i, 0], whiteners[k, i, 1]
+                residual = whitened_error(whiteners, seen, k, i, pixels)
+                _, pull, curvature = geman_mcclure(residual, scale, share)
+                add_residual(
+                    wrenches,
+                    stiffnesses,
+                    segments[k, e],
+                    place[0],
+                    place[1],
+                    place[2],
+                    w0 * projections[0, 0, 0] + w1 * projections[0, 1, 0],
+                    w0 * projections[0, 0, 1] + w1 * projections[0, 1, 1],
+                    w0 * projections[0, 0, 2] + w1 * projections[0, 1, 2],
+                    pull,
+                    curvature,
+                )
+    assemble_pose(tree, axes, dof_origins, wrenches, stiffnesses, gradient, hessian)
+    if lifted.weight > 0.0:
+        readings = np.zeros(2)
         for e in range(len(exchanged)):
-            for g in range(groups):
-                shares[g, exchanged[e, g]] += np.exp(posterior[e])
-        wrenches[:] = 0.0
-        stiffnesses[:] = 0.0
-        for k in range(len(point_groups)):
-            for e in range(2):
-                share = weights[point_groups[k]] * shares[point_groups[k], e]
-                if share < 1e-6 or not point_residual(
-                    segments,
-                    offsets,
-                    k,
-                    e,
-                    lens,
-                    columns[n],
-                    origins[n],
-                    pixels,
-                    projections,
-                    place,
-                ):
-                    continue
-                for i in range(2):
-                    w0, w1 = whiteners[k, i, 0], whiteners[k, i, 1]
-                    residual = w0 * (pixels[0, 0] - seen[k, 0])
-                    residual += w1 * (pixels[0, 1] - seen[k, 1])
-                    _, pull, curvature = geman_mcclure(residual, scale, share)
-                    add_residual(
-                        wrenches,
-                        stiffnesses,
-                        segments[k, e],
-                        place[0],
-                        place[1],
-                        place[2],
-                        w0 * projections[0, 0, 0] + w1 * projections[0, 1, 0],
-                        w0 * projections[0, 0, 1] + w1 * projections[0, 1, 1],
-                        w0 * projections[0, 0, 2] + w1 * projections[0, 1, 2],
-                        pull,
-                        curvature,
-                    )
-        assemble_pose(tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradient[n], hessian[n])
-        if lifted.weight > 0.0:
-            readings[:] = 0.0
-            for e in range(len(exchanged)):
-                readings[lifted.readings[e]] += np.exp(posterior[e])
-            add_lifted(
-                lifted,
-                tree,
-                readings,
-                behind,
-                joints,
-                components,
-                axes[n],
-                dof_origins[n],
-                gradient[n],
-                hessian[n],
-            )
+            readings[lifted.readings[e]] += np.exp(posterior[e])
+        add_lifted(lifted, tree, readings, room, axes, dof_origins, gradient, hessian)
+    return value

@@ -34,17 +34,12 @@ from hmt_ros.image.terms.keypoint_kernel import (
     KeypointInputs,
     Lifted,
     Points,
-    add_keypoints,
-    exchange_log_posterior,
-    group_energies,
+    exchange_posteriors,
     keypoint_errors,
-    lifted_energies,
-    lifted_room,
     record_keypoints,
 )
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.energy import Derivatives, Energy
 
 KEYPOINTS = TermSettings(0.5, 1.0, 3.0)
 # Assumed height of the visible part of a person whose distance is unknown, m.
@@ -203,7 +198,7 @@ class Keypoints:
 
 @dataclass(frozen=True, eq=False)
 class KeypointTerm:
-    """Minus the log-likelihood of keypoints; a `FrameTerm`.
+    """Minus the log-likelihood of keypoints.
 
     Keypoints that were not seen (NaN) or have no confidence do not count.
 
@@ -231,34 +226,14 @@ class KeypointTerm:
     beliefs: Array | None = None
     lifted_share: float = 1.0
 
-    def energy(
-        self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        """See `hmt_ros.body.pose_terms.FrameTerm`."""
-        n, d = frames.count, self.skeleton.dimension
-        poses = n if derivatives else 0
-        value, gradient, hessian = np.zeros(n), np.zeros((poses, d)), np.zeros((poses, d, d))
-        inputs = self.compiled
-        chosen = rows if len(inputs.log_priors) > 1 else np.zeros(n, dtype=np.intp)
-        add_keypoints(
-            inputs,
-            inputs.log_priors[chosen],
-            *frames.by_pose(),
-            *frames.dofs_by_pose(),
-            value,
-            gradient,
-            hessian,
-        )
-        return Energy(value, gradient, hessian) if derivatives else Energy(value)
-
     @property
     def compiled(self) -> KeypointInputs:
         """The term as compiled code reads it."""
         exchanges = np.zeros((1, 1)) if self.exchanges is None else self.exchanges
-        measured = self.measured
+        lifted = self.measured.lifted
         return KeypointInputs(
-            measured.points,
-            self._lifted(),
+            self.measured.points,
+            lifted._replace(weight=self.lifted_share * lifted.weight),
             tree_of(self.skeleton),
             lens_of(self.camera),
             float(self.settings.scale),
@@ -269,34 +244,10 @@ class KeypointTerm:
 
     def exchanged(self, frames: Frames, rows: Index) -> Array:
         """Log probabilities (N, E) of the exchanges at the frames of N poses."""
-        measured = self.measured
-        exchanged, priors = self._priors(rows, frames.count)
+        inputs = self.compiled
+        priors = inputs.log_priors[rows if len(inputs.log_priors) > 1 else [0] * frames.count]
         result = np.empty(priors.shape)
-        energies = np.empty((exchanged.shape[1], 2))
-        lifted = self._lifted()
-        behind, joints, shares = lifted_room(lifted)
-        columns, origins = frames.by_pose()
-        for n in range(frames.count):
-            group_energies(
-                measured.points,
-                lens_of(self.camera),
-                float(self.settings.scale),
-                columns[n],
-                origins[n],
-                energies,
-            )
-            whole = np.zeros(2)
-            if lifted.weight > 0:
-                lifted_energies(lifted, columns[n], origins[n], behind, joints, shares, whole)
-            exchange_log_posterior(
-                energies,
-                lifted.weight * whole,
-                self.weights,
-                exchanged,
-                lifted.readings[: len(exchanged)],
-                priors[n],
-                result[n],
-            )
+        exchange_posteriors(inputs, priors, *frames.by_pose(), result)
         return result
 
     def residuals(self, frames: Frames) -> tuple[Index, Array, Array, Array, Array]:
@@ -331,18 +282,6 @@ class KeypointTerm:
         errors = np.empty((frames.count, len(self.measured.joints), 2))
         keypoint_errors(self.compiled, *frames.by_pose(), errors)
         return np.asarray(np.linalg.norm(errors, axis=2))
-
-    def _priors(self, rows: Index, count: int) -> tuple[NDArray[np.int64], Array]:
-        """Groups that each exchange exchanges (E, G), and log priors (N, E)."""
-        if self.exchanges is None:
-            return EXCHANGED[:1], np.zeros((count, 1))
-        chosen = self.exchanges[rows] if len(self.exchanges) > 1 else self.exchanges[[0] * count]
-        return EXCHANGED, np.ascontiguousarray(chosen)
-
-    def _lifted(self) -> Lifted:
-        """The mixture over whole poses, with its share."""
-        lifted = self.measured.lifted
-        return lifted._replace(weight=self.lifted_share * lifted.weight)
 
     @property
     def weights(self) -> Array:

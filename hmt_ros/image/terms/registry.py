@@ -22,9 +22,9 @@ from hmt_ros.image.surface import (
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.edges import EDGES
 from hmt_ros.image.terms.image_term import ImageTerm, PoseView
-from hmt_ros.image.terms.residuals import Tree, assemble_pose
+from hmt_ros.image.terms.residuals import Tree
 from hmt_ros.image.terms.silhouette import COVERAGE
-from hmt_ros.inference.arrays import Array, Mask
+from hmt_ros.inference.arrays import Mask
 
 TERMS: tuple[ImageTerm, ...] = (COVERAGE, EDGES, DEPTH)
 
@@ -45,15 +45,6 @@ class Model(NamedTuple):
     traced: Mask
     occluders: Mask
     contour_points: int
-
-
-class Placement(NamedTuple):
-    """Frames of N poses: columns (N, S, 3, 3), origins (N, S, 3); axes, dof origins (N, d, 3)."""
-
-    columns: Array
-    origins: Array
-    axes: Array
-    dof_origins: Array
 
 
 def _one_after_the_other(terms: tuple[ImageTerm, ...]) -> Any:
@@ -127,56 +118,18 @@ def look(view, number, shape):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def add_energies(  # type: ignore[no-untyped-def]
-    first, last, model, inputs, shape, placement, energies, gradients, hessians
-):
-    """Energies, gradients and Hessians of the poses first to last - 1.
-
-    Args:
-        first, last: range of poses.
-        model, placement: body and poses that are compared with the image.
-        inputs: of the kernels, one entry a term, in the order of `TERMS`.
-        shape: whether the contour is traced.
-        energies: (N, terms) result.
-        gradients, hessians: (N, d), (N, d, d), added to; hessians of no pose: no derivatives
-            wanted.
-    """
-    segments = len(model.tree.parents)
-    wrenches, stiffnesses = np.empty((segments, 6)), np.empty((segments, 6, 6))
-    if len(hessians) == 0:
-        wrenches, stiffnesses = wrenches[:0], stiffnesses[:0]
-    view = new_view(model)
-    for n in range(first, last):
-        wrenches[:] = 0.0
-        stiffnesses[:] = 0.0
-        view.columns[:], view.origins[:] = placement.columns[n], placement.origins[n]
-        look(view, n, shape)
-        run_terms(view, inputs, 0, energies[n], wrenches, stiffnesses)
-        if len(hessians) > 0:
-            assemble_pose(
-                model.tree,
-                placement.axes[n],
-                placement.dof_origins[n],
-                wrenches,
-                stiffnesses,
-                gradients[n],
-                hessians[n],
-            )
-
-
-@njit(cache=True, nogil=True)
-def record_residuals(model, inputs, columns, origins, energies, residuals):  # type: ignore[no-untyped-def]
+def record_residuals(model, inputs, columns, origins, residuals):  # type: ignore[no-untyped-def]
     """Lists the residuals of N poses, instead of summing them.
 
     Args:
-        model, inputs: as for `add_energies`; the contour is traced.
+        model: body and camera.
+        inputs: of the kernels, one entry a term, in the order of `TERMS`; the contour is traced.
         columns, origins: (N, S, 3, 3), (N, S, 3) frames of the segments.
-        energies: (N, terms) result.
         residuals: (N, M, RECORDED) result, see `residuals.add_residual`; entries (n, 0, 0) must be
             0 and become the number of residuals of pose n.
     """
-    view, nothing = new_view(model), np.empty((0, 6, 6))
+    view, nothing, energies = new_view(model), np.empty((0, 6, 6)), np.empty(len(inputs))
     for n in range(len(columns)):
         view.columns[:], view.origins[:] = columns[n], origins[n]
         look(view, n, True)
-        run_terms(view, inputs, 0, energies[n], residuals[n], nothing)
+        run_terms(view, inputs, 0, energies, residuals[n], nothing)

@@ -83,6 +83,21 @@ def contour_sigma(term, noise):  # type: ignore[no-untyped-def]
     return np.sqrt(term.sigma * term.sigma + blur * blur)
 
 
+# Fewer visible points than this do not make each of them count more.
+FEWEST = 20
+
+
+@njit(cache=True, nogil=True)
+def weight_of_each(weight, shared, valid, hidden):  # type: ignore[no-untyped-def]
+    """A weight shared among so many points; 0: among those that are valid and not hidden."""
+    count = shared
+    if count == 0:
+        for i in range(len(valid)):
+            if valid[i] and not hidden[i]:
+                count += 1
+    return weight / max(count, FEWEST)
+
+
 # Columns of a list of residuals: segment, point (3), derivative (3), pull, curvature.
 RECORDED = 9
 
@@ -106,41 +121,12 @@ def add_residual(wrenches, stiffnesses, s, p0, p1, p2, a0, a1, a2, pull, curvatu
             wrenches[n, 4], wrenches[n, 5], wrenches[n, 6] = a0, a1, a2
             wrenches[n, 7], wrenches[n, 8] = pull, curvature
         return
-    a3 = p1 * a2 - p2 * a1
-    a4 = p2 * a0 - p0 * a2
-    a5 = p0 * a1 - p1 * a0
-    wrenches[s, 0] += pull * a0
-    wrenches[s, 1] += pull * a1
-    wrenches[s, 2] += pull * a2
-    wrenches[s, 3] += pull * a3
-    wrenches[s, 4] += pull * a4
-    wrenches[s, 5] += pull * a5
-    c = curvature * a0
-    stiffnesses[s, 0, 0] += c * a0
-    stiffnesses[s, 0, 1] += c * a1
-    stiffnesses[s, 0, 2] += c * a2
-    stiffnesses[s, 0, 3] += c * a3
-    stiffnesses[s, 0, 4] += c * a4
-    stiffnesses[s, 0, 5] += c * a5
-    c = curvature * a1
-    stiffnesses[s, 1, 1] += c * a1
-    stiffnesses[s, 1, 2] += c * a2
-    stiffnesses[s, 1, 3] += c * a3
-    stiffnesses[s, 1, 4] += c * a4
-    stiffnesses[s, 1, 5] += c * a5
-    c = curvature * a2
-    stiffnesses[s, 2, 2] += c * a2
-    stiffnesses[s, 2, 3] += c * a3
-    stiffnesses[s, 2, 4] += c * a4
-    stiffnesses[s, 2, 5] += c * a5
-    c = curvature * a3
-    stiffnesses[s, 3, 3] += c * a3
-    stiffnesses[s, 3, 4] += c * a4
-    stiffnesses[s, 3, 5] += c * a5
-    c = curvature * a4
-    stiffnesses[s, 4, 4] += c * a4
-    stiffnesses[s, 4, 5] += c * a5
-    stiffnesses[s, 5, 5] += curvature * a5 * a5
+    b = (a0, a1, a2, p1 * a2 - p2 * a1, p2 * a0 - p0 * a2, p0 * a1 - p1 * a0)
+    for i in range(6):
+        wrenches[s, i] += pull * b[i]
+        c = curvature * b[i]
+        for j in range(i, 6):
+            stiffnesses[s, i, j] += c * b[j]
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -21,9 +21,8 @@ from functools import cached_property
 
 import numpy as np
 
-from hmt_ros.body.kinematics import forward
 from hmt_ros.flips.limb_products import LimbProducts
-from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.keypoints import group_of
@@ -89,18 +88,16 @@ class LimbSearch:
             plan: allocation of its evaluations.
             rng: source of randomness.
         """
-        body, own = self.posterior.body, self.dofs
-        s = self.posterior.settings.search
+        s, own = self.posterior.settings.search, self.dofs
         block = covariance[np.ix_(own, own)]
         samples = self._draw(pose[own], block, plan.samples, rng)
         of_limb, of_rest = self._likelihoods
-        others = of_rest.energies(
-            forward(body.skeleton, pose[None]), observation, derivatives=False
-        )
-        seen = of_limb.seen(observation, explained=others.costs)
-        seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
+        others = PoseEnergy(of_rest, (ObservedImage(of_rest, observation),))
+        explained = others.by_cue(pose[None], derivatives=False).outline_costs
+        seen = of_limb.seen(observation, explained=explained)
+        terms = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
         motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
-        term = PoseEnergy(of_limb, seen, motion, pose, own)
+        term = PoseEnergy(of_limb, terms, motion, pose, own)
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: plan.refined]]
         self.posterior.spent.append(len(samples) + plan.refined * s.iterations)

@@ -84,8 +84,8 @@ def test_ground_is_that_of_the_frame(replayed):
 
 def test_same_numbers_as_with_parameters_of_the_same_gravity(replayed, moving, tmp_path):
     down = [float(x) for x in -VIEW.rotation[:, 2]]
-    settings = [f'gravity={down}', 'camera_height=1.25', 'fixed_frame=']
-    settings += [f'gravity_sigma={np.degrees(UP_SIGMA)}']
+    sure = f'gravity_sigma={np.degrees(UP_SIGMA)}'
+    settings = [f'gravity={down}', sure, 'camera_height=1.25', 'fixed_frame=']
     settings = [x for one in settings for x in ('--set', one)]
     arguments = [str(moving), '-o', str(tmp_path / 'out'), *PERSON, *SMALL, *settings]
     assert main([*arguments, '--no-smoother', '--quiet']) == 0

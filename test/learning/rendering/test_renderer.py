@@ -13,7 +13,7 @@ from hmt_ros.body import Camera, load_body
 from hmt_ros.body.flesh import Flesh
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.rasterisation import render_silhouettes
-from test.oracles.numpy_contour import occluding_contour
+from test.oracles.numpy_contour import occluding_contour, surface
 
 VIEW = Viewpoint(distance=3.2)
 BARE = Scene(viewpoint=VIEW, noise=0.0, shadow=0.0, clutter=2)
@@ -82,7 +82,7 @@ def test_depth_is_that_of_the_surface(body):
     rng = np.random.default_rng(0)
     checked = 0
     for index, part in enumerate(body.flesh.parts):
-        local, normal = part.surface(rng.uniform(-0.95, 0.95, 200), rng.uniform(0, 2 * np.pi, 200))
+        local, normal = surface(part, rng.uniform(-0.95, 0.95, 200), rng.uniform(0, 2 * np.pi, 200))
         segments = np.full(200, part.segment)
         points = frames.points(segments, local)[:, :, 0]
         normals = frames.directions(segments, normal)[:, :, 0]
@@ -184,7 +184,7 @@ def test_clothes_stay_on_the_surface(body):
     after = standing(body, root_y=0.3)
     part = next(i for i, p in enumerate(body.flesh.parts) if p.taper == (0.1, 0.1))
     s, w = (x.ravel() for x in np.meshgrid(np.linspace(-0.6, 0.6, 15), np.linspace(-2.2, -0.9, 15)))
-    local, _ = body.flesh.parts[part].surface(s, w)
+    local, _ = surface(body.flesh.parts[part], s, w)
     colours = []
     for pose in (before, after):
         points = forward(body.skeleton, pose[None]).points(

@@ -5,14 +5,13 @@ import pytest
 
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.pose_prior import pose_prior
-from hmt_ros.body.pose_terms import Posed
-from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.inference.energy import Student, Sum
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.kinematic_jumps import LimbSearch
 from hmt_ros.tracking.settings import LIMB_TAILS, LimbSearchSettings, TrackerSettings
-from test.inference.restricted import Restricted
 
 CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
 
@@ -32,7 +31,9 @@ def test_without_an_image_a_limb_goes_where_the_prior_wants_it_given_the_other_l
     found = search.find(pose, covariance, Observation(), settings.plan, np.random.default_rng(0))
     own = search.dofs
     assert found.shape == (2, len(own))
-    prior = Restricted(Posed(body.skeleton, (pose_prior(body, kind, 2.0),)), pose, own)
+    prior = PoseEnergy(
+        ImageLikelihood(body, CAMERA), (pose_prior(body, kind, 2.0),), None, pose, own
+    )
     kept = Student(pose[own], np.linalg.inv(covariance[np.ix_(own, own)]), LIMB_TAILS)
     value, gradient, hessian = Sum((prior, kept)).energy(found, np.arange(2))
     start = Sum((prior, kept)).energy(pose[None, own], np.arange(1)).value
