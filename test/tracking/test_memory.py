@@ -16,9 +16,9 @@ START = 10**9
 SMALL = Camera(110.0, 110.0, 59.5, 44.5, 120, 90)
 # A small search: what is kept of an image does not depend on it.
 SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, searched_chains=1, combinations=32)
-# Bytes that a track may gain from the first number of images to the last: less than four of its
+# Bytes that a track may gain from the first number of images to the last: less than seven of its
 # images take.
-FIRST, LAST, BOUND = 30, 60, 100_000
+FIRST, LAST, BOUND = 80, 160, 200_000
 
 
 def test_a_track_does_not_grow(filmed):
