@@ -50,11 +50,11 @@ def term(poses, exchanges):
     return KeypointTerm(BODY.skeleton, CAMERA, one, exchanges=exchanges)
 
 
-def energy(poses, x, exchanges):
+def energy(poses: LiftedPoses, x: np.ndarray, exchanges: np.ndarray | None) -> float:
     return float(energies(poses, x, exchanges).value[0])
 
 
-def energies(poses, x, exchanges):
+def energies(poses: LiftedPoses, x: np.ndarray, exchanges: np.ndarray | None):
     return energy_of(term(poses, exchanges), BODY, x, camera=CAMERA)
 
 

@@ -1,14 +1,11 @@
 """The tracker on short motions whose poses are known: joints as keypoints, and rendered images."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hmt_ros.body import Body
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
@@ -37,7 +34,7 @@ OFF = GroundSettings(0.0, 0.0)
 FRAME = 100_000_000  # ns
 
 
-def keypoint_settings(**values) -> TrackerSettings:
+def keypoint_settings(**values):
     return TrackerSettings(
         **{
             'candidates': 8,
@@ -51,17 +48,17 @@ def keypoint_settings(**values) -> TrackerSettings:
 
 
 @pytest.fixture(scope='module')
-def black(camera) -> np.ndarray:
+def black(camera):
     return np.zeros((camera.height, camera.width, 3), np.uint8)
 
 
 @pytest.fixture(scope='module')
-def subject(human32, motion, keypoints_of) -> Subject:
+def subject(human32, motion, keypoints_of):
     return Subject(0, keypoints_of(human32, motion[0]), dict(human32.segment_lengths))
 
 
 @pytest.fixture
-def mixture(motion) -> GaussianMixture:
+def mixture(motion):
     """A start around the first pose: the truth, and another that is 60 cm away."""
     means = np.stack([motion[0], motion[0]])
     means[1, 0] += 0.6
@@ -71,7 +68,7 @@ def mixture(motion) -> GaussianMixture:
 
 
 @pytest.fixture(scope='module')
-def begun(human32, camera, black, motion, keypoints_of, subject) -> tuple[Body, GaussianMixture]:
+def begun(human32, camera, black, motion, keypoints_of, subject):
     """The person's body and the poses at the first image, from the subject."""
     tracker = Tracker(human32, camera, keypoint_settings())
     tracker.reset(subject)
@@ -83,7 +80,7 @@ def begun(human32, camera, black, motion, keypoints_of, subject) -> tuple[Body, 
 def started(begun, camera):
     """Function (seed, tracker settings) -> a tracker that starts from there."""
 
-    def make(seed=0, **values) -> Tracker:
+    def make(seed=0, **values):
         body, posterior = begun
         tracker = Tracker(body, camera, keypoint_settings(**values), seed=seed)
         tracker.reset(posterior)
@@ -351,7 +348,7 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert abs(places[found][2] - other[2]) < 0.4
 
 
-def predicted(body, pose) -> PosePrediction:
+def predicted(body, pose):
     """What a regression may say of a pose: near it, or its back to the front."""
     means = np.stack([pose, pose])
     means[0, 6:] += 0.05
@@ -517,7 +514,7 @@ def test_images_alone(film, human32, camera, keypoints_of):
 class KnownHeight:
     """A term that only knows how high above the floor the root is."""
 
-    def __init__(self, height: float) -> None:
+    def __init__(self, height):
         self.height = height
 
     def energy(self, frames, rows, *, derivatives=Derivatives.POSITIVE):
