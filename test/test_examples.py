@@ -200,7 +200,6 @@ def demonstration(tmp_path_factory):
         subject=source / 'subject.yaml',
         background=source / 'background.png',
         with_smoother=False,
-        settings=['overlay_modes=0'],
         quiet=True,
     )
     replay_bag(source, target, options, tell=print)

@@ -1,7 +1,5 @@
 """Superquadric flesh: surface, normals, contours and mesh against their definitions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -27,11 +25,11 @@ PARTS = {
 
 
 @pytest.fixture(params=PARTS)
-def part(request) -> Superquadric:
+def part(request):
     return PARTS[request.param]
 
 
-def implicit(part: Superquadric, points: np.ndarray) -> np.ndarray:
+def implicit(part, points):
     """Inside-outside function of points (..., 3): 1 on the surface, less inside."""
     s = (part.centre[2] - points[..., 2]) / part.radii[2]
     e1, e2 = part.exponents
@@ -43,7 +41,7 @@ def implicit(part: Superquadric, points: np.ndarray) -> np.ndarray:
     return total ** (e2 / e1) + np.abs(s) ** (2 / e1)
 
 
-def looks(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def looks(n, seed):
     """Rotations (n, 3, 3) and places (n, 3) of a segment before the camera."""
     rng = np.random.default_rng(seed)
     q, r = np.linalg.qr(rng.normal(size=(n, 3, 3)))
@@ -55,7 +53,7 @@ def looks(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return q, places
 
 
-def frames_of(rotations: np.ndarray, places: np.ndarray) -> Frames:
+def frames_of(rotations, places):
     columns = rotations.transpose(2, 1, 0)[None]  # (1, axis, coordinate, n)
     empty = np.empty((0, 3, len(places)))
     return Frames(HUMAN.skeleton, empty, columns, places.T[None], empty, empty)

@@ -1,7 +1,5 @@
 """Gravity and floor as energies of poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +28,7 @@ PLANE = FloorPlane(UP, 0.01, 0.8, 0.02)
 LEVEL = np.array([0.0, -1.0, 0.0])
 
 
-def only(name: str) -> GroundSettings:
+def only(name):
     off = {f'{term}_weight': 0.0 for term in TERMS}
     return GroundSettings(**{**off, f'{name}_weight': 1.0})
 
@@ -41,7 +39,7 @@ def body():
 
 
 @pytest.fixture(scope='module')
-def poses(body) -> np.ndarray:
+def poses(body):
     """(12, d) some that lean, stand badly, and have feet below the floor."""
     rng = np.random.default_rng(0)
     sigma = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.0)
@@ -52,14 +50,14 @@ def poses(body) -> np.ndarray:
 
 
 @pytest.fixture(scope='module')
-def standing(body) -> np.ndarray:
+def standing(body):
     """(1, d) upright, both feet on the floor below a level camera."""
     pose = np.zeros((1, body.dimension))
     pose[0, 2] = 3.0
     return pose
 
 
-def level_plane(body, pose: np.ndarray) -> FloorPlane:
+def level_plane(body, pose):
     """The floor under the soles of a pose (1, d), before a level camera."""
     feet = soles(body)
     points = forward(body.skeleton, pose).points(feet.segments, feet.local)[..., 0]
@@ -70,7 +68,7 @@ def level_plane(body, pose: np.ndarray) -> FloorPlane:
 def test_derivatives_are_those_of_finite_differences(name, body, poses):
     term = GroundTerm(body, only(name), PLANE)
 
-    def value(x: np.ndarray) -> np.ndarray:
+    def value(x):
         found = energy_of(term, body, x, derivatives=Derivatives.NONE)
         assert found.gradient is None
         return found.value
@@ -119,7 +117,7 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
     term = GroundTerm(body, only('upright'), FloorPlane(LEVEL, 0.0, None, np.inf))
     bends = bool(skeleton.segment_dofs[trunk])
 
-    def leaning(pelvis: np.ndarray, spine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def leaning(pelvis, spine):
         """Cost and lean of the trunk (N,), of leans of the pelvis and angles of the spine."""
         poses = np.zeros((len(pelvis), body.dimension))
         poses[:, 2] = 3.0

@@ -17,15 +17,11 @@ from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
 from hmt_ros.image.terms.depth import (
     ASIDE,
     DEPTH,
-    FURTHEST,
     JUMP,
     LEAST_COSINE,
-    NEAREST,
     usable_depths,
 )
-from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.residuals import FEWEST
-from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from test.oracles.single_terms import image_energy
 
 ALONE = LikelihoodSettings.of_terms(depth=DEPTH.settings)
@@ -167,21 +163,6 @@ def test_gradient_at_material_points(shot, sensed, likelihood):
         assert np.abs(gradient - wanted).max() < 1e-5 * np.abs(wanted).max()
 
 
-def test_sliding_of_the_points_hardly_changes_the_gradient(shot, true_depth, likelihood):
-    observation = observe(shot.images[1], depth=np.where(np.isfinite(true_depth), true_depth, 0))
-    poses, step = shot.near(6, 9, spread=0.05), 1e-5
-    found = image_energy(likelihood, poses, observation).gradient
-    wanted = np.empty_like(poses)
-    for j in range(poses.shape[1]):
-        shift = step * (np.arange(poses.shape[1]) == j)
-        up, down = (image_energy(likelihood, poses + s, observation).value for s in (shift, -shift))
-        wanted[:, j] = (up - down) / (2 * step)
-    cosine = (
-        (found * wanted).sum(1) / np.linalg.norm(found, axis=1) / np.linalg.norm(wanted, axis=1)
-    )
-    assert np.median(cosine) > 0.95
-
-
 def test_the_hessian_is_positive_semidefinite(shot, sensed, likelihood):
     found = image_energy(likelihood, shot.near(6, 5, spread=0.3), seen(shot, sensed)).hessian
     assert np.allclose(found, found.transpose(0, 2, 1))
@@ -189,16 +170,6 @@ def test_the_hessian_is_positive_semidefinite(shot, sensed, likelihood):
 
 
 # What it says.
-
-
-def test_depth_tells_the_distance(shot, sensed, likelihood):
-    shifts = np.linspace(-0.3, 0.3, 61)
-    poses = shot.poses[1] * np.ones((61, 1))
-    poses[:, :3] *= 1.0 + shifts[:, None] / poses[:, 2:3]
-    value = image_energy(likelihood, poses, seen(shot, sensed)).value
-    assert abs(shifts[value.argmin()]) <= 0.01
-    assert value[0] - value.min() > 20.0
-    assert value[-1] - value.min() > 20.0
 
 
 def test_the_noise_grows_with_the_square_of_the_distance(shot, true_depth):
@@ -215,26 +186,6 @@ def test_the_noise_grows_with_the_square_of_the_distance(shot, true_depth):
     assert costs[2] == pytest.approx(0.5 * 30.0 * (0.05 / (0.02 * z * z)) ** 2, abs=1.5)
 
 
-def test_nothing_measured_says_nothing(shot, likelihood):
-    for empty in (0.0, np.nan, -1.0, np.inf, 0.5 * NEAREST, 2 * FURTHEST):
-        observation = seen(shot, np.full(shot.images[1].shape[:2], empty))
-        assert 'depth' not in observation.evidence
-        assert image_energy(likelihood, shot.poses[1:], observation).value == 0.0
-
-
-def test_holes_pull_nowhere(shot, sensed, likelihood):
-    """Where the left half is unknown, only the right half counts."""
-    half = sensed.copy()
-    column = int(shot.camera.project(shot.body.joint_positions(shot.poses[1:]))[0, :, 0].mean())
-    half[:, :column] = np.nan
-    with_holes = seen(shot, half)
-    assert np.isfinite(image_energy(likelihood, shot.near(8, 3), with_holes).gradient).all()
-    far = shot.poses[1:].copy()
-    far[:, 0] -= 0.8
-    gradient = image_energy(likelihood, far, with_holes).gradient
-    assert np.abs(gradient).max() < 1e-9
-
-
 @pytest.mark.parametrize('other', [0.4, 9.0], ids=['occluder', 'background'])
 def test_other_surfaces_cost_at_most_what_the_kernel_allows(shot, sensed, likelihood, other):
     """A pose that is hidden, or before an empty place, is not pulled there."""
@@ -246,16 +197,6 @@ def test_other_surfaces_cost_at_most_what_the_kernel_allows(shot, sensed, likeli
         likelihood, shot.poses[1:] + 0.05 * (np.arange(37) == 2), seen(shot, sensed)
     )
     assert np.abs(found.gradient).max() < 0.05 * np.abs(right.gradient).max()
-
-
-def test_an_occluder_before_the_legs_leaves_the_distance(shot, sensed, likelihood):
-    depth = sensed.copy()
-    depth[shot.images[1].shape[0] * 6 // 10 :] = 1.0
-    shifts = np.linspace(-0.3, 0.3, 61)
-    poses = shot.poses[1] * np.ones((61, 1))
-    poses[:, :3] *= 1.0 + shifts[:, None] / poses[:, 2:3]
-    value = image_energy(likelihood, poses, seen(shot, depth)).value
-    assert abs(shifts[value.argmin()]) <= 0.02
 
 
 def test_depth_tells_which_way_a_forearm_points(shot, true_depth, likelihood):
@@ -271,34 +212,6 @@ def test_depth_tells_which_way_a_forearm_points(shot, true_depth, likelihood):
     observation = observe(shot.images[1], depth=np.where(np.isfinite(seen_depth), seen_depth, 5.0))
     value = image_energy(likelihood, np.stack([towards, away]), observation).value
     assert value[1] - value[0] > 5.0
-
-
-def test_depth_tells_the_size(shot, true_depth):
-    """A smaller person nearer by has the same image, but not the same depth."""
-    smaller = shot.body.with_stature(0.92 * shot.body.stature)
-    poses = shot.poses[1:].copy()
-    poses[:, :3] *= 0.92
-    likelihood = ImageLikelihood(smaller, shot.camera, ALONE)
-    observation = seen(shot, np.where(np.isfinite(true_depth), true_depth, 0.0))
-    same = image_energy(ImageLikelihood(shot.body, shot.camera, ALONE), shot.poses[1:], observation)
-    assert image_energy(likelihood, poses, observation).value[0] > same.value[0] + 50.0
-    # The residuals reach the estimate of the shape, too.
-    linear = ShapeEstimate(smaller).linearised(likelihood, observation, poses[:1])
-    assert np.linalg.matrix_rank(linear.curvature[0]) > 10
-
-
-def test_without_depth_nothing_changes(shot):
-    poses = shot.near(6, 2)
-    usual = ImageLikelihood(shot.body, shot.camera)
-    off = replace(usual, settings=replace(usual.settings, depth=TermSettings(0.0, 1.0, 1.0)))
-    one, other = (image_energy(x, poses, seen(shot, None)) for x in (usual, off))
-    assert np.array_equal(one.value, other.value)
-    assert np.array_equal(one.hessian, other.hessian)
-
-
-def test_depth_of_another_size_is_refused(shot):
-    with pytest.raises(ValueError, match=r'depth \(3, 4\) for an image'):
-        seen(shot, np.ones((3, 4)))
 
 
 def test_depth_of_somebody_else_says_nothing(shot, sensed):

@@ -274,7 +274,7 @@ def test_a_wrong_cue_is_doubted(altered, name, cues):
     assert cues == ['depth'] or believed[-JUDGED:].min() > 0.7
 
 
-@pytest.mark.parametrize('gap', [0.1, 1.0, 10.0, 1000.0])
+@pytest.mark.parametrize('gap', [0.1, 1000.0])
 def test_gaps(run, usual, gap):
     """Of three seeds: a track may take a limb the wrong way."""
     count = BAD + SECOND
