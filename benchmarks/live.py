@@ -16,6 +16,7 @@ the clip back and forth for so long.
 from __future__ import annotations
 
 import math
+import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +25,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -52,7 +54,7 @@ from benchmarks.nodes import PROFILE
 from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.replay import command as replay
 from hmt_ros.app.replay.live_node import LiveNode
-from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment
+from hmt_ros.app.replay.player import LiveNodeError, Player
 from hmt_ros.app.truth import read_truth
 from hmt_ros.detectors.blazepose import BlazePose
 from hmt_ros.detectors.detector import DetectorError
@@ -149,7 +151,7 @@ def _tried(
     try:
         if case.detector:
             BlazePose()
-        with changed_environment({PROFILES: str(PROFILE)}):
+        with patch.dict(os.environ, {PROFILES: str(PROFILE)}):
             found = [live(clip, folder / f'{stage} {k}', case, minutes) for k in range(runs)]
     except (LiveNodeError, DetectorError) as error:
         return f'skipped: {error}'

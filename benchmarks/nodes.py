@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -9,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -18,7 +20,7 @@ from benchmarks.camera import with_stamp
 from benchmarks.clips import COMPRESSED, ROOT, index_back_and_forth, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from hmt_ros.app.replay.live_node import LiveNode
-from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment
+from hmt_ros.app.replay.player import LiveNodeError, Player
 from hmt_ros.sessions import bme_session
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
@@ -54,7 +56,7 @@ def measure(only: tuple[str, ...] = tuple(TRANSPORTS), *, quick: bool = False) -
     """What comes of images at the rate of a camera, by their transport."""
     seconds = QUICK_SECONDS if quick else SECONDS
     stages = {name: partial(_tried, name, seconds) for name in TRANSPORTS}
-    with changed_environment({'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE)}):
+    with patch.dict(os.environ, {'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE)}):
         return run_stages('nodes', stages, only[:1] if quick else only)
 
 

@@ -47,7 +47,7 @@ def test_the_readme_names_every_example():
     programs = [
         path.name for path in EXAMPLES.iterdir() if path.suffix in ('.py', '.cpp', '.ipynb')
     ]
-    assert len(programs) == 8
+    assert len(programs) == 9
     assert all(f'`{name}`' in text for name in programs)
 
 

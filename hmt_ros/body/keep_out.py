@@ -77,14 +77,6 @@ class Capsules:
         """Whether each of points (P, 3) is in any capsule, (P,)."""
         return np.asarray((self.depths(points) >= 0.0).any(1))
 
-    def volume(self, samples: int = 20_000, seed: int = 0) -> float:
-        """Volume of their union, m^3, by random points in the box around it."""
-        reach = self.radii[:, None]
-        low = (np.minimum(self.starts, self.ends) - reach).min(0)
-        high = (np.maximum(self.starts, self.ends) + reach).max(0)
-        points = np.random.default_rng(seed).uniform(low, high, size=(samples, 3))
-        return float(self.contain(points).mean() * np.prod(high - low))
-
     def without_held(self) -> Capsules:
         """The capsules without those inside of larger ones together, by a few surface points."""
         order = np.argsort(-self._sizes, kind='stable')

@@ -1,6 +1,6 @@
 """Poses under the names of the joints of the URDF, and as transforms: for viewers and robots.
 
-sensor_msgs/JointState, trajectory_msgs/JointTrajectory and tf2_msgs/TFMessage.
+sensor_msgs/JointState and tf2_msgs/TFMessage.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msg_tools.messages.headers import SECOND_NS, header_message
+from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_error import Array, MessageError
 from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.pose_mixtures import PoseMixture
-from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
 
 
 def joint_state_message(
@@ -54,46 +53,6 @@ def heaviest_joint_state(messages: MessageFactory, content: PoseMixture) -> Any:
         mixture.means[int(np.argmax(mixture.weights))],
         content.stamp_ns,
         content.frame_id,
-    )
-
-
-def joint_trajectory(
-    messages: MessageFactory, content: TrajectoryMixture, identity: int | None = None
-) -> Any:
-    """trajectory_msgs/JointTrajectory of one of the trajectories of a window: positions only.
-
-    Args:
-        messages: factory; one for ROS has the classes JointTrajectory, JointTrajectoryPoint,
-            Duration, Header and Time.
-        identity: of the motion; None: the heaviest.
-
-    Returns:
-        A message whose stamp is that of the first pose, which times count from.
-
-    Raises:
-        MessageError: no trajectory has the identity.
-    """
-    weights = content.weights
-    if identity is not None:
-        weights = np.where(content.identities == identity, weights, -1.0)
-    chosen = int(np.argmax(weights))
-    if weights[chosen] < 0.0:
-        assert content.identities is not None
-        raise MessageError(
-            f'trajectories: none has the identity {identity}, they have '
-            f'{content.identities.tolist()}'
-        )
-    points = []
-    for pose, stamp in zip(content.means[chosen], content.stamps_ns, strict=True):
-        seconds, rest = divmod(stamp - content.stamps_ns[0], SECOND_NS)
-        time = messages.create('builtin_interfaces/msg/Duration', sec=seconds, nanosec=rest)
-        kind = 'trajectory_msgs/msg/JointTrajectoryPoint'
-        points.append(messages.create(kind, positions=pose, time_from_start=time))
-    return messages.create(
-        'trajectory_msgs/msg/JointTrajectory',
-        header=header_message(messages, content.stamps_ns[0], content.frame_id),
-        joint_names=list(content.dof_names),
-        points=points,
     )
 
 

@@ -32,9 +32,6 @@ def test_capsules_hold_points():
     points = np.array([[0.4, 0.0, 1.0], [0.6, 0.0, 1.0], [0.0, 0.0, 2.4], [0.0, 0.4, 2.4]])
     assert one.contain(points).tolist() == [True, False, True, False]
     np.testing.assert_allclose(one.depths(points)[:3, 0], [0.1, -0.1, 0.1])
-    exact = np.pi * 0.25 * 2.0 + 4.0 / 3.0 * np.pi * 0.125
-    assert one.volume(100_000) == pytest.approx(exact, rel=0.02)
-    assert one.volume() == one.volume()
 
 
 def test_every_joint_of_every_mode_that_counts_is_inside():

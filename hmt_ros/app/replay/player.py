@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 
 class LiveNodeError(ValueError):
@@ -77,7 +78,7 @@ class Player:
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
         context = rclpy.Context()
-        with changed_environment(environment(self.domain)):
+        with patch.dict(os.environ, environment(self.domain)):
             rclpy.init(context=context, domain_id=self.domain)
         opened.callback(rclpy.try_shutdown, context=context)
         self.node = rclpy.create_node('replay', context=context)
@@ -117,18 +118,3 @@ def reserved_domain() -> Iterator[int]:
 def environment(domain: int) -> dict[str, str]:
     """Environment variables of a process in a domain, on this machine only."""
     return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
-
-
-@contextmanager
-def changed_environment(changes: dict[str, str]) -> Iterator[None]:
-    """Changes environment variables of this process for a while."""
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

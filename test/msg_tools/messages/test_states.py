@@ -1,6 +1,8 @@
 """JointState, TFMessage, Body and headers."""
 
 import importlib
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,6 @@ from msg_tools.messages.message_error import lengths_of
 from msg_tools.messages.states import (
     heaviest_joint_state,
     joint_state_message,
-    joint_trajectory,
     quaternions,
     transforms_message,
 )
@@ -32,6 +33,8 @@ def test_joint_state_of_the_heaviest(pose_mixture, messages):
 
 
 STAMPS = (1_700_000_000_900_000_000, 1_700_000_001_000_000_000, 1_700_000_002_150_000_000)
+EXAMPLE = Path(__file__).parents[3] / 'examples' / 'joint_trajectory.py'
+joint_trajectory = runpy.run_path(str(EXAMPLE))['joint_trajectory']
 TRAJECTORIES = TrajectoryMixture(
     weights=np.array([0.3, 0.6, 0.1]),
     means=np.arange(18.0).reshape(3, 3, 2),
