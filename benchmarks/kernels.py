@@ -16,8 +16,8 @@ from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.kernel_flops import ALL, KINDS, PLACING, counts, energies
 from benchmarks.machine import best_time, description, dgemm_rate
+from hmt_learning.motion.self_intersection import self_intersection_energy
 from hmt_ros.body import load_body
-from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.tracking.selection import choose_hypotheses
 

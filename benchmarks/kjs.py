@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import description, dgemm_rate
+from hmt_learning.motion.self_intersection import self_intersection_energy
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips import enumerate_flips
 from hmt_ros.flips.interpretation_tree import distinct_poses
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hmt_learning.app.motions import add_seed
+from hmt_learning.app.motions import add_body, add_seed
 from hmt_learning.app.rendered_bag import (
     CROSSING,
     MEASURED,
@@ -30,7 +30,6 @@ from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.app.command_line import (
     CommandParser,
-    add_body,
     image_size,
     number,
     run_command,

@@ -16,13 +16,20 @@ from typing import TypeVar
 import numpy as np
 
 from hmt_learning.training.training_set import MOTION_SUFFIXES, PoseSequence, motion_files
-from hmt_ros.app.command_line import add_body, number, whole_number
+from hmt_ros.app.command_line import number, whole_number
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.pose_predictor import RATE
 from msg_tools.files.error_line import error_line
 
 Item = TypeVar('Item')
+
+
+def add_body(parser: argparse._ActionsContainer) -> None:
+    """Adds --body."""
+    parser.add_argument(
+        '--body', default='human37', help='body model: a name or a YAML file (default: human37)'
+    )
 
 
 def add_motions(parser: argparse._ActionsContainer) -> None:

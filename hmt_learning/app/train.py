@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 from hmt_learning.app.motions import (
     add_alike,
+    add_body,
     add_model,
     add_seed,
     add_sources,
@@ -50,12 +51,7 @@ from hmt_learning.training.training_set import (
     training_set,
     typical_body,
 )
-from hmt_ros.app.command_line import (
-    CommandParser,
-    add_body,
-    run_command,
-    whole_number,
-)
+from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.progress import show_progress, with_progress
 from hmt_ros.app.report.skeletons import STYLE
 from hmt_ros.body import Body, load_body

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_learning.motion.inverse_kinematics import solve_joint_positions
+from hmt_learning.motion.self_intersection import self_intersection_energy
 from hmt_ros.body.body import Body
 from hmt_ros.body.limb_angles import SIDES
-from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.inference.arrays import Array
 
 Posture = dict[str, float]  # degree of freedom -> rad

@@ -95,13 +95,6 @@ class CommandParser(argparse.ArgumentParser):
         )
 
 
-def add_body(parser: argparse._ActionsContainer) -> None:
-    """Adds --body."""
-    parser.add_argument(
-        '--body', default='human37', help='body model: a name or a YAML file (default: human37)'
-    )
-
-
 def gravity_of(arguments: argparse.Namespace) -> list[float] | None:
     """The direction of gravity that --level or --gravity tell; None: it is not known."""
     return [0.0, 1.0, 0.0] if arguments.level else arguments.gravity

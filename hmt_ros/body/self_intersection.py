@@ -78,17 +78,6 @@ class SelfIntersection:
         return overlaps_of(self.body, self.sigma)
 
 
-def self_intersection_energy(body: Body, poses: Array, *, sigma: float = 0.02) -> Array:
-    """Energies (N,) of poses (N, d); sigma as for `SelfIntersection`."""
-    overlaps, d = overlaps_of(body, sigma), body.dimension
-    frames = forward(body.skeleton, poses)
-    placed = zip(*frames.by_pose(), *frames.dofs_by_pose(), strict=True)
-    value, gradient, hessian = np.zeros((len(poses), 1)), np.zeros(d), np.zeros((d, d))
-    for own, place in zip(value, placed, strict=True):
-        add_overlaps(overlaps, *place, False, own, gradient, hessian)
-    return value[:, 0]
-
-
 @lru_cache(maxsize=16)
 def overlaps_of(body: Body, sigma: float) -> Overlaps:
     """The parts of a body as compiled code reads them; sigma: overlap with energy 1/2, m."""

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_learning.motion.self_intersection import self_intersection_energy
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.body import PartShape
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import (
     TOLERANCE,
     SelfIntersection,
-    self_intersection_energy,
 )
 from test.oracles import single_terms
 

@@ -10,10 +10,10 @@ from hmt_learning.motion.procedural_motion import (
     PROCEDURAL_MOTIONS,
     procedural_motion,
 )
+from hmt_learning.motion.self_intersection import self_intersection_energy
 from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import load_body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.self_intersection import self_intersection_energy
 
 VIEW = Viewpoint()
 FPS = 20.0
