@@ -86,7 +86,7 @@ def test_limits_are_those_of_the_page():
         detections.MAX_PEOPLE,
         model_file.LARGEST_FILE,
         subject.LARGEST_FILE,
-        parameter_file._LARGEST_FILE,
+        parameter_file.LARGEST_FILE,
         rig.LARGEST_FILE,
         rig.LARGEST_MOTION,
         array_file.LARGEST_ARCHIVE,
