@@ -8,11 +8,9 @@ The rules, besides those of `CameraSession`:
 - With `use_mask` the mask of an image is its silhouette; an image whose mask shows somebody teaches
   no background.
 - With `tracked_interval` the track of the filter (`pose_mixture`) is heard. While it says that the
-  person is tracked, images are left to it: their messages have no components but the state of the
-  track, so that a subscriber that waits for a prediction goes on: the image was not looked at,
-  which does not say that nobody was seen. The first image that is `tracked_interval` younger than
-  the last one that was looked at is looked at once the track has come as far: its prediction goes
-  out behind the pose, as a second message of its stamp.
+  person is tracked, images within `tracked_interval` after the last prediction are not looked at.
+  Their messages have no components but the state of the track, so that a subscriber that waits for
+  a prediction goes on: the image was not looked at, which does not say that nobody was seen.
 - The silhouette of every image is published if somebody subscribes to it: that of the background
   subtraction, empty while the background is being learned. An image that is left to the track has
   one, too. With `use_mask` there is none besides the mask.
@@ -184,8 +182,6 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         # Stamps of the last image that was looked at, and of the last one with a track.
         self._looked: int | None = None
         self._tracked: int | None = None
-        # An image that is to be looked at once its pose is out.
-        self._due: WaitingImage | None = None
         self._by_keypoints: KeypointPredictor | None = None
         self._weights = np.empty(0)
         super().restart()
@@ -227,9 +223,6 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         elif self._tracked is None or stamp > self._tracked:
             tracked = message.state == TrackState.TRACKING and len(message.components)
             self._tracked = stamp if tracked else None
-            due, camera = self._due, self._camera
-            if due is not None and camera is not None and stamp >= due.stamp_ns:
-                self._look(due, camera)
 
     def _take_keypoints(self, row: ImageInput, message: Any, stamp: int) -> None:
         """Predicts from keypoints and those of the last second, without an image."""
@@ -282,8 +275,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if self._cue == FROM_KEYPOINTS:
             return
         in_turn = not self._waiting and self._newest is not None and stamp > self._newest
-        left = self._is_left_to_track(stamp) and not self._is_due(stamp)
-        if not in_turn or not left or self._wanted(SILHOUETTE):
+        if not in_turn or not self._is_left_to_track(stamp) or self._wanted(SILHOUETTE):
             super()._take_image(message, stamp)
             return
         # Not even decoded.
@@ -291,16 +283,11 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._leave_to_track(stamp, str(message.header.frame_id) or self._frame or FRAME_ID)
 
     def _is_left_to_track(self, stamp: int) -> bool:
-        """Whether nobody need wait for the prediction from an image."""
+        """Whether an image need not be predicted from."""
+        interval = self.parameters.tracked_interval * SECOND_NS
         if self._looked is None or self._tracked is None:
             return False
-        return stamp - self._tracked <= _SURE_NS
-
-    def _is_due(self, stamp: int) -> bool:
-        """Whether an image is to be looked at although it is left to the track."""
-        assert self._looked is not None
-        interval = self.parameters.tracked_interval * SECOND_NS
-        return self._due is None and stamp >= self._looked + interval
+        return stamp < self._looked + interval and stamp - self._tracked <= _SURE_NS
 
     def _leave_to_track(self, stamp: int, frame_id: str) -> None:
         self._log.counts['left'] += 1
@@ -312,13 +299,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if self._is_left_to_track(waiting.stamp_ns):
             self._publish_silhouette(waiting)
             self._leave_to_track(waiting.stamp_ns, waiting.frame_id)
-            if self._is_due(waiting.stamp_ns):
-                self._due = waiting
             return
-        self._look(waiting, camera)
-
-    def _look(self, waiting: WaitingImage, camera: Camera) -> None:
-        self._looked, self._due, self._reason = waiting.stamp_ns, None, ''
+        self._looked, self._reason = waiting.stamp_ns, ''
         try:
             mixture = self._mixture_of(waiting, camera)
         except (ValueError, ArithmeticError) as error:
