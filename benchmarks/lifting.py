@@ -171,7 +171,7 @@ def main(arguments: list[str]) -> int:
         'lifting', __doc__, quick=f'{QUICK} images of one clip, all of it known'
     )
     parser.add_argument('--clips', type=Path, help='folder of the clips')
-    parser.add_argument('--lifter', default=SHIPPED, help='file that learn-lifter wrote')
+    parser.add_argument('--lifter', default=SHIPPED, help='file that learn lifter wrote')
     options = parser.parse_args(arguments)
     return run_benchmark(
         'lifting',

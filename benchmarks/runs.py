@@ -584,7 +584,7 @@ def records_of(runs: Sequence[Run], folder: Path) -> list[Record | None]:
 def _normalised(text: str) -> str:
     """The same text for the same identity of a run; empty: the text is damaged.
 
-    What a file of an older checkout does not tell of a run is usual there; its runs over smaller
+    What a file of an older checkout does not state has its usual value; its runs over smaller
     images are left out.
     """
     usual = {x.name: x.default for x in fields(Run) if x.default is not MISSING}

@@ -1,6 +1,6 @@
 """Nodes and files under load and fault.
 
-`cases` lists what is done, runs it and tells of it; `messages`, `files` and `nodes` do it.
+`cases` lists the cases, runs them and reports; `messages`, `files` and `nodes` do it.
 """
 
 from benchmarks.soak.cases import as_text, main, measure

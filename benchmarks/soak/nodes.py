@@ -84,7 +84,7 @@ def killed(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
 
 def _has_come(watched: Watched) -> bool:
-    """Whether all has come that an answer tells of, of a node that lives no more."""
+    """Whether all messages that an answer names have arrived, from a node that has ended."""
     try:
         watched.node.answer('message', 0.0)
     except LiveNodeError:

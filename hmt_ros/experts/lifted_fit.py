@@ -5,7 +5,7 @@
 
 J_j is joint j of the pose x, a the axes of the person's view, t the middle of the hips; P_l is
 landmark l, A_l the projection across the ray of its keypoint, whose noise is n_l. A closed form
-gives the start (`motion.limb_angles`); linear least squares place it where the landmarks are seen;
+gives the start (`body.limb_angles`); linear least squares place it where the landmarks are seen;
 Newton's method within the limits gives the minimum, its Hessian the covariance. The distance of the
 person hardly shows: the spread of people's size is added along the line of sight.
 """
