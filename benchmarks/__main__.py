@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from benchmarks import BENCHMARKS, benchmark
-from hmt_ros.app.command_line import until_nobody_reads
+from hmt_ros.app.last_resort import last_resort
 
 HELP = """\
 usage: python -m benchmarks [NAME [options]]
@@ -36,4 +36,4 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(until_nobody_reads(lambda: main(sys.argv[1:])))
+    sys.exit(last_resort('benchmarks', lambda: main(sys.argv[1:]), debug=True))

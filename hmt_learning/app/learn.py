@@ -61,7 +61,7 @@ from hmt_learning.training.prior_learning import (
 )
 from hmt_learning.training.training_set import PoseSequence, recorded_sequence
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
-from hmt_ros.app.progress import show_progress, with_progress
+from hmt_ros.app.progress import say, show_progress, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.model_file import write_arrays
 from hmt_ros.experts.pose_predictor import RATE
@@ -163,14 +163,14 @@ def _lengths(arguments: argparse.Namespace) -> int:
     rows = np.array([lengths for _, lengths in found])
     names, relative = own_skeletons(body, people, rows)
     spread = learned_spread(relative, usual)
-    print(f'# {len(names)} people with a skeleton of their own: {", ".join(names)}')
+    say(f'# {len(names)} people with a skeleton of their own: {", ".join(names)}')
     if len(names) > 2:
         learned, plain = held_out(relative, usual)
-        print(f'# people left out: {learned.mean():.2f} nats, model file {plain.mean():.2f}')
-    print('lengths:')
+        say(f'# people left out: {learned.mean():.2f} nats, model file {plain.mean():.2f}')
+    say('lengths:')
     for (name, value), own in zip(body.segment_lengths.items(), spread.proportions, strict=True):
-        print(f'  {name}: [{value:.3f}, {own:.3f}]')
-    print(f'stature_spread: {spread.stature:.3f}')
+        say(f'  {name}: [{value:.3f}, {own:.3f}]')
+    say(f'stature_spread: {spread.stature:.3f}')
     return 0
 
 
@@ -196,7 +196,7 @@ def _motion(arguments: argparse.Namespace) -> int:
         skipped = len(paths) - len(sequences)
         skips = f', {skipped} skipped' if skipped else ''
         size = output.stat().st_size / 1e3
-        print(f'{output}: {len(sequences)} motions{skips}, {size:.0f} kB', flush=True)
+        say(f'{output}: {len(sequences)} motions{skips}, {size:.0f} kB')
     return 0
 
 
@@ -254,9 +254,9 @@ def _lifter(arguments: argparse.Namespace) -> int:
     mark.unlink(missing_ok=True)
     if not quiet:
         size = output.stat().st_size / 1e6
-        print(f'{output}: {len(learned)} motions, {size:.1f} MB', flush=True)
+        say(f'{output}: {len(learned)} motions, {size:.1f} MB')
         for name, value in lifter.notes.get('scores', {}).items():
-            print(f'  {name}: {value}', flush=True)
+            say(f'  {name}: {value}')
     return 0
 
 
@@ -309,24 +309,24 @@ def _method(s: PriorSettings, people: Iterable[str]) -> str:
 
 
 def _describe(output: Path, found: LearnedPrior) -> None:
-    print(
+    say(
         f'{output}: {len(found.mixture.components) - 1} components over '
         f'{len(found.mixture.dofs)} angles, from {found.poses} poses of {found.motions} motions '
         f'of {found.people} people, {output.stat().st_size / 1e3:.0f} kB'
     )
-    print('log likelihood of people left out, nats per pose:')
+    say('log likelihood of people left out, nats per pose:')
     for count, value in found.held_out.items():
-        print(f'  {count:3d} components {value:8.2f}')
-    print(f'  model file     {found.plain:8.2f}', flush=True)
+        say(f'  {count:3d} components {value:8.2f}')
+    say(f'  model file     {found.plain:8.2f}')
 
 
 def _describe_test(body: Body, found: LearnedPrior, data: PriorData, dofs: Index) -> None:
     def plain(poses: Array) -> Array:
         return plain_log_density(body, dofs, poses)
 
-    print('log likelihood of the test motions, nats per pose: learned, model file')
+    say('log likelihood of the test motions, nats per pose: learned, model file')
     for person in [*sorted(set(data.people)), None]:
         own = data if person is None else data.of([person])
         name = 'mean of the people' if person is None else person
         learned, usual = own.score(found.mixture.log_density), own.score(plain)
-        print(f'  {name:20s} {learned:8.2f} {usual:8.2f}')
+        say(f'  {name:20s} {learned:8.2f} {usual:8.2f}')

@@ -21,6 +21,7 @@ from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.pose_predictor import RATE
 from msg_tools.files.error_line import error_line
+from msg_tools.files.new_folder import check_file_place
 
 Item = TypeVar('Item')
 
@@ -127,8 +128,7 @@ def model_file(output: Path, *, overwrite: bool) -> Path:
     """
     if output.suffix != '.npz':
         output = output.with_name(output.name + '.npz')
-    if output.exists() and not overwrite:
-        raise ValueError(f'{output} exists: --overwrite replaces it')
+    check_file_place(output, overwrite=overwrite)
     if not output.parent.is_dir():
         raise ValueError(f'there is no folder {output.parent} for {output.name}')
     return output

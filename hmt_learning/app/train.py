@@ -52,7 +52,7 @@ from hmt_learning.training.training_set import (
     typical_body,
 )
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
-from hmt_ros.app.progress import show_progress, with_progress
+from hmt_ros.app.progress import say, show_progress, with_progress
 from hmt_ros.app.report.skeletons import STYLE
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN
@@ -60,6 +60,7 @@ from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.pose_encoding import AXES
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.inference.arrays import Array
+from msg_tools.files.new_folder import new_file
 
 Item = TypeVar('Item')
 
@@ -201,7 +202,7 @@ def _bars(quiet: bool) -> Callable[[str, str], Callable[[Iterable[Item], int], I
 
 def _say(options: argparse.Namespace, text: str) -> None:
     if not options.quiet:
-        print(text, flush=True)
+        say(text)
 
 
 def _sequences(options: argparse.Namespace, body: Body) -> tuple[list[PoseSequence], int]:
@@ -282,7 +283,8 @@ def write_report(
     ]
     result = []
     for figure, name, what in figures:
-        figure.savefig(folder / name)
+        with new_file(folder / name) as file:
+            figure.savefig(file)
         result.append((folder / name, what))
     return result
 

@@ -27,6 +27,7 @@ from hmt_ros.experts.network_experts import LEAK, WIDTHS, Layers, NetworkExperts
 from hmt_ros.experts.training_pairs import Standardisation, checked_pairs
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import k_means
+from msg_tools.files.new_folder import new_file
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -176,10 +177,8 @@ def _ahead(drawn: Callable[[int], Any], steps: range) -> Iterator[tuple[int, Any
 
 def _mark(path: Path, step: int, leaves: list[Any], settings: str) -> None:
     arrays: dict[str, Any] = {f'leaf{i}': np.asarray(leaf) for i, leaf in enumerate(leaves)}
-    partial = path.with_suffix('.part')
-    with partial.open('wb') as file:
+    with new_file(path) as file:
         np.savez(file, **arrays, step=step, settings=settings)
-    partial.replace(path)
 
 
 def _taken_up(path: Path, leaves: list[Any], settings: str) -> tuple[int, list[Any]]:

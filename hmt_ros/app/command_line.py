@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
 import hmt_ros
-from msg_tools.files.error_line import error_line
+from hmt_ros.app.last_resort import last_resort, told_in_lines
 
-# Exit codes of programs that the interrupt key or SIGPIPE has ended, as shells report them.
-INTERRUPTED, NOBODY_READS = 130, 141
 LARGEST = 10_000  # largest side of an image, px
 
 Number = TypeVar('Number', int, float)
@@ -30,6 +27,12 @@ class CommandParser(argparse.ArgumentParser):
             description=description,
             epilog=epilog,
             formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        self.add_argument(
+            '--debug',
+            action='store_true',
+            default=argparse.SUPPRESS,
+            help='print the traceback of an error, and what libraries print',
         )
 
     def error(self, message: str) -> NoReturn:
@@ -108,7 +111,8 @@ usage: python -m {program} <command> [arguments]
 commands:
 {commands}
 
-python -m {program} <command> --help lists the arguments of a command.
+python -m {program} <command> --help lists the arguments of a command. Whatever ends one early is
+told in one line on stderr; --debug behind the name of the command adds the traceback.
 {more}
 options:
   -h, --help  show this help
@@ -134,9 +138,10 @@ def run_program(
     Returns:
         The exit code: 0: done, 1: bad input, which one line on stderr explains.
     """
+    words = list(sys.argv[1:] if argv is None else argv)
 
     def run() -> int:
-        command, *rest = (sys.argv[1:] if argv is None else argv) or ['']
+        command, *rest = words or ['']
         if command in ('-h', '--help'):
             width = max(map(len, commands))
             lines = '\n'.join(f'  {name:{width}}  {what}' for name, (_, what) in commands.items())
@@ -148,11 +153,10 @@ def run_program(
             return 0
         if command not in commands:
             seen = f'no command {command!r}' if command else 'no command given'
-            print(f'{program}: {seen}, wanted one of {", ".join(commands)}', file=sys.stderr)
-            return 1
+            raise ValueError(f'{seen}, wanted one of {", ".join(commands)}')
         return int(importlib.import_module(commands[command][0]).main(rest))
 
-    return until_nobody_reads(run)
+    return last_resort(program, run, debug='--debug' in words)
 
 
 def run_command(
@@ -171,41 +175,19 @@ def run_command(
         whole_or_nothing: whether an interrupted command writes nothing, which a line then reports.
 
     Returns:
-        The exit code: that of `work`; 1 after bad input, which one line on stderr explains;
-        `INTERRUPTED`; `NOBODY_READS`.
+        The exit code: that of `work`, or see `last_resort`.
     """
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = '--debug' in words
 
     def run() -> int:
-        try:
-            return work(parser.parse_args(argv))
-        except BrokenPipeError:
-            raise
-        except (ValueError, OSError) as error:
-            print(f'{parser.prog}: {error_line(error)}', file=sys.stderr)
-            return 1
-        except KeyboardInterrupt:
-            if not whole_or_nothing:
-                raise
-            print(f'{parser.prog}: interrupted, nothing is written', file=sys.stderr)
-            return INTERRUPTED
+        arguments = parser.parse_args(words)
+        vars(arguments).pop('debug', None)
+        with nullcontext() if debug else told_in_lines(parser.prog):
+            return work(arguments)
 
-    return until_nobody_reads(run)
-
-
-def until_nobody_reads(printing: Callable[[], int]) -> int:
-    """The exit code of a function that prints; `NOBODY_READS` once its reader, say head, ends."""
-    try:
-        try:
-            return printing()
-        finally:
-            # Otherwise the interpreter finds the closed pipe at its end, and prints an error.
-            sys.stdout.flush()
-    except BrokenPipeError:
-        # Buffered text is still written at the end.
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
-        return NOBODY_READS
+    lost = ', nothing is written' if whole_or_nothing else ''
+    return last_resort(parser.prog, run, debug=debug, lost=lost)
 
 
 def number(

@@ -10,7 +10,7 @@ import argparse
 import time
 
 from hmt_ros.app.command_line import CommandParser, run_command
-from hmt_ros.app.progress import show_progress
+from hmt_ros.app.progress import say, show_progress
 from hmt_ros.compiled_code import compiled_functions, folder_in_use
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
@@ -40,5 +40,5 @@ def _compile(arguments: argparse.Namespace) -> int:
         BmeSession(BmeParameters(), lambda output: None).prepare()
     if not arguments.quiet:
         count, spent = compiled.count - before, time.monotonic() - start
-        print(f'{count} functions compiled in {spent:.0f} s, kept in {folder_in_use()}')
+        say(f'{count} functions compiled in {spent:.0f} s, kept in {folder_in_use()}')
     return 0

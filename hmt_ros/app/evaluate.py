@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.progress import show_progress
+from hmt_ros.app.progress import say, show_progress
 from hmt_ros.app.recorded_bodies import RecordedBodies, body_topics
 from hmt_ros.app.truth import is_truth, mixture_topics, read_truth, recorded_truth
 from hmt_ros.body import Body
@@ -23,6 +23,7 @@ from hmt_ros.evaluation.track_scores import Estimate, TrackScorer, TrackScores, 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from msg_tools import BagMessage, BagReader
+from msg_tools.files.error_line import one_line
 from msg_tools.messages.ground import GROUND, ground_of
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import (
@@ -30,6 +31,9 @@ from msg_tools.messages.trajectory_mixtures import (
     TrajectoryMixture,
     trajectory_mixture_of,
 )
+
+# Longest name in a table, and longest row of one with many topics, characters.
+LONGEST_CELL, WIDEST_TABLE = 60, 1000
 
 EPILOG = """\
 Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from their true
@@ -106,7 +110,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(as_json(found, truth, model_sigma, verticals), indent=1))
     else:
-        print(as_text(found, truth, verticals))
+        say(as_text(found, truth, verticals), most=WIDEST_TABLE)
     return 0
 
 
@@ -153,6 +157,7 @@ def as_text(
     verticals: Mapping[str, GravityScores] | None = None,
 ) -> str:
     """Tables for people: one row per topic, and the errors joint by joint."""
+    found = {one_line(name, LONGEST_CELL): topic for name, topic in found.items()}
     rows: list[tuple[str, ...]] = [
         (
             '',
@@ -213,6 +218,7 @@ def _percent(value: float | None) -> str:
 
 def table(rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a table; the first column is aligned left, all others right."""
+    rows = [[one_line(cell, LONGEST_CELL) for cell in row] for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
         '  '.join(

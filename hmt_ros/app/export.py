@@ -20,13 +20,14 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.progress import show_progress
+from hmt_ros.app.progress import say, show_progress
 from hmt_ros.app.recorded_bodies import RecordedBodies, read_grounds
 from hmt_ros.app.truth import mixture_topics
 from hmt_ros.body import Body
 from hmt_ros.body.moving_skeleton import CAMERA_TO_ROOM, MovingSkeleton, bvh_text
 from hmt_ros.inference.arrays import Array
 from msg_tools import BagReader
+from msg_tools.files.new_folder import check_file_place, new_file
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import (
     POSE_MIXTURE,
@@ -176,10 +177,9 @@ def _export(arguments: argparse.Namespace) -> int:
         raise ValueError(f'{output} ends in {kind!r}, wanted one of {" ".join(FORMATS)}')
     if arguments.fps is not None and kind != '.bvh':
         raise ValueError(f'--fps is for .bvh: a {kind} has the stamps of the recording')
-    if output.exists() and not arguments.overwrite:
-        raise ValueError(f'{output} exists; give another name, or --overwrite')
-    place = output if output.exists() else output.absolute().parent
-    if not os.access(place, os.W_OK) or output.is_dir():
+    check_file_place(output, overwrite=arguments.overwrite)
+    place = output.absolute().parent
+    if not os.access(place, os.W_OK):
         raise ValueError(f'{output} can not be written: {place} is no place to write to')
     with show_progress(str(output), 'messages', quiet=quiet) as bar:
         motion = read_tracked_motion(
@@ -191,12 +191,14 @@ def _export(arguments: argparse.Namespace) -> int:
             camera_axes=arguments.camera_axes,
             progress=bar.update,
         )
-        output.write_bytes(motion_bytes(motion, kind, arguments.fps))
+        content = motion_bytes(motion, kind, arguments.fps)
+        with new_file(output) as file:
+            file.write(content)
     if not quiet:
         span = f'{len(motion.steps)} poses over {motion.times[-1]:.2f} s'
         rate = f' at {arguments.fps or motion.rate:.4g} a second' if kind == '.bvh' else ''
-        print(f'{output}: {span}{rate}, of {motion.topic}')
-        print(*(f'  {note}' for note in motion.notes), sep='\n')
+        notes = (f'  {note}' for note in motion.notes)
+        say(f'{output}: {span}{rate}, of {motion.topic}', *notes)
     return 0
 
 

@@ -34,7 +34,7 @@ from hmt_ros.app.import_video.keypoint_files.reading import (
     keypoints_of_person,
     read_keypoints,
 )
-from hmt_ros.app.progress import show_progress, tell_user
+from hmt_ros.app.progress import say, show_progress, tell_user
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.experts.lifted_fit import lift_poses
@@ -217,7 +217,7 @@ def _lift(arguments: argparse.Namespace) -> int:
     _, written = write_report(options)
     if not quiet:
         posed = sum(one is not None for one in mixtures)
-        print(f'{folder / LIFTED}: {len(mixtures)} images, {posed} with a pose\n{written}')
+        say(f'{folder / LIFTED}: {len(mixtures)} images, {posed} with a pose\n{written}')
     return 0
 
 

@@ -21,6 +21,7 @@ from typing import Any, TypeAlias, TypeVar
 from tqdm import tqdm
 
 from hmt_ros.compiled_code import compiling
+from msg_tools.files.error_line import LONGEST_LINE, one_line, printable
 
 Item = TypeVar('Item')
 Progress: TypeAlias = 'tqdm[Any]'
@@ -84,7 +85,8 @@ def with_progress(
     quiet: bool = False,
 ) -> tqdm[Item]:
     """The items; shows how many of them are done. None: `update` counts."""
-    options: dict[str, Any] = {'iterable': items, 'desc': what, 'unit': f' {unit}', 'total': total}
+    options: dict[str, Any] = {'iterable': items, 'unit': f' {unit}', 'total': total}
+    options['desc'] = one_line(what)
     if not unit:
         options['bar_format'] = '{desc}: {elapsed} so far{postfix}'
     if quiet or _is_wide_terminal():
@@ -98,7 +100,13 @@ def with_progress(
 
 def tell_user(command: str, text: str) -> None:
     """Prints a line for the user on stderr, above the bar of `show_progress`."""
-    tqdm.write(f'{command}: {text}', file=sys.stderr)
+    tqdm.write(one_line(f'{command}: {text}', LONGEST_LINE), file=sys.stderr)
+
+
+def say(*texts: object, most: int = LONGEST_LINE) -> None:
+    """Prints results on stdout, in lines of at most `most` characters that can be printed."""
+    for line in '\n'.join(map(str, texts)).split('\n'):
+        print(printable(line, most), flush=True)
 
 
 def _is_wide_terminal() -> bool:

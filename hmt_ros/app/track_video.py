@@ -22,13 +22,14 @@ from hmt_ros.app.import_video.command import (
 )
 from hmt_ros.app.import_video.frames import Selection, open_source
 from hmt_ros.app.import_video.lens import TOLD_SIGMA, told_fov
-from hmt_ros.app.progress import tell_user
+from hmt_ros.app.progress import say, tell_user
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.body import load_body
 from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.sessions.focal_length import USUAL_FOV, USUAL_SIGMA
+from msg_tools.files.new_folder import new_file
 
 VIDEO, SUBJECT, TRACKED, REPORT = 'video', 'subject.yaml', 'tracked', 'report'
 # Images a second of a folder of images.
@@ -102,9 +103,9 @@ def _track(arguments: argparse.Namespace) -> int:
     tell = partial(tell_user, 'track-video')
     overwrite, stature = arguments.overwrite, arguments.stature
 
-    def say(text: object) -> None:
+    def done(text: object) -> None:
         if not quiet:
-            print(text, flush=True)
+            say(text)
 
     if arguments.keypoints is None and arguments.detector is None and not arguments.no_detector:
         usual = DETECTORS[USUAL_DETECTOR]
@@ -132,7 +133,7 @@ def _track(arguments: argparse.Namespace) -> int:
         tell(note)
     video, start = folder / VIDEO, folder / SUBJECT
     imported = import_video(ImportOptions.of(arguments, video), tell)
-    say(f'{video}: {imported}')
+    done(f'{video}: {imported}')
     subject = arguments.subject
     if stature is not None:
         try:
@@ -141,8 +142,9 @@ def _track(arguments: argparse.Namespace) -> int:
             tell(f'{error}: --stature is not used')
         else:
             subject = start
-            start.write_text(subject_text(seen, stature), encoding='utf-8')
-            say(f'{start}: {len(seen.joints.names)} joints at {seen.stamp_ns} ns')
+            with new_file(start) as file:
+                file.write(subject_text(seen, stature).encode())
+            done(f'{start}: {len(seen.joints.names)} joints at {seen.stamp_ns} ns')
     options = ReplayOptions(
         overwrite=overwrite,
         quiet=quiet,
@@ -152,7 +154,7 @@ def _track(arguments: argparse.Namespace) -> int:
         settings=[*settings, *_of_gravity(arguments), *arguments.settings],
     )
     replayed = replay_bag(video, folder / TRACKED, options, tell)
-    say(f'{folder / TRACKED}: {replayed}')
+    done(f'{folder / TRACKED}: {replayed}')
     _, written = write_report(
         ReportOptions(
             folder / TRACKED,
@@ -163,7 +165,7 @@ def _track(arguments: argparse.Namespace) -> int:
             notes=notes,
         )
     )
-    say(written)
+    done(written)
     return 0
 
 

@@ -18,6 +18,7 @@ import zipfile
 from pathlib import Path
 
 from hmt_ros.detectors.detector import DetectorError
+from msg_tools.files.new_folder import new_file
 
 # Package that runs the networks, and the module that it brings.
 RUNTIME, RUNTIME_MODULE = 'ai-edge-litert', 'ai_edge_litert'
@@ -137,10 +138,8 @@ def _write(networks: dict[str, bytes]) -> None:
         folder = own
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in networks.items():
-        # A reader sees the whole file or none.
-        unfinished = folder / f'{name}.part'
-        unfinished.write_bytes(data)
-        unfinished.replace(folder / name)
+        with new_file(folder / name) as file:
+            file.write(data)
 
 
 def _pip(*arguments: str) -> None:

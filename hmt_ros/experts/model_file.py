@@ -8,8 +8,6 @@ arrays under a prefix: `nested` and `part`.
 from __future__ import annotations
 
 import json
-import os
-import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_tools.files.array_file import read_archive
+from msg_tools.files.new_folder import new_file
 
 FORMAT = 'hmt_ros model'
 VERSION = 1
@@ -88,21 +87,17 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
 
     Returns:
         The path written.
+
+    Raises:
+        ValueError: there is a link, or something that is no file.
+        OSError: it can not be written.
     """
     path = Path(path)
     if path.suffix != '.npz':
         path = path.with_name(path.name + '.npz')
     content: dict[str, Any] = dict(arrays)
-    partial = path.with_name(f'.{path.name}.{secrets.token_hex(4)}.partial')
-    try:
-        with partial.open('xb') as file:
-            np.savez_compressed(file, **content)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    with new_file(path) as file:
+        np.savez_compressed(file, **content)
     return path
 
 

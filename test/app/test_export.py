@@ -251,16 +251,20 @@ def test_a_body_that_is_not_known_leaves_tables(body, poses, tmp_path, capsys):
         ('a.bvh', ['--track', '7'], 'has no track 7; it has [1]'),
         ('a.bvh', ['--identity', 'x'], 'wanted a whole number from 1 to 9223372036854775807'),
         ('no/a.bvh', [], 'no is no place to write to'),
-        ('folder.bvh', ['--overwrite'], 'folder.bvh is no place to write to'),
+        ('folder.bvh', ['--overwrite'], 'folder.bvh is not replaced: it is a link or no file'),
+        ('link.bvh', [], 'link.bvh exists; give another name, or --overwrite'),
+        ('link.bvh', ['--overwrite'], 'link.bvh is not replaced: it is a link or no file'),
         ('there.bvh', [], 'there.bvh exists; give another name, or --overwrite'),
     ],
 )
 def test_bad_input_is_one_line(run, tmp_path, capsys, out, options, said):
     (tmp_path / 'folder.bvh').mkdir()
     (tmp_path / 'there.bvh').write_text('mine')
+    (tmp_path / 'link.bvh').symlink_to(tmp_path / 'elsewhere')
     assert export.main([str(run), '-o', str(tmp_path / out), *options]) == 1
     error = capsys.readouterr().err
     assert said in error
+    assert not (tmp_path / 'elsewhere').exists()
     assert error.count('\n') == 1
     assert (tmp_path / 'there.bvh').read_text() == 'mine'
 

@@ -32,7 +32,7 @@ from hmt_ros.app.import_video.keypoint_files.reading import (
     keypoints_of_person,
     read_keypoints,
 )
-from hmt_ros.app.progress import Tell, tell_user, with_progress
+from hmt_ros.app.progress import Tell, say, tell_user, with_progress
 from hmt_ros.body import Camera
 from hmt_ros.detectors.detector import Detector
 from hmt_ros.detectors.registry import DETECTORS
@@ -280,7 +280,7 @@ def _import(arguments: argparse.Namespace) -> int:
     tell = partial(tell_user, 'import-video')
     imported = import_video(ImportOptions.of(arguments, arguments.output), tell)
     if not arguments.quiet:
-        print(f'{arguments.output}: {imported}')
+        say(f'{arguments.output}: {imported}')
     return 0
 
 

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, run_command
-from hmt_ros.app.progress import tell_user
+from hmt_ros.app.progress import say, tell_user
 from hmt_ros.app.replay.many_bags import is_many, replay_many
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import LOG_TIMES, STAMPS, ReplayOptions
@@ -207,5 +207,5 @@ def _replay(arguments: argparse.Namespace) -> int:
         return replay_many(bags, output, options, tell, scheduler)
     replayed = replay_bag(bags[0], output, options.of_bag(bags[0]), tell)
     if not options.quiet:
-        print(f'{output}: {replayed}')
+        say(f'{output}: {replayed}')
     return 0

@@ -14,7 +14,6 @@ import importlib
 import json
 import logging
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -25,15 +24,15 @@ import cv2
 from tqdm import tqdm
 
 import hmt_ros
-from hmt_ros.app.command_line import INTERRUPTED
-from hmt_ros.app.progress import Tell, show_progress
+from hmt_ros.app.last_resort import INTERRUPTED
+from hmt_ros.app.progress import Tell, say, show_progress
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions, parameters_of_bag
 from hmt_ros.inference.threads import limit_threads
 from msg_tools import BagError
 from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES
-from msg_tools.files.error_line import error_line
-from msg_tools.files.new_folder import unfinished_folders
+from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
+from msg_tools.files.new_folder import new_file
 
 # Options that change the new bag, besides the parameters.
 _DECIDING = (
@@ -130,14 +129,14 @@ def replay_many(
                 if outcome.kind == FAILED:
                     tell(f'{outcome.name}: {outcome.text}')
                 elif not options.quiet:
-                    tqdm.write(f'{outcome.name}: {outcome.text}')
+                    tqdm.write(one_line(f'{outcome.name}: {outcome.text}', LONGEST_LINE))
                 bar.update()
     except KeyboardInterrupt:
         done = counts[DONE] + counts[BEFORE]
         tell(f'interrupted, {done} of {len(jobs)} bags are done; the same command continues')
         return INTERRUPTED
     if not options.quiet:
-        print(
+        say(
             f'{output}: {counts[DONE]} replayed, {counts[BEFORE]} done before, '
             f'{counts[FAILED]} failed'
         )
@@ -224,8 +223,6 @@ def _replayed_once(job: Job, tell: Tell) -> tuple[str, str]:
             return BEFORE, 'done before'
         # This command has started the bag and did not complete it: its remains are ours.
         options = replace(options, overwrite=True)
-        for folder in unfinished_folders(target):
-            shutil.rmtree(folder, ignore_errors=True)
     elif os.path.lexists(target) and not options.overwrite:
         raise BagError(
             f'{target} exists, made from other input or with other parameters; --overwrite '
@@ -295,12 +292,8 @@ def _read_record(path: Path) -> dict[str, Any]:
 
 
 def _write_record(path: Path, content: dict[str, Any]) -> None:
-    partial = path.with_name(f'.{path.name}.partial')
-    with partial.open('w', encoding='utf-8') as file:
-        json.dump(content, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    with new_file(path) as file:
+        file.write(json.dumps(content, indent=1).encode())
 
 
 # Choice of bags

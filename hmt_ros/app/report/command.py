@@ -10,7 +10,7 @@ from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.evaluate import chosen_topics, score_bag
-from hmt_ros.app.progress import Progress, show_progress
+from hmt_ros.app.progress import Progress, say, show_progress
 from hmt_ros.app.recorded_bodies import body_topics, read_grounds
 from hmt_ros.app.report.detector import read_detector
 from hmt_ros.app.report.images import FilmStrip, ImageSource, film_strip, image_source
@@ -105,7 +105,7 @@ def _report(arguments: argparse.Namespace) -> int:
     options = ReportOptions(**vars(arguments))
     _, summary = write_report(options)
     if not options.quiet:
-        print(summary)
+        say(summary)
     return 0
 
 

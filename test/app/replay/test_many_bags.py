@@ -97,7 +97,7 @@ def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkey
     def killed(source, target, options, tell, **shown):
         """Leaves what a process leaves that is killed in its second bag."""
         if begun:
-            folder = target.with_name(f'.{target.name}.0123abcd.partial')
+            folder = target.with_name(f'.{target.name}.0123abcd.partial') / target.name
             folder.mkdir(parents=True)
             (folder / 'b.mcap').write_bytes(b'half')
             raise KeyboardInterrupt
