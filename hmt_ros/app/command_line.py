@@ -186,8 +186,9 @@ def run_command(
         with nullcontext() if debug else told_in_lines(parser.prog):
             return work(arguments)
 
-    lost = ', nothing is written' if whole_or_nothing else ''
-    return last_resort(parser.prog, run, debug=debug, lost=lost)
+    return last_resort(
+        parser.prog, run, debug=debug, lost=', nothing is written' if whole_or_nothing else ''
+    )
 
 
 def number(

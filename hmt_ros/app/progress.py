@@ -30,13 +30,13 @@ Tell = Callable[[str], object]  # a line for the user
 INTERVAL = 3.0  # s, between two lines; a bar shows the time every second
 
 
-class _LineFile:
-    """A file that prints each state of a bar as a line on stderr."""
+class LineFile:
+    """A file that prints what is written to it, the state of a bar say, as a line on stderr."""
 
     def write(self, text: str) -> None:
         """Prints what tqdm would draw over its last state; nothing where it clears that."""
         if text.strip():
-            print(text.strip(), file=sys.stderr, flush=True)
+            print(printable(text.strip()), file=sys.stderr, flush=True)
 
     def flush(self) -> None:
         """Nothing is kept."""
@@ -93,9 +93,7 @@ def with_progress(
         # One bar below another is removed at its end.
         return _Bar(1.0, **options, disable=quiet, leave=None)
     # The thread prints all lines, none before the first interval has passed.
-    return _Bar(
-        INTERVAL, **options, file=_LineFile(), ncols=0, mininterval=math.inf, delay=math.inf
-    )
+    return _Bar(INTERVAL, **options, file=LineFile(), ncols=0, mininterval=math.inf, delay=math.inf)
 
 
 def tell_user(command: str, text: str) -> None:

@@ -91,7 +91,7 @@ def relative_positions(
     """
     missing = [name for name in (*origin, *joints) if name not in names]
     if missing:
-        raise ValueError(f'a skeleton of {list(names)} has no joints {missing}')
+        raise ValueError(f'a skeleton has no joints {missing}, it has {list(names)}')
     centre = positions[..., [names.index(name) for name in origin], :].mean(-2, keepdims=True)
     return np.asarray(positions[..., [names.index(name) for name in joints], :] - centre)
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_tools.files.array_file import read_archive
+from msg_tools.files.error_line import error_line
 from msg_tools.files.new_folder import new_file
 
 FORMAT = 'hmt_ros model'
@@ -73,9 +74,9 @@ def parameters_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 def damaged(where: str, fault: Exception) -> ValueError:
     """The error to raise from one of `FAULTS`."""
-    text = ' '.join(str(fault).split())
+    kind = type(fault).__name__
     return ValueError(
-        f'{where}: a damaged model file ({type(fault).__name__}: {text}); train it again'
+        f'{where}: a damaged model file ({kind}: {error_line(fault)}); train it again'
     )
 
 
@@ -114,8 +115,7 @@ def read_arrays(path: str | Path, kind: str | None = None) -> Arrays:
     try:
         arrays = read_archive(path)
     except (OSError, ValueError) as fault:
-        text = ' '.join(str(fault).split())
-        raise ValueError(f'{path}: not a model file of hmt_ros ({text})') from fault
+        raise ValueError(f'{path}: not a model file of hmt_ros ({error_line(fault)})') from fault
     check_header(arrays, kind, str(path))
     for name, values in arrays.items():
         if values.dtype.kind == 'f' and not np.isfinite(values).all():

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 import threading
 import time
@@ -24,7 +25,6 @@ from typing import Any
 
 import cv2
 import rclpy
-from rclpy.exceptions import ParameterException
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -140,23 +140,23 @@ class Video:
 def main(args: list[str] | None = None) -> int:
     """Publishes until the video ends or a signal comes; returns 0, or 1 without a camera."""
     arguments = sys.argv[1:] if args is None else args
-    given = _parser().parse_args(remove_ros_args([NAME, *arguments])[1:])
     stopped = threading.Event()
     on_signals(lambda *_: stopped.set())
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node(NAME)
+    os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')  # none of its lines
     try:
+        given = _parser().parse_args(remove_ros_args([NAME, *arguments])[1:])
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node(NAME)
         p = declare(node, CameraNodeParameters())
         video = Video(given.video, loop=p.loop, speed=p.rate)
         try:
             _show(node, video, given, p.wait_for.split(), stopped)
         finally:
             video.close()
-    except (ParameterException, ValueError) as error:
+    except Exception as error:  # noqa: BLE001 - whatever it is given, the node says why it ends
         sys.stderr.write(f'{NAME}: {error_line(error)}\n')
         return 1
     finally:
-        node.destroy_node()
         rclpy.try_shutdown()
     return 0
 

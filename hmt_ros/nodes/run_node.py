@@ -17,7 +17,6 @@ from typing import Any
 
 import cv2
 import rclpy
-from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
@@ -63,6 +62,7 @@ def run_together(
     _use_one_heap()
     # OpenCV's own threads wait actively: on images of a camera they cost more than they save.
     cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     sys.setswitchinterval(_SWITCH_INTERVAL)
     # The handlers of rclpy end the context in the middle of the work; ours let the work finish.
     stopped = threading.Event()
@@ -79,7 +79,7 @@ def run_together(
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         nodes = make()
-    except (ParameterException, ValueError, RuntimeError) as error:
+    except Exception as error:  # noqa: BLE001 - whatever it is given, a node starts or says why not
         sys.stderr.write(f'{name}: {error_line(error)}\n')
         rclpy.try_shutdown()
         return 1

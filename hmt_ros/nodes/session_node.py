@@ -418,7 +418,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     def _tell_error(self, error: Exception) -> str:
         self._errors += 1
         self._last_error = f'{type(error).__name__}: {error_line(error)}'
-        self.get_logger().error(''.join(traceback.format_exception(error)))
+        self.get_logger().error(f'{self._last_error}; --log-level debug shows where')
+        self.get_logger().debug(''.join(traceback.format_exception(error)))
         return self._last_error
 
     def _publish(self, output: Output) -> None:

@@ -239,7 +239,7 @@ class Session(ABC, Generic[Parameters, State]):
         """Counts an error of the session itself, and restarts the estimate."""
         self._log.fault('node itself', text)
         self.restart()
-        # The traceback is in the log of the node already.
+        # The error is in the log of the node already.
         return replace(self._log.handled(source, 0), warnings=())
 
     def count_dropped(self, messages: int) -> None:

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 # Characters of a line; one that a log puts its own words around is shorter.
 LONGEST_LINE, LONGEST_TEXT = 300, 220
-# A text is searched up to this number of characters.
-_LONGEST_SEARCHED = 20_000
 
 
 def one_line(text: str, most: int = LONGEST_TEXT) -> str:
     """A text without breaks and control characters, of at most `most` characters."""
-    return printable(' '.join(_shortened(text, _LONGEST_SEARCHED).split()), most)
+    return printable(' '.join(_shortened(text, 100 * most).split()), most)
 
 
 def error_line(error: BaseException, most: int = LONGEST_TEXT) -> str:
@@ -24,10 +22,8 @@ def error_line(error: BaseException, most: int = LONGEST_TEXT) -> str:
 
 def printable(text: str, most: int = LONGEST_LINE) -> str:
     """A line as it is but for its length, with escapes for what can not be printed."""
-    short = _shortened(text, most)
-    if short.isprintable():
-        return short
-    return _shortened(''.join(x if x.isprintable() else ascii(x)[1:-1] for x in short), most)
+    shown = (x if x.isprintable() else ascii(x)[1:-1] for x in _shortened(text, most))
+    return _shortened(''.join(shown), most)
 
 
 def _shortened(text: str, most: int) -> str:

@@ -1,20 +1,20 @@
 """Writes folders and files as a whole or not at all.
 
-Both are made under a hidden name beside their place, `.<name>.<random>.partial`, and renamed. They
-are locked while they are made: those without a lock are left from a process that was killed, and
-the next one that comes to the same place removes them. Links are neither replaced nor followed.
+Both are made in a hidden folder beside their place, `.<name>.<random>.partial`, and renamed. It is
+locked meanwhile: one without a lock is left from a process that was killed, and is removed when the
+next one has come to the same place. Links are neither replaced nor followed.
 """
 
 from __future__ import annotations
 
 import fcntl
+import glob
 import logging
 import os
 import re
-import secrets
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -50,7 +50,7 @@ class FolderKind:
         if not overwrite:
             raise ValueError(f'{target} exists; give another name, or --overwrite')
         names = sorted(path.name for path in target.iterdir()) if target.is_dir() else []
-        foreign = self._foreign(names)
+        foreign = _foreign(names, (self.marker, *self.own))
         if target.is_symlink() or self.marker not in names or foreign:
             why = f'it has {foreign[0]}' if foreign else f'it is not the folder of {self.what}'
             raise ValueError(f'{target} is not replaced: {why}; give another name')
@@ -69,41 +69,14 @@ class FolderKind:
         self.check_place(target, overwrite=overwrite)
         missing = [folder for folder in target.parents if not folder.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
-        with _without_remains(target, lambda left: self._fills(left, target.name)):
-            around = Path(
-                tempfile.mkdtemp(prefix=f'.{target.name}.', suffix=_PARTIAL, dir=target.parent)
-            )
-            try:
-                with _locked(around):
-                    yield around / target.name
-                    self.check_place(target, overwrite=overwrite)
-                    replaced = around / _REPLACED
-                    if target.exists():
-                        target.rename(replaced)
-                    try:
-                        (around / target.name).rename(target)
-                    except BaseException:
-                        if replaced.exists():
-                            replaced.rename(target)
-                        raise
-            finally:
-                shutil.rmtree(around, ignore_errors=True)
-                for folder in missing:
-                    with suppress(OSError):  # the new folder is in it
-                        folder.rmdir()
-
-    def _foreign(self, names: Iterable[str]) -> list[str]:
-        """Those that are not of files of such a folder."""
-        own = (self.marker, *self.own)
-        return [x for x in names if not any(fnmatchcase(x, pattern) for pattern in own)]
-
-    def _fills(self, left: Path, name: str) -> bool:
-        """Whether all in a hidden folder is of a folder of this kind, by its name."""
-        return left.is_dir() and all(
-            not self._foreign(files)
-            and all(x in (name, _REPLACED) or x.endswith(_PARTIAL) for x in folders)
-            for _, folders, files in os.walk(left)
-        )
+        try:
+            with _made_aside(target, (self.marker, *self.own)) as new:
+                yield new
+                self.check_place(target, overwrite=overwrite)
+        finally:
+            for folder in missing:
+                with suppress(OSError):  # the new folder is in it
+                    folder.rmdir()
 
 
 def check_file_place(target: Path, *, overwrite: bool) -> None:
@@ -112,11 +85,9 @@ def check_file_place(target: Path, *, overwrite: bool) -> None:
     Args:
         overwrite: whether a file that is there may be replaced; a link never is.
     """
-    if not os.path.lexists(target):
-        return
-    if not overwrite:
+    if os.path.lexists(target) and not overwrite:
         raise ValueError(f'{target} exists; give another name, or --overwrite')
-    if target.is_symlink() or not target.is_file():
+    if target.is_symlink() or (target.exists() and not target.is_file()):
         raise ValueError(f'{target} is not replaced: it is a link or no file; give another name')
 
 
@@ -130,55 +101,71 @@ def new_file(target: Path) -> Iterator[BinaryIO]:
     """
     target = target.absolute()
     check_file_place(target, overwrite=True)
-    partial = target.with_name(f'.{target.name}.{secrets.token_hex(4)}{_PARTIAL}')
-    with _without_remains(target, Path.is_file):
-        try:
-            with partial.open('xb') as file, _locked(partial):
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-                partial.replace(target)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
+    with _made_aside(target, (glob.escape(target.name),)) as new, new.open('xb') as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Shows others that a file or a folder is being made."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+def _made_aside(target: Path, own: Sequence[str]) -> Iterator[Path]:
+    """Where to make a file or a folder, which takes the place of what is there then.
+
+    Args:
+        own: patterns of the names of the files that it may have.
+    """
+    around = Path(tempfile.mkdtemp(prefix=f'.{target.name}.', suffix=_PARTIAL, dir=target.parent))
+    replaced = around / _REPLACED
     try:
-        with suppress(OSError):  # a file system without locks, of a network for example
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
+        with _locked(around):
+            yield around / target.name
+            if target.is_dir():
+                target.rename(replaced)
+            try:
+                (around / target.name).rename(target)
+            except BaseException:
+                if replaced.exists():
+                    replaced.rename(target)
+                raise
+            _remove_remains(target, own)
     finally:
-        os.close(descriptor)
+        shutil.rmtree(around, ignore_errors=True)
 
 
 @contextmanager
-def _without_remains(target: Path, is_ours: Callable[[Path], bool]) -> Iterator[None]:
-    """Names what killed processes have left beside a place, and removes it once work is done."""
-    hidden = re.compile(rf'\.{re.escape(target.name)}\.[a-z0-9_]{{8}}{re.escape(_PARTIAL)}')
-    beside = [x for x in sorted(target.parent.iterdir()) if hidden.fullmatch(x.name)]
-    left = [x for x in beside if not x.is_symlink() and is_ours(x) and _is_abandoned(x)]
-    for path in left:
-        _log.warning('%s: left by a run that was killed; removed once this one succeeds', path)
-    yield
-    for path in filter(_is_abandoned, left):
-        with suppress(OSError):
-            path.unlink() if path.is_file() else shutil.rmtree(path)
-
-
-def _is_abandoned(path: Path) -> bool:
-    """Whether nobody makes a file or a folder any more; False where that can not be known."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
-    except OSError:
-        return False
-    try:
+def _locked(folder: Path) -> Iterator[bool]:
+    """Shows others that a folder is in use; whether it was free, and the system has locks."""
+    descriptor, free = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW), False
+    with suppress(OSError):
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
+        free = True
+    try:
+        yield free
     finally:
         os.close(descriptor)
-    return True
+
+
+def _remove_remains(target: Path, own: Sequence[str]) -> None:
+    """Removes what killed processes have left beside a place, and names it."""
+    hidden = re.compile(rf'\.{re.escape(target.name)}\.[a-z0-9_]{{8}}{re.escape(_PARTIAL)}')
+    with suppress(OSError):
+        for path in sorted(target.parent.iterdir()):
+            if hidden.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
+                with _locked(path) as free:
+                    if free and _holds_only(path, target.name, own):
+                        shutil.rmtree(path)
+                        _log.warning('%s: removed, a run that was killed had left it', path)
+
+
+def _holds_only(folder: Path, name: str, own: Sequence[str]) -> bool:
+    """Whether all in a hidden folder is of what was made in it."""
+    return all(
+        not _foreign(files, own)
+        and not _foreign(folders, (glob.escape(name), _REPLACED, f'*{_PARTIAL}'))
+        for _, folders, files in os.walk(folder)
+    )
+
+
+def _foreign(names: Iterable[str], own: Sequence[str]) -> list[str]:
+    """Names that fit none of the patterns."""
+    return [x for x in names if not any(fnmatchcase(x, pattern) for pattern in own)]
