@@ -129,8 +129,6 @@ def model_file(output: Path, *, overwrite: bool) -> Path:
     if output.suffix != '.npz':
         output = output.with_name(output.name + '.npz')
     check_file_place(output, overwrite=overwrite)
-    if not output.parent.is_dir():
-        raise ValueError(f'there is no folder {output.parent} for {output.name}')
     return output
 
 

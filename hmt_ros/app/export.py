@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -178,9 +177,6 @@ def _export(arguments: argparse.Namespace) -> int:
     if arguments.fps is not None and kind != '.bvh':
         raise ValueError(f'--fps is for .bvh: a {kind} has the stamps of the recording')
     check_file_place(output, overwrite=arguments.overwrite)
-    place = output.absolute().parent
-    if not os.access(place, os.W_OK):
-        raise ValueError(f'{output} can not be written: {place} is no place to write to')
     with show_progress(str(output), 'messages', quiet=quiet) as bar:
         motion = read_tracked_motion(
             arguments.bag,

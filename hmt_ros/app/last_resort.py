@@ -93,14 +93,12 @@ def told_in_lines(program: str) -> Iterator[None]:
 
     usual = sys.stderr
     shown = os.fdopen(os.dup(2), 'w', 1, usual.encoding, usual.errors)
-    logged = logging.StreamHandler(LineFile())
-    logged.setFormatter(logging.Formatter(f'{program}: %(message)s'))
     with (
         shown,
         _replaced(sys, stderr=shown if usual is sys.__stderr__ else usual, unraisablehook=ended),
         _replaced(threading, excepthook=ended),
         _replaced(warnings, showwarning=warned),
-        _replaced(logging, lastResort=logged),
+        _replaced(logging, lastResort=logging.StreamHandler(LineFile())),
     ):
         _nowhere(2)
         try:

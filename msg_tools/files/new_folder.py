@@ -89,6 +89,8 @@ def check_file_place(target: Path, *, overwrite: bool) -> None:
         raise ValueError(f'{target} exists; give another name, or --overwrite')
     if target.is_symlink() or (target.exists() and not target.is_file()):
         raise ValueError(f'{target} is not replaced: it is a link or no file; give another name')
+    if not os.access(target.absolute().parent, os.W_OK):
+        raise ValueError(f'{target} can not be written: its folder is no place to write to')
 
 
 @contextmanager

@@ -250,7 +250,7 @@ def test_a_body_that_is_not_known_leaves_tables(body, poses, tmp_path, capsys):
         ('a.bvh', ['--identity', '9'], 'has no motion of identity 9; the longest are 1, 2'),
         ('a.bvh', ['--track', '7'], 'has no track 7; it has [1]'),
         ('a.bvh', ['--identity', 'x'], 'wanted a whole number from 1 to 9223372036854775807'),
-        ('no/a.bvh', [], 'no is no place to write to'),
+        ('no/a.bvh', [], 'no/a.bvh can not be written: its folder is no place to write to'),
         ('folder.bvh', ['--overwrite'], 'folder.bvh is not replaced: it is a link or no file'),
         ('link.bvh', [], 'link.bvh exists; give another name, or --overwrite'),
         ('link.bvh', ['--overwrite'], 'link.bvh is not replaced: it is a link or no file'),

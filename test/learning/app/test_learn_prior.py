@@ -70,7 +70,7 @@ def test_the_command_learns_chooses_and_tells(folder, tmp_path, read_here, capsy
     assert learn.main(['prior', *rest, '--quiet', '-o', str(again)]) == 0
     assert again.with_suffix('.npz').read_bytes() == output.read_bytes()
     assert learn.main(['prior', *rest, '-o', str(output)]) == 1
-    assert 'exists: --overwrite replaces it' in capsys.readouterr().err
+    assert 'exists; give another name, or --overwrite' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

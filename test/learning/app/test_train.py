@@ -116,7 +116,7 @@ def test_bad_input_is_one_line(tmp_path, read_here, capsys):
         (['-o', output, '--mocap', str(empty)], 'has no motion'),
         (['-o', output, '--mocap', str(tmp_path / 'absent')], 'wanted a folder or a motion'),
         (['-o', output, '--motions', 'swim'], "no motion 'swim'"),
-        (['-o', str(tmp_path / 'x' / 'm.npz'), '--motions', 'walk'], 'no folder'),
+        (['-o', str(tmp_path / 'x' / 'm.npz'), '--motions', 'walk'], 'its folder is no place'),
         (['-o', output, '--motions', 'walk', '--samples', '3'], 'from 50'),
         (['-o', output, '--motions', 'walk', '--body', 'nobody'], 'nobody'),
         (['--motions', 'walk'], '-o'),
