@@ -54,6 +54,7 @@ from hmt_ros.tracking import (
     TrackerSettings,
     read_subject,
 )
+from msg_tools.files.new_folder import new_file
 
 Item = TypeVar('Item')
 Result = TypeVar('Result')
@@ -523,12 +524,10 @@ def _run_and_keep(item: tuple[Run, Path]) -> None:
     one, path = item
     _warm_up(one)
     record = run(one)
-    partial = path.with_suffix(f'.{os.getpid()}.tmp.npz')
-    np.savez_compressed(
-        partial, **{each.name: getattr(record, each.name) for each in fields(record)}
-    )
-    path.with_suffix('.json').write_text(json.dumps(one.identity), 'utf-8')
-    partial.replace(path)
+    with new_file(path.with_suffix('.json')) as file:
+        file.write(json.dumps(one.identity).encode())
+    with new_file(path) as file:
+        np.savez_compressed(file, **{x.name: getattr(record, x.name) for x in fields(record)})
 
 
 # Filled once this process has run a tracker.

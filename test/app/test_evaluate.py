@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hmt_learning.app.rendered_bag import ground_truth
-from hmt_ros.app.evaluate import main
+from hmt_ros.app.evaluate import main, table
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, joint_mixtures, score
 from hmt_ros.inference import GaussianMixture
@@ -386,6 +386,13 @@ def test_bags_that_can_not_be_used(capsys, tmp_path, bag, body, mixtures, truth_
         assert (code, out, len(errors)) == (1, '', 1), (wanted, errors)
         assert errors[0].startswith('evaluate: ')
         assert wanted in errors[0], errors[0]
+
+
+def test_table_of_hostile_names_is_one_of_short_rows():
+    lines = table([('a\n\x1b[2Jb', '1.0'), (10_000 * 'x', '22.0')])
+    assert lines[0].rstrip() == r'a \x1b[2Jb' + 52 * ' ' + ' 1.0'
+    assert lines[1].endswith('xxx  22.0')
+    assert len(lines[1]) == 66
 
 
 def test_feet_against_the_floor(tmp_path, body, mixtures, truth_file, capsys):

@@ -9,6 +9,7 @@ import sys
 import threading
 import warnings
 import zlib
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -216,6 +217,51 @@ def test_closed_standard_files_are_no_files_of_ours(tmp_path):
 
     assert ended('-c', WRITES, tmp_path / 'out', preexec_fn=close)[0] == 0
     assert (tmp_path / 'out').read_bytes() == b'content'
+
+
+FILLS = """\
+import os, resource, sys
+from hmt_ros.app.command_line import CommandParser, run_command
+from msg_tools import BagWriter, RosbagsMessages
+def work(arguments):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))
+    with BagWriter(sys.argv[1]) as bag:
+        for stamp in range(100):
+            text = os.urandom(10_000).hex()
+            bag.write('text', stamp, RosbagsMessages().create('std_msgs/msg/String', data=text))
+    return 0
+sys.exit(run_command(CommandParser('work'), work, []))
+"""
+
+
+def test_full_disk_under_a_bag_is_one_line(tmp_path):
+    code, out, error = ended('-c', FILLS, tmp_path / 'out')
+    assert (code, out) == (1, '')
+    assert only_line(error) == f'work: {tmp_path}/out can not be written: File too large'
+    assert list(tmp_path.iterdir()) == []
+
+
+def fail_there(_):
+    raise MemoryError(HOSTILE)
+
+
+@pytest.mark.parametrize('pool', [ProcessPoolExecutor, ThreadPoolExecutor])
+def test_exception_in_a_worker_is_one_line(pool, run_with, capsys):
+    def work(_):
+        with pool(1) as workers:
+            return list(workers.map(fail_there, [0]))
+
+    assert run_with('learn', work) == 1
+    assert only_line(capsys.readouterr().err).startswith('learn: MemoryError: ')
+
+
+def test_worker_that_is_killed_is_one_line(run_with, capsys):
+    def work(_):
+        with ProcessPoolExecutor(1) as workers:
+            return list(workers.map(os._exit, [9]))
+
+    assert run_with('learn', work) == 1
+    assert only_line(capsys.readouterr().err).startswith('learn: BrokenProcessPool: ')
 
 
 WAITS = """\

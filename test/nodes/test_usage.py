@@ -45,6 +45,27 @@ def test_help_lists_usage_and_all_parameters(node, helped):
         assert ' '.join(parameter.description.split()) in words
 
 
+@pytest.mark.parametrize('node', ['filter_node', 'camera_node'])
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ('-p', 'nonsense'),
+        ('-p', 'x:=' + 10_000 * '['),
+        ('--params-file', '/no\n\x1b[2J'),
+        ('-r', '__ns:=/a b' + 10_000 * 'c'),
+    ],
+    ids=['parameter', 'nested', 'file', 'namespace'],
+)
+def test_bad_arguments_are_one_line(node, arguments, ended):
+    code, output, errors = ended(node, 'video.mp4', '--ros-args', *arguments)
+    assert (code, output) == (1, '')
+    # rcl prints lines of its own, which begin with their time.
+    (line,) = (x for x in errors.splitlines() if x.startswith(f'{node}: '))
+    assert len(line) <= 300
+    assert line.isprintable()
+    assert 'Traceback' not in errors
+
+
 @pytest.mark.parametrize(
     'arguments',
     [('-h',), ('--ros-args', '-p', 'max_hypotheses:=3', '--', '--help')],

@@ -140,6 +140,25 @@ def test_one_that_fails_does_not_keep_the_others(archive, tracked, tmp_path, cap
     assert 'No such file' in nowhere
 
 
+@pytest.mark.parametrize('scheduler', [[], ['--scheduler', 'local']])
+def test_any_exception_in_one_of_many_is_one_line(
+    archive, tmp_path, monkeypatch, capsys, scheduler
+):
+    def fail(*_arguments, **_options):
+        raise KeyError('\x1b[2J\n' + 1000 * 'long ')
+
+    if scheduler:
+        # A worker is another process: the fault is of what comes to it.
+        pytest.importorskip('distributed')
+        monkeypatch.setattr(many_bags, '_replay_in_worker', fail)
+    monkeypatch.setattr(many_bags, 'replay_bag', fail)
+    command = [str(archive), '-o', str(tmp_path / 'out'), '--quiet', *scheduler, *PERSON]
+    assert main(command) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert sorted(x[:14] for x in lines) == ['replay: a: Key', 'replay: day/b:']
+    assert all(len(x) <= 300 and x.isprintable() for x in lines)
+
+
 def test_what_can_not_be_begun(archive, tmp_path, monkeypatch, capsys):
     def fails(*arguments):
         assert main([*map(str, arguments), *PERSON]) == 1
