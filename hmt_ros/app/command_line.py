@@ -6,12 +6,12 @@ import argparse
 import importlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
 import hmt_ros
-from hmt_ros.app.last_resort import last_resort, told_in_lines
+from hmt_ros.app.last_resort import last_resort
 
 LARGEST = 10_000  # largest side of an image, px
 
@@ -178,17 +178,14 @@ def run_command(
         The exit code: that of `work`, or see `last_resort`.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    debug = '--debug' in words
 
     def run() -> int:
         arguments = parser.parse_args(words)
         vars(arguments).pop('debug', None)
-        with nullcontext() if debug else told_in_lines(parser.prog):
-            return work(arguments)
+        return work(arguments)
 
-    return last_resort(
-        parser.prog, run, debug=debug, lost=', nothing is written' if whole_or_nothing else ''
-    )
+    lost = ', nothing is written' if whole_or_nothing else ''
+    return last_resort(parser.prog, run, debug='--debug' in words, lost=lost)
 
 
 def number(

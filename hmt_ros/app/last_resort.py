@@ -10,7 +10,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import ModuleType
 from typing import Any, TextIO
 
@@ -20,6 +20,7 @@ from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
 # Exit codes of programs that the interrupt key or SIGPIPE has ended, as shells report them; that of
 # another signal is this and its number.
 INTERRUPTED, NOBODY_READS, SIGNALLED = 130, 141, 128
+_HINT = '; --debug shows where'
 
 
 def last_resort(
@@ -44,25 +45,27 @@ def last_resort(
         if signal.getsignal(number) is signal.SIG_DFL:
             # As an exception, the signal has what is unfinished removed.
             signal.signal(number, lambda seen, _: sys.exit(SIGNALLED + seen))
-    try:
+    # What an error held goes while lines are told, with what its finalisers say.
+    with nullcontext() if debug else _told_in_lines(program):
         try:
-            return run()
-        finally:
-            # Otherwise the interpreter finds the closed pipe at its end, and prints an error.
-            sys.stdout.flush()
-    except BrokenPipeError:
-        code = NOBODY_READS
-    except KeyboardInterrupt:
-        print(f'{program}: interrupted{lost}', file=sys.stderr)
-        code = INTERRUPTED
-    except Exception as error:  # noqa: BLE001 - no input is worth a traceback to whoever gives it
-        if debug:
-            traceback.print_exc()
-        usual = isinstance(error, (ValueError, OSError))
-        kind, hint = ('', '') if usual else (f'{type(error).__name__}: ', '; --debug shows where')
-        text = f'{program}: {kind}{error_line(error, LONGEST_LINE)}'
-        print(f'{one_line(text, LONGEST_LINE - len(hint))}{hint}', file=sys.stderr)
-        code = 1
+            try:
+                return run()
+            finally:
+                # Else the interpreter finds the closed pipe at its end, and prints an error.
+                sys.stdout.flush()
+        except BrokenPipeError:
+            code = NOBODY_READS
+        except KeyboardInterrupt:
+            print(f'{program}: interrupted{lost}', file=sys.stderr)
+            code = INTERRUPTED
+        except Exception as error:  # noqa: BLE001 - no input is worth a traceback
+            if debug:
+                traceback.print_exc()
+            usual = isinstance(error, (ValueError, OSError))
+            kind, hint = ('', '') if usual else (f'{type(error).__name__}: ', _HINT)
+            text = f'{program}: {kind}{error_line(error, LONGEST_LINE)}'
+            print(f'{one_line(text, LONGEST_LINE - len(hint))}{hint}', file=sys.stderr)
+            code = 1
     try:
         sys.stdout.flush()
     except OSError:
@@ -78,18 +81,18 @@ def _nowhere(number: int) -> TextIO:
 
 
 @contextmanager
-def told_in_lines(program: str) -> Iterator[None]:
+def _told_in_lines(program: str) -> Iterator[None]:
     """Has all that is printed beside the results come as lines for the user.
 
     So do warnings, and what ends in other threads or in a finaliser. What libraries in C print,
     libpng about a damaged image for example, is dropped.
     """
 
-    def ended(found: Any) -> None:
-        tell_user(program, f'{found.exc_type.__name__}: {error_line(found.exc_value)}')
+    def tell(error: BaseException, *_: object) -> None:
+        tell_user(program, f'{type(error).__name__}: {error_line(error)}')
 
-    def warned(message: Warning, *_: object) -> None:
-        tell_user(program, f'{type(message).__name__}: {message}')
+    def ended(found: Any) -> None:
+        tell(found.exc_value)
 
     usual = sys.stderr
     shown = os.fdopen(os.dup(2), 'w', 1, usual.encoding, usual.errors)
@@ -97,7 +100,7 @@ def told_in_lines(program: str) -> Iterator[None]:
         shown,
         _replaced(sys, stderr=shown if usual is sys.__stderr__ else usual, unraisablehook=ended),
         _replaced(threading, excepthook=ended),
-        _replaced(warnings, showwarning=warned),
+        _replaced(warnings, showwarning=tell),
         _replaced(logging, lastResort=logging.StreamHandler(LineFile())),
     ):
         _nowhere(2)

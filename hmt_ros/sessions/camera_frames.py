@@ -127,8 +127,8 @@ class CameraFrames:
             self.pose = None
             text = (
                 f'no transform from {camera_frame!r} to fixed_frame {name!r} at the image of '
-                f'{stamp_ns} ns: {error}; the camera is taken to go on as before, and after '
-                f'{MAX_EXTRAPOLATION_TIME} s its motion is unknown'
+                f'{stamp_ns} ns: {error}; the camera is taken to go on as before for '
+                f'{MAX_EXTRAPOLATION_TIME} s'
             )
             return [('no pose of the camera', text)]
         return []

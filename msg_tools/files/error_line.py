@@ -7,7 +7,7 @@ characters, those that turn the direction of text, that have no width, or that s
 from __future__ import annotations
 
 # Characters of a line; one that a log puts its own words around is shorter.
-LONGEST_LINE, LONGEST_TEXT = 300, 220
+LONGEST_LINE, LONGEST_TEXT = 300, 250
 
 
 def one_line(text: str, most: int = LONGEST_TEXT) -> str:

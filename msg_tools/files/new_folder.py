@@ -137,7 +137,7 @@ def _made_aside(target: Path, own: Sequence[str]) -> Iterator[Path]:
 @contextmanager
 def _locked(folder: Path) -> Iterator[bool]:
     """Shows others that a folder is in use; whether it was free, and the system has locks."""
-    descriptor, free = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW), False
+    descriptor, free = os.open(folder, os.O_DIRECTORY | os.O_NOFOLLOW), False
     with suppress(OSError):
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         free = True

@@ -131,6 +131,21 @@ def test_interrupt_key_is_one_line(run_with, capsys):
     assert capsys.readouterr().err == 'replay: interrupted, nothing is written\n'
 
 
+def test_finalisers_of_what_an_error_held_are_lines(run_with, capsys):
+    class Held:
+        def __del__(self):
+            raise KeyError(HOSTILE)
+
+    def work(_):
+        held = Held()
+        raise ValueError(f'held {held is None}')
+
+    assert run_with('export', work) == 1
+    first, second = capsys.readouterr().err.splitlines(keepends=True)
+    assert only_line(first) == 'export: held False'
+    assert only_line(second).startswith('export: KeyError: ')
+
+
 def test_warnings_and_ends_of_threads_are_lines(run_with, capsys):
     class Finalised:
         def __del__(self):
