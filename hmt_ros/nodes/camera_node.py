@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 import threading
 import time
@@ -142,7 +141,6 @@ def main(args: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if args is None else args
     stopped = threading.Event()
     on_signals(lambda *_: stopped.set())
-    os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')  # none of its lines
     try:
         given = _parser().parse_args(remove_ros_args([NAME, *arguments])[1:])
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)

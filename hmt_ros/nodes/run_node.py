@@ -62,7 +62,6 @@ def run_together(
     _use_one_heap()
     # OpenCV's own threads wait actively: on images of a camera they cost more than they save.
     cv2.setNumThreads(1)
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     sys.setswitchinterval(_SWITCH_INTERVAL)
     # The handlers of rclpy end the context in the middle of the work; ours let the work finish.
     stopped = threading.Event()
