@@ -119,7 +119,7 @@ def _made_aside(target: Path, own: Sequence[str]) -> Iterator[Path]:
     around = Path(tempfile.mkdtemp(prefix=f'.{target.name}.', suffix=_PARTIAL, dir=target.parent))
     replaced = around / _REPLACED
     try:
-        with _locked(around):
+        with locked(around):
             yield around / target.name
             if target.is_dir():
                 target.rename(replaced)
@@ -135,12 +135,18 @@ def _made_aside(target: Path, own: Sequence[str]) -> Iterator[Path]:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[bool]:
-    """Shows others that a folder is in use; whether it was free, and the system has locks."""
-    descriptor, free = os.open(folder, os.O_DIRECTORY | os.O_NOFOLLOW), False
-    with suppress(OSError):
+def locked(folder: Path) -> Iterator[bool | None]:
+    """Shows other processes that a folder is in use.
+
+    Yields:
+        Whether it was free; None where the file system has no locks, of a network for example.
+    """
+    descriptor = os.open(folder, os.O_DIRECTORY)
+    try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        free = True
+        free: bool | None = True
+    except OSError as error:
+        free = False if isinstance(error, BlockingIOError) else None
     try:
         yield free
     finally:
@@ -153,7 +159,7 @@ def _remove_remains(target: Path, own: Sequence[str]) -> None:
     with suppress(OSError):
         for path in sorted(target.parent.iterdir()):
             if hidden.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
-                with _locked(path) as free:
+                with locked(path) as free:
                     if free and _holds_only(path, target.name, own):
                         shutil.rmtree(path)
                         _log.warning('%s: removed, a run that was killed had left it', path)

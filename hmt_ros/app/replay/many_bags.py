@@ -8,7 +8,6 @@ package) and whether it is complete. The record is written before and after the 
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import hashlib
 import importlib
 import json
@@ -32,7 +31,7 @@ from hmt_ros.inference.threads import limit_threads
 from msg_tools import BagError
 from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES
 from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
-from msg_tools.files.new_folder import new_file
+from msg_tools.files.new_folder import locked, new_file
 
 # Options that change the new bag, besides the parameters.
 _DECIDING = (
@@ -352,17 +351,9 @@ def _name(path: Path) -> str:
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Locks a folder: another command would take unfinished bags for its own remains."""
+    """Locks a folder: another command would replay the same bags."""
     folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(f'another replay writes into {folder}') from None
-        except OSError:
-            # A file system without locks, for example of a network: assume that nobody else writes.
-            pass
+    with locked(folder) as free:
+        if free is False:
+            raise ValueError(f'another replay writes into {folder}')
         yield
-    finally:
-        os.close(descriptor)
