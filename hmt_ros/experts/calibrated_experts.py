@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.learned_file import LARGEST, Arrays, check_shapes, nested, part
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity, stored_model
 from hmt_ros.experts.gates import log_softmax
-from hmt_ros.experts.model_file import Arrays, nested, parameters_of, part
 from hmt_ros.inference.arrays import Array
 
 if TYPE_CHECKING:
@@ -48,10 +48,14 @@ class Calibration:
 
     def __post_init__(self) -> None:
         size = len(self.added)
-        if self.added.shape != (size, size) or not np.isfinite(self.added).all():
-            raise ValueError(f'added must be finite and (D, D), saw {self.added.shape}')
+        check_shapes({'added': self.added}, added=(size, size))
+        smallest = float(np.linalg.eigvalsh(self.added)[0])
+        if not smallest >= -1e-9 * np.abs(self.added).max() or not np.allclose(
+            self.added, self.added.T
+        ):
+            raise ValueError('added must be symmetric and positive semidefinite')
         for name in ('temperature', 'factor'):
-            if not 1.0 <= getattr(self, name) < np.inf:
+            if not 1.0 <= getattr(self, name) <= LARGEST:
                 raise ValueError(f'{name} must be at least 1, saw {getattr(self, name)}')
 
     def of(self, found: Components) -> Components:
@@ -100,7 +104,7 @@ class CalibratedExperts(ConditionalDensity):
         # Files could nest models without end.
         if str(own['kind']) == cls.kind:
             raise ValueError('a calibrated model inside a calibrated model')
-        return cls(stored_model(own, where), **parameters_of(arrays))
+        return cls(stored_model(own, where), **cls._checked_parameters(arrays))
 
     def _learned(self) -> Arrays:
         found = self.calibration_
@@ -111,6 +115,8 @@ class CalibratedExperts(ConditionalDensity):
         } | nested('model', self.model.to_arrays())
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        if (self.model.n_inputs_, self.model.n_outputs_) != (self.n_inputs_, self.n_outputs_):
+            raise ValueError('its model has other inputs or outputs')
         self.calibration_ = Calibration(
             float(arrays['temperature']),
             np.asarray(arrays['added'], dtype=np.float64),

@@ -21,16 +21,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
-from hmt_ros.experts.model_file import (
-    FAULTS,
+from hmt_ros.body.learned_file import (
     MOST_NUMBERS,
+    MOST_VALUES,
     Arrays,
+    check_covariances,
     check_header,
-    damaged,
     header,
+    named_faults,
     parameters_of,
-    read_arrays,
-    write_arrays,
+    read_model,
+    write_model,
 )
 from hmt_ros.experts.training_pairs import finite_matrix
 from hmt_ros.inference import GaussianMixture
@@ -38,6 +39,10 @@ from hmt_ros.inference.arrays import Array
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+
+# Maximum number of outputs of a model; a pose has forty.
+MOST_OUTPUTS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,23 +198,26 @@ class ConditionalDensity(ABC):
             ValueError: the kind or the version is another one, or arrays are missing or wrong.
         """
         check_header(arrays, cls.kind, where)
-        try:
+        with named_faults(where):
             inputs, outputs = (int(n) for n in arrays['shape'])
-            if not (1 <= inputs <= MOST_NUMBERS and 1 <= outputs <= MOST_NUMBERS):
+            if not (1 <= inputs <= MOST_NUMBERS and 1 <= outputs <= MOST_OUTPUTS):
                 raise ValueError(
-                    f'{inputs} inputs and {outputs} outputs, wanted 1 to {MOST_NUMBERS}'
+                    f'{inputs} inputs and {outputs} outputs, wanted 1 to {MOST_NUMBERS} and 1 to '
+                    f'{MOST_OUTPUTS}'
                 )
             model = cls._constructed(arrays, where)
             model.n_inputs_, model.n_outputs_ = inputs, outputs
             model._set_learned(arrays)
-            model.components(np.zeros((1, model.n_inputs_)))
-        except FAULTS as fault:
-            raise damaged(where, fault) from fault
+            model._check_components()
         return model
 
-    def save(self, path: str | Path) -> Path:
-        """Writes the model into an .npz file and returns its path."""
-        return write_arrays(path, self.to_arrays())
+    def save(self, path: str | Path, card: Mapping[str, Any] | None = None) -> Path:
+        """Writes the model into an .npz file and returns its path.
+
+        Args:
+            card: what it was learned from, licence, method; JSON must be able to hold it.
+        """
+        return write_model(path, self, stored_model, card or {})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -217,9 +225,30 @@ class ConditionalDensity(ABC):
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is no model, or one of another version or kind.
+            ValueError: the file is no model, or one of another version or kind, or a wrong one.
         """
-        return cls.from_arrays(read_arrays(path, cls.kind), str(path))
+        return read_model(path, cls.kind, cls.from_arrays)
+
+    def example_input(self) -> Array:
+        """An input (p,), for `hmt_ros.body.learned_file`."""
+        return np.random.default_rng(0).normal(size=self.n_inputs_)
+
+    def answer(self, given: Array) -> GaussianMixture:
+        """The mixture at one input (p,)."""
+        return self.predict(given[None])[0]
+
+    def _check_components(self) -> None:
+        """Raises ValueError if predictions do not fit each other, are none, or are too large."""
+        found, d = self.components(np.zeros((1, self.n_inputs_))), self.n_outputs_
+        m = found.log_weights.size
+        shapes = tuple(x.shape for x in vars(found).values())
+        if shapes != ((1, m), (1, m, d), (1, m), (m, d, d)):
+            raise ValueError(f'its predictions have shapes {shapes}')
+        if m * d * max(d, self.n_inputs_) > MOST_VALUES:
+            raise ValueError(f'derivatives of its predictions have more than {MOST_VALUES} numbers')
+        if not all(np.isfinite(x).all() for x in vars(found).values()):
+            raise ValueError('its predictions are not finite')
+        check_covariances('noise', found.noise)
 
     def _stored_parameters(self) -> dict[str, Any]:
         """The constructor's arguments that JSON can hold."""
@@ -228,7 +257,23 @@ class ConditionalDensity(ABC):
     @classmethod
     def _constructed(cls, arrays: Mapping[str, NDArray[Any]], where: str) -> Self:
         """The model of a file before its learned arrays are set."""
-        return cls(**parameters_of(arrays))
+        return cls(**cls._checked_parameters(arrays))
+
+    @classmethod
+    def _checked_parameters(cls, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+        """The constructor's parameters in a file; those with defaults, which have their types."""
+        found, known = parameters_of(arrays), inspect.signature(cls).parameters
+        usual = {name: one.default for name, one in known.items() if one.default is not one.empty}
+        if found.keys() != usual.keys():
+            raise ValueError(f'its parameters are not those of {cls.__name__}')
+        for name, value in found.items():
+            own = {type(usual[name])}
+            # A number, or None where the default is None.
+            if not own.isdisjoint({float, type(None)}):
+                own |= {int, float}
+            if type(value) not in own:
+                raise ValueError(f'its parameter {name} has another type than usual')
+        return found
 
     def _check_learned(self) -> None:
         if not hasattr(self, 'n_inputs_'):
@@ -259,7 +304,5 @@ def stored_model(arrays: Mapping[str, NDArray[Any]], where: str) -> ConditionalD
     """
     kind = str(arrays['kind'])
     if kind not in ConditionalDensity.kinds:
-        raise ValueError(
-            f'a model of kind {kind!r}, wanted one of {sorted(ConditionalDensity.kinds)}'
-        )
+        raise ValueError(f'its kind is none of {sorted(ConditionalDensity.kinds)}')
     return ConditionalDensity.kinds[kind].from_arrays(arrays, where)

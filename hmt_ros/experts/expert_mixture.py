@@ -18,6 +18,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.learned_file import (
+    Arrays,
+    check_covariances,
+    check_shapes,
+    nested,
+    part,
+)
 from hmt_ros.experts.basis import (
     BASES,
     Basis,
@@ -29,7 +36,6 @@ from hmt_ros.experts.basis import (
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.expectation_maximisation import EMState, climb, e_step, m_step
 from hmt_ros.experts.gates import Gates, GaussianGates, SoftmaxGates, log_softmax
-from hmt_ros.experts.model_file import Arrays, nested, part
 from hmt_ros.experts.sparse_bayes import (
     RegressionPrior,
     SparseRegression,
@@ -51,6 +57,10 @@ TRIAL_ITERATIONS = (2, 4, 8)
 TRIAL_SAMPLES = 1000
 # Share of the targets' variance that the prior of the noise pulls to.
 NOISE_FLOOR = 1e-2
+# Maximum numbers of experts, and of functions of an expert, in a file.
+MOST_EXPERTS, MOST_ACTIVE = 1000, 2000
+# Rounding of covariances of weights, which span many orders of magnitude, in their correlations.
+SEMIDEFINITE = 1e-6
 
 
 class ExpertMixture(ConditionalDensity):
@@ -290,25 +300,32 @@ class ExpertMixture(ConditionalDensity):
         )
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        p, d, count = self.n_inputs_, self.n_outputs_, int(arrays['n_experts'])
+        if not 1 <= count <= MOST_EXPERTS:
+            raise ValueError(f'it has {count} experts, wanted 1 to {MOST_EXPERTS}')
+        check_shapes(arrays, input_centre=(p,), target_centre=(d,))
         self._scaling = Standardisation(arrays['input_centre'], arrays['input_scale'])
         self._target_scaling = Standardisation(arrays['target_centre'], arrays['target_scale'])
-        self.basis_ = basis_of(part('basis', arrays))
+        self.basis_ = basis_of(part('basis', arrays), p)
         if isinstance(self.basis_, RadialBasis):
-            self._candidates = np.asarray(arrays['candidates'])
-        stored = [part(f'expert{i}', arrays) for i in range(int(arrays['n_experts']))]
-        self.experts_ = tuple(
-            SparseRegression(
-                own['active'],
-                own['precisions'],
-                own['weights'],
-                own['covariance'],
-                own['noise'],
-                np.nan,
-            )
-            for own in stored
-        )
-        self.gates_ = self._gates.of_arrays(part('gates', arrays))
+            self._candidates = arrays['candidates']
+            check_shapes(arrays, candidates=(max(len(self._candidates), 1), p))
+        self.experts_ = tuple(self._stored_expert(part(f'expert{i}', arrays)) for i in range(count))
+        self.gates_ = self._gates.of_arrays(part('gates', arrays), count, p)
         self._prepare()
+
+    def _stored_expert(self, own: Mapping[str, NDArray[Any]]) -> SparseRegression:
+        active, d = own['active'], self.n_outputs_
+        m = len(active)
+        if not np.array_equal(np.unique(active[active >= 0]), np.sort(active)) or m > MOST_ACTIVE:
+            raise ValueError(f'an expert names functions twice, or more than {MOST_ACTIVE}')
+        check_shapes(own, active=(m,), precisions=(m,), weights=(m, d), covariance=(m, m))
+        check_shapes(own, noise=(d, d))
+        check_covariances('the covariance of weights', own['covariance'], SEMIDEFINITE)
+        evidence = np.nan
+        return SparseRegression(
+            active, own['precisions'], own['weights'], own['covariance'], own['noise'], evidence
+        )
 
 
 class ConditionalExperts(ExpertMixture):

@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from hmt_ros.body.learned_file import Arrays, check_positive, check_shapes
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
-from hmt_ros.experts.model_file import Arrays
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs, checked_pairs
 from hmt_ros.inference.arrays import Array, Index
 
@@ -40,6 +40,7 @@ CLOSEST = 1e-3
 SWEEPS = 8  # of the clustering
 LEFT_OUT = 600  # training samples whose residuals give the covariance of local experts
 FAINT = 1e-12  # weight of an expert without neighbours
+MOST = 1000  # maximum number of neighbours, and of experts, in a file
 
 
 class _NeighbourModel(ConditionalDensity):
@@ -114,8 +115,16 @@ class _NeighbourModel(ConditionalDensity):
             np.asarray(arrays[name], dtype=np.float64)
             for name in ('inputs', 'targets', 'sample_weight')
         )
-        if len(inputs) != len(targets) or weights.shape != inputs.shape[:1]:
-            raise ValueError(f'inputs {inputs.shape} and targets {targets.shape} do not pair')
+        n, p, d, count = len(inputs), self.n_inputs_, self.n_outputs_, self.n_neighbours
+        check_shapes(arrays, inputs=(n, p), targets=(n, d), sample_weight=(n,), centre=(p,))
+        check_shapes(arrays, noise=(d, d))
+        check_positive('weights and spacing', np.append(weights, arrays['spacing']))
+        experts, nearest = (vars(self).get(x, 1) for x in ('n_experts', 'width_neighbour'))
+        if not 1 <= nearest <= count <= min(n, MOST) or not 1 <= experts <= MOST:
+            raise ValueError(
+                f'{experts} experts and {count} neighbours of {n} samples, the width from number '
+                f'{nearest}: wanted 1 to {MOST} of each'
+            )
         scale = Standardisation(arrays['centre'], arrays['scale'])
         self._keep(TrainingPairs(inputs, targets, weights), scale)
         self.noise_ = np.asarray(arrays['noise'], dtype=np.float64)

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.learned_file import Arrays, check_positive, check_shapes
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.gates import log_softmax
-from hmt_ros.experts.model_file import Arrays
 from hmt_ros.experts.training_pairs import Standardisation
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import squared_distances
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 # Limits of log sqrt(c).
 WIDTHS = 2.0
 LEAK = 0.1  # slope of a unit below 0
+# Maximum number of layers in a file, and of its outputs for inputs of a size, whitened.
+MOST_LAYERS, LARGEST_INPUT, LARGEST_OUTPUT = 100, np.float32(100.0), 1e15
 
 Floats = NDArray[np.float32]
 
@@ -83,10 +85,19 @@ class Layers:
         """The layers that `to_arrays` stored.
 
         Raises:
-            KeyError, ValueError: arrays are missing or do not fit.
+            KeyError, ValueError: arrays are missing, do not fit, or have outputs without bounds.
         """
-        names = cls.__dataclass_fields__
-        return cls(**{name: np.asarray(arrays[name], dtype=np.float32) for name in names})
+        own = {name: np.asarray(arrays[name], np.float32) for name in cls.__dataclass_fields__}
+        (p, h), m, o = own['first'].shape, len(own['hidden']), own['last_bias'].size
+        check_shapes(own, first_bias=(h,), hidden=(m, h, h), hidden_biases=(m, h))
+        check_shapes(own, last=(h, o), last_bias=(o,))
+        if m > MOST_LAYERS:
+            raise ValueError(f'it has {m} hidden layers, wanted at most {MOST_LAYERS}')
+        # No output is larger than that of the sizes of all weights for the largest inputs.
+        bound = cls(**{name: np.abs(values) for name, values in own.items()})
+        if not (bound.outputs(np.full((1, p), LARGEST_INPUT)) <= LARGEST_OUTPUT).all():
+            raise ValueError(f'its outputs may be larger than {LARGEST_OUTPUT:g}')
+        return cls(**own)
 
 
 class NetworkExperts(ConditionalDensity):
@@ -183,7 +194,11 @@ class NetworkExperts(ConditionalDensity):
         }
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        a = {name: np.asarray(value) for name, value in arrays.items()}
+        a, m, p, d = dict(arrays), self.n_experts, self.n_inputs_, self.n_outputs_
+        check_shapes(a, input_centre=(p,), target_centre=(d,), noise=(m, d, d))
+        check_shapes(a, first=(p, len(a['first_bias'])), last_bias=(m * (2 + d),))
+        check_shapes(a, centres=(max(len(a['centres']), 1), p))
+        check_positive('spacing', a['spacing'])
         self.set_parts(
             Layers.from_arrays(a),
             Standardisation(a['input_centre'], a['input_scale']),

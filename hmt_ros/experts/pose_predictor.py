@@ -13,28 +13,40 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body import Body, Camera
+from hmt_ros.body.learned_file import (
+    Arrays,
+    ModelFileError,
+    body_of,
+    check_covariances,
+    header,
+    named_faults,
+    nested,
+    parameters_of,
+    part,
+    read_model,
+    write_model,
+)
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
 from hmt_ros.experts.density_propagation import joined, propagate, propagate_by_dynamics
 from hmt_ros.experts.descriptor.contour import PersonBlob, centred_view, person_blob
-from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor, silhouette_parts
-from hmt_ros.experts.model_file import (
-    FAULTS,
-    Arrays,
-    damaged,
-    header,
-    nested,
-    parameters_of,
-    part,
-    read_arrays,
-    write_arrays,
+from hmt_ros.experts.descriptor.silhouette_descriptor import (
+    ANGULAR,
+    FIXED,
+    MAP,
+    PAIR_BINS,
+    RADIAL,
+    SilhouetteDescriptor,
+    SilhouetteParts,
+    silhouette_parts,
 )
 from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
 from hmt_ros.experts.root_placement import (
@@ -48,7 +60,7 @@ from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.inference.reduction import reduced
 
 FOLDER = Path(__file__).resolve().parent / 'models'
-# Learned from motion capture: its card is in its notes.
+# Learned from motion capture: its notes are its card.
 SHIPPED = 'silhouettes'
 
 KIND = 'pose_predictor'
@@ -67,6 +79,18 @@ FORGETTING, LASTING = 5.0, 0.02
 # Axes of unit length have no spread along themselves, and those that are predicted have no unit
 # length: variance that is added to both.
 OF_AXES = 0.5**2
+# The person whose silhouette is the example of a file: rows and columns of rectangles.
+FIGURE = (
+    (5, 22, 33, 47),
+    (22, 30, 20, 60),
+    (30, 65, 28, 52),
+    (30, 60, 20, 25),
+    (30, 55, 55, 60),
+    (65, 115, 28, 37),
+    (65, 115, 43, 52),
+)
+# Largest condition of a basis of targets; how much an offset may differ from the usual one, m.
+WORST_CONDITION, OFFSET = 1e12, 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +116,7 @@ class PosePredictor:
         target_basis: (D, D) B; models learn z = B' x of a target x.
         equilibrium: p(x) of targets: a mixture of one component.
         dynamics: Model of p(z | previous z, descriptor) that has learned, or None.
-        notes: Origin of the model, for its file; JSON must be able to hold it.
+        notes: Card of its file; JSON must be able to hold it.
 
     Raises:
         ValueError: the parts do not fit each other.
@@ -125,6 +149,8 @@ class PosePredictor:
             )
         if (len(equilibrium), equilibrium.dimension) != (1, size):
             raise ValueError(f'equilibrium must be one component over {size} numbers')
+        if not np.linalg.cond(target_basis) <= WORST_CONDITION:
+            raise ValueError('target_basis is singular')
         self._from_basis = np.asarray(np.linalg.inv(target_basis), dtype=np.float64)
 
     @property
@@ -306,15 +332,14 @@ class PosePredictor:
         covariances += JITTER * np.eye(self.encoding.size)
         return GaussianMixture(poses.weights, self.encoding.encode(poses.means), covariances)
 
-    def save(self, path: str | Path) -> Path:
-        """Writes the predictor into an .npz file without pickled objects and returns its path."""
+    def to_arrays(self) -> Arrays:
+        """The arrays of a file."""
         body = self.body
         parameters = {
             'body': body.name,
             'dof_names': list(body.dof_names),
             'lengths': body.segment_lengths,
-            'descriptor': {'points': self.descriptor.points},
-            'notes': self.notes,
+            'points': self.descriptor.points,
         }
         arrays: Arrays = header(KIND, parameters)
         arrays |= nested('descriptor', self.descriptor.to_arrays())
@@ -324,7 +349,66 @@ class PosePredictor:
         arrays['target_basis'] = self.target_basis
         arrays['equilibrium_mean'] = self.equilibrium.means[0]
         arrays['equilibrium_covariance'] = self.equilibrium.covariances[0]
-        return write_arrays(path, arrays)
+        return arrays
+
+    @classmethod
+    def from_arrays(
+        cls, arrays: Arrays, where: str = 'predictor', body: Body | None = None
+    ) -> PosePredictor:
+        """The predictor that `to_arrays` and a card describe; see `load`.
+
+        Raises:
+            ValueError: arrays or parameters are missing or wrong, or the body is another one.
+        """
+        with named_faults(where):
+            parameters = parameters_of(arrays)
+            names = tuple(map(str, parameters['dof_names']))
+            if body is None:
+                body = body_of(parameters, where)
+                _check_body(body, names, where)
+                body = body.with_segment_lengths(_checked_lengths(body, parameters['lengths']))
+            else:
+                _check_body(body, names, where)
+            descriptor = SilhouetteDescriptor.from_arrays(
+                part('descriptor', arrays), parameters['points']
+            )
+            model = stored_model(part('model', arrays), where)
+            dynamics = part('dynamics', arrays)
+            equilibrium = GaussianMixture(
+                np.ones(1), arrays['equilibrium_mean'][None], arrays['equilibrium_covariance'][None]
+            )
+            check_covariances('equilibrium', equilibrium.covariances)
+            return cls(
+                body,
+                descriptor,
+                model,
+                arrays['target_basis'],
+                equilibrium,
+                stored_model(dynamics, where) if dynamics else None,
+                parameters_of(arrays, 'card'),
+            )
+
+    def example_input(self) -> Array:
+        """The parts of a silhouette, one after the other: a figure of rectangles."""
+        mask = np.zeros((120, 80), dtype=np.uint8)
+        for top, bottom, left, right in FIGURE:
+            mask[top:bottom, left:right] = 1
+        parts = vars(silhouette_parts(mask, self.descriptor.points)).values()
+        return np.concatenate([x.ravel() for x in parts])
+
+    def answer(self, given: Array) -> GaussianMixture:
+        """The mixture over targets (D,) for the parts of a silhouette; with dynamics, by these."""
+        contexts, *others = np.split(given, np.cumsum([-FIXED, PAIR_BINS, MAP * MAP]))
+        parts = SilhouetteParts(contexts.reshape(-1, RADIAL * ANGULAR), *others)
+        row = self.descriptor.describe([parts])[0]
+        found = self.model.answer(row)
+        if self.dynamics is not None:
+            found = self.dynamics.answer(np.concatenate([found.mean(), row]))
+        return _transformed(found, self._from_basis)
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the predictor into an .npz file, with its notes as the card; returns its path."""
+        return write_model(path, self, partial(self.from_arrays, body=self.body), self.notes)
 
     @classmethod
     def load(cls, path: str | Path, body: Body | None = None) -> PosePredictor:
@@ -336,44 +420,9 @@ class PosePredictor:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is no predictor, or one of another version or body.
+            ValueError: the file is no predictor, or one of another version or body, or a wrong one.
         """
-        arrays = read_arrays(path, KIND)
-        where = str(path)
-        try:
-            parameters = parameters_of(arrays)
-            names = tuple(str(x) for x in parameters['dof_names'])
-            if body is None:
-                body = load_body(str(parameters['body']))
-                _check_body(body, names, where)
-                body = body.with_segment_lengths(parameters['lengths'])
-            else:
-                _check_body(body, names, where)
-            descriptor = SilhouetteDescriptor.from_arrays(
-                part('descriptor', arrays), int(parameters['descriptor']['points'])
-            )
-            model = stored_model(part('model', arrays), where)
-            dynamics = part('dynamics', arrays)
-            equilibrium = GaussianMixture(
-                np.ones(1), arrays['equilibrium_mean'][None], arrays['equilibrium_covariance'][None]
-            )
-            return cls(
-                body,
-                descriptor,
-                model,
-                np.asarray(arrays['target_basis'], dtype=np.float64),
-                equilibrium,
-                stored_model(dynamics, where) if dynamics else None,
-                parameters['notes'],
-            )
-        except _WrongBodyError as fault:
-            raise ValueError(str(fault)) from None
-        except FileNotFoundError as fault:
-            raise ValueError(
-                f'{where}: trained for a body {parameters["body"]!r}, which does not ship: give it'
-            ) from fault
-        except FAULTS as fault:
-            raise damaged(where, fault) from fault
+        return read_model(path, KIND, partial(cls.from_arrays, body=body))
 
 
 def load_predictor(model: str | Path = SHIPPED) -> PosePredictor:
@@ -391,18 +440,25 @@ def load_predictor(model: str | Path = SHIPPED) -> PosePredictor:
     return PosePredictor.load(model)
 
 
-class _WrongBodyError(ValueError):
-    """Raised for a body that a predictor was not trained for."""
-
-
 def _check_body(body: Body, names: Sequence[str], where: str) -> None:
     if tuple(names) != body.dof_names:
-        missing = sorted(set(names) - set(body.dof_names))
-        more = sorted(set(body.dof_names) - set(names))
-        raise _WrongBodyError(
+        missing = sorted(set(body.dof_names) - set(names))
+        raise ModelFileError(
             f'{where}: trained for a body of {len(names)} degrees of freedom, but {body.name} has '
-            f'{body.dimension} (missing {missing}, more {more}); use that body or train again'
+            f'{body.dimension} (more: {missing}); use that body or train again'
         )
+
+
+def _checked_lengths(body: Body, lengths: Mapping[str, Any]) -> Mapping[str, float]:
+    """Lengths (m) in a file by name; raises ValueError if nobody has them."""
+    usual = body.segment_lengths
+    if lengths.keys() != usual.keys():
+        raise ValueError(f'its lengths are not those of {body.name}')
+    for name, value in lengths.items():
+        # Some are offsets near zero, of either sign.
+        if not abs(value - usual[name]) <= max(0.9 * usual[name], OFFSET):
+            raise ValueError(f'nobody has its length {name}')
+    return lengths
 
 
 def _check_fit(what: str, model: ConditionalDensity, inputs: int, outputs: int) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.learned_file import check_positive, check_shapes
 from hmt_ros.inference.arrays import Array
 
 SCALINGS = ('each', 'common')
@@ -41,15 +42,15 @@ class Standardisation:
         centre, scale: (p,) each.
 
     Raises:
-        ValueError: a scale is not positive.
+        ValueError: shapes that differ, or a scale that is not positive.
     """
 
     centre: Array
     scale: Array
 
     def __post_init__(self) -> None:
-        if not (self.scale > 0).all():
-            raise ValueError(f'scales must be positive, saw {np.min(self.scale)}')
+        check_shapes({'scale': self.scale}, scale=self.centre.shape)
+        check_positive('scales', self.scale)
 
     @classmethod
     def of(cls, values: Array, weights: Array, scaling: str = 'each') -> Standardisation:

@@ -146,6 +146,7 @@ EXTENT = 4.4  # width of the map in radii of gyration; stretched arms and legs a
 DEEPEST, FURTHEST = 0.25, 0.60  # limits of the distances inside and outside, radii of gyration
 MOMENTS = 12
 FIXED = PAIR_BINS + MAP * MAP + MOMENTS  # features besides those of the codebook
+FEWEST_POINTS, MOST_POINTS = 8, 500  # on the outline; time and memory grow with their square
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +212,8 @@ class SilhouetteDescriptor:
         shapes = (self.scale.shape, self.centre.shape, self.basis.shape[:1])
         if shapes != ((length,),) * 3 or self.basis.ndim != 2:
             raise ValueError(f'arrays of the descriptor have shapes {shapes}, wanted ({length},)')
+        if type(self.points) is not int or not FEWEST_POINTS <= self.points <= MOST_POINTS:
+            raise ValueError(f'wanted {FEWEST_POINTS} to {MOST_POINTS} points on the outline')
 
     @property
     def size(self) -> int:

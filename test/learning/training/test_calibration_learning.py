@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hmt_learning.training.calibration_learning import LearningCalibration, calibration, folds_of
+from hmt_ros.body.learned_file import nested
 from hmt_ros.experts import JointExperts, NearestNeighbours, RelevanceVectorRegression
 from hmt_ros.experts.calibrated_experts import CalibratedExperts, Calibration
 from hmt_ros.experts.conditional_density import Components
-from hmt_ros.experts.model_file import nested
 
 GROUPS, EACH = 12, 40
 

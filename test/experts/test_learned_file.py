@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from hmt_ros.body.learned_file import nested, parameters_of, part, write_arrays
 from hmt_ros.experts import JointExperts, NearestNeighbours
-from hmt_ros.experts.model_file import nested, part, read_arrays, write_arrays
+from test.forged_models import arrays_of, forged, write_forged
 
 
 @pytest.fixture(scope='module')
@@ -18,24 +19,49 @@ def test_same_model_same_bytes(model, tmp_path):
     assert a.read_bytes() == b.read_bytes()
 
 
-def test_other_version_is_refused(model, tmp_path):
-    path = write_arrays(tmp_path / 'm.npz', model.to_arrays() | {'version': np.array(99)})
-    with pytest.raises(ValueError, match="version '99', wanted 1; train it again"):
+def test_other_versions_are_refused(model, tmp_path):
+    path = write_forged(tmp_path / 'm.npz', model.save(tmp_path / 'm'), {'version': np.array(1)})
+    with pytest.raises(ValueError, match='a model file of another version; train it again'):
         NearestNeighbours.load(path)
 
 
 def test_other_kind_is_refused(model, tmp_path):
     path = model.save(tmp_path / 'm')
-    with pytest.raises(ValueError, match="'nearest_neighbours', wanted 'joint_experts'"):
+    with pytest.raises(ValueError, match="not a model of kind 'joint_experts'"):
         JointExperts.load(path)
 
 
-@pytest.mark.parametrize('name', ['kind', 'version'])
-def test_a_damaged_header_makes_one_line(name, model, tmp_path):
-    path = write_arrays(tmp_path / 'm.npz', model.to_arrays() | {name: np.array('a\nb\x85')})
-    with pytest.raises(ValueError, match='wanted') as error:
+@pytest.mark.parametrize('name', ['format', 'kind', 'version'])
+@pytest.mark.parametrize('value', ['a\nsecret\x85' + 1000 * 'b', ['secret'] * 3])
+def test_a_strange_header_makes_one_line_that_repeats_nothing_of_it(name, value, model, tmp_path):
+    path = write_forged(tmp_path / 'm.npz', model.save(tmp_path / 'm'), {name: np.array(value)})
+    with pytest.raises(ValueError, match=r'train it again|train one|load it as such') as error:
         NearestNeighbours.load(path)
     assert len(str(error.value).splitlines()) == 1
+    assert 'secret' not in str(error.value)
+
+
+def test_damage_is_told_from_a_model_that_is_wrong(model, tmp_path):
+    path = model.save(tmp_path / 'm')
+    arrays = arrays_of(path)
+    arrays['targets'][3, 1] += 1e-9
+    with pytest.raises(ValueError, match=r'a damaged model file \(other checksum\); copy it again'):
+        NearestNeighbours.load(write_arrays(path, arrays))
+    write_arrays(path, forged(arrays, {'targets': arrays['targets'] + 1.0}))
+    with pytest.raises(ValueError, match=r'a wrong model file .* does not answer as when'):
+        NearestNeighbours.load(path)
+
+
+def test_a_file_has_a_card_and_its_answer_is_that_of_the_model(model, tmp_path):
+    path = model.save(tmp_path / 'm', {'source': 'made up'})
+    arrays = arrays_of(path)
+    size = sum(x.size for x in model.to_arrays().values())
+    assert parameters_of(arrays, 'card') == {'source': 'made up', 'numbers': size}
+    mixture = model.predict(arrays['example/input'][None])[0]
+    told = arrays['example/answer']
+    np.testing.assert_allclose(told[:3], mixture.mean())
+    np.testing.assert_allclose(told[3:6] ** 2, np.diagonal(mixture.covariance()))
+    np.testing.assert_allclose(told[6:], mixture.log_density(told[None, :3]))
 
 
 def test_missing_file_is_named(tmp_path):
@@ -56,13 +82,13 @@ def test_foreign_archive_and_pickles_are_refused(tmp_path):
     np.savez(tmp_path / 'b.npz', x=np.array([{'a': 1}], dtype=object))
     for name in ('a.npz', 'b.npz'):
         with pytest.raises(ValueError, match='not a model file of hmt_ros'):
-            read_arrays(tmp_path / name)
+            NearestNeighbours.load(tmp_path / name)
 
 
-def test_damaged_model_is_refused(model):
+def test_a_model_without_an_array_is_refused(model):
     arrays = model.to_arrays()
     del arrays['targets']
-    with pytest.raises(ValueError, match=r'a damaged model file \(KeyError'):
+    with pytest.raises(ValueError, match=r'a wrong model file \(KeyError'):
         NearestNeighbours.from_arrays(arrays)
 
 
