@@ -194,7 +194,9 @@ def _motion(arguments: argparse.Namespace) -> int:
     card = data_card(sequences, arguments.acknowledgement)
     with show_progress('learning', quiet=quiet):
         model = learned_motion(body, [one.poses for one in sequences], RATE, card)
-    write_model(output, model, LearnedMotion.from_arrays, model.card)
+    # At rest.
+    example = np.zeros(model.dynamics.state_dimension)
+    write_model(output, model, LearnedMotion.from_arrays, model.card, example)
     if not quiet:
         skipped = len(paths) - len(sequences)
         skips = f', {skipped} skipped' if skipped else ''
@@ -285,7 +287,7 @@ def _prior(arguments: argparse.Namespace) -> int:
     card['method'] = _method(settings, data.people)
     found = learned_prior(data, dofs, card, settings, bar)
     read = partial(AngleMixture.from_arrays, skeleton=body.skeleton)
-    write_model(output, found.mixture, read, found.mixture.card)
+    write_model(output, found.mixture, read, found.mixture.card, np.zeros(0))
     if arguments.quiet:
         return 0
     _describe(output, found)

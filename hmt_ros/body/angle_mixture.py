@@ -20,13 +20,10 @@ from scipy.special import logsumexp
 from hmt_ros.body.body import Body
 from hmt_ros.body.learned_file import (
     Arrays,
-    ModelFileError,
-    check_covariances,
-    check_shapes,
     header,
-    named_faults,
     parameters_of,
     read_model,
+    require,
 )
 from hmt_ros.body.mirror import mirror_order
 from hmt_ros.body.model_file import load_body, shipped_file
@@ -63,19 +60,19 @@ class AngleMixture:
     card: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if not {*self.dofs} <= {*self.skeleton.dof_names}:
-            raise ValueError(f'it names degrees of freedom that {self.skeleton.name} has not')
+        known = {*self.dofs} <= {*self.skeleton.dof_names}
+        require(known, f'it names degrees of freedom that {self.skeleton.name} has not')
         rotation = self.skeleton.dof_is_rotation[self.indices]
-        if len(set(self.dofs)) != len(self.dofs) or not rotation.all():
-            raise ValueError('wanted different angles')
-        count, total = len(self.components), float(self.components.weights.sum())
-        if self.components.dimension != len(self.dofs) or not 2 <= count <= MOST_COMPONENTS:
-            raise ValueError(
-                f'{count} components over {self.components.dimension} angles, wanted 2 to '
-                f'{MOST_COMPONENTS} over {len(self.dofs)}'
-            )
-        if not abs(total - 1.0) < 1e-3 or not (self.components.weights > 0).all():
-            raise ValueError(f'weights must be positive and sum to 1, saw a sum of {total:g}')
+        different = len(set(self.dofs)) == len(self.dofs)
+        require(different and rotation.all(), 'wanted different angles')
+        own, total = self.components, float(self.components.weights.sum())
+        require(
+            own.dimension == len(self.dofs) and 2 <= len(own) <= MOST_COMPONENTS,
+            f'{len(own)} components over {own.dimension} angles, wanted 2 to {MOST_COMPONENTS} '
+            f'over {len(self.dofs)}',
+        )
+        right = abs(total - 1.0) < 1e-3 and (own.weights > 0).all()
+        require(right, f'weights must be positive and sum to 1, saw a sum of {total:g}')
         self.components.cholesky()
         _ = self._mirror_order
 
@@ -141,39 +138,24 @@ class AngleMixture:
         }
 
     @classmethod
-    def from_arrays(
-        cls, arrays: Arrays, where: str = 'pose prior', *, skeleton: Skeleton
-    ) -> AngleMixture:
+    def from_arrays(cls, arrays: Arrays, skeleton: Skeleton) -> AngleMixture:
         """The mixture that `to_arrays` and a card describe, of the angles of a skeleton.
 
         Raises:
-            ValueError: arrays or parameters are missing or wrong, or the skeleton is another one.
+            ValueError, LookupError, TypeError: arrays or parameters are missing or wrong, or the
+                skeleton is another one.
         """
-        with named_faults(where):
-            parameters = parameters_of(arrays)
-            check_shapes(arrays, mounts=skeleton.mounts.shape)
-            same = np.allclose(arrays['mounts'], skeleton.mounts, atol=SAME)
-            if parameters['body'] != skeleton.name or not same:
-                raise ModelFileError(
-                    f'{where}: a pose prior of another body than {skeleton.name!r}, or with other '
-                    'frames at rest; learn one with `learn prior --body`'
-                )
-            dofs, count = tuple(map(str, parameters['dofs'])), len(arrays['weights'])
-            n = len(dofs)
-            lower = np.tril_indices(n)
-            check_shapes(arrays, weights=(count,), means=(count, n))
-            check_shapes(arrays, factors=(count, len(lower[0])))
-            factors = np.zeros((count, n, n))
-            factors[:, lower[0], lower[1]] = arrays['factors']
-            components = GaussianMixture(
-                arrays['weights'], arrays['means'], factors @ factors.transpose(0, 2, 1)
-            )
-            check_covariances('the mixture', components.covariances)
-            return cls(skeleton, dofs, components, parameters_of(arrays, 'card'))
-
-    def example_input(self) -> Array:
-        """Nothing: the mixture is not conditional."""
-        return np.zeros(0)
+        parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
+        same = np.allclose(arrays['mounts'], skeleton.mounts, atol=SAME)
+        same = same and parameters['body'] == skeleton.name
+        require(same, f'it is for another body than {skeleton.name}, or other frames at rest')
+        dofs, means = tuple(map(str, parameters['dofs'])), arrays['means']
+        factors = np.zeros((*means.shape, len(dofs)))
+        lower = np.tril_indices(len(dofs))
+        factors[:, lower[0], lower[1]] = arrays['factors']
+        covariances = factors @ factors.transpose(0, 2, 1)
+        components = GaussianMixture(arrays['weights'], means, covariances)
+        return cls(skeleton, dofs, components, card)
 
     def answer(self, given: Array) -> GaussianMixture:
         """The mixture."""
@@ -186,8 +168,7 @@ class AngleMixture:
         place = {int(j): i for i, j in enumerate(self.indices)}
         wanted = order[self.indices].tolist()
         lonely = [name for name, j in zip(self.dofs, wanted, strict=True) if j not in place]
-        if lonely:
-            raise ValueError(f'the mirror images of {lonely} are missing')
+        require(not lonely, f'the mirror images of {lonely} are missing')
         return np.array([place[j] for j in wanted], dtype=np.intp), signs[self.indices]
 
 

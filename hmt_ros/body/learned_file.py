@@ -43,8 +43,10 @@ Arrays = dict[str, NDArray[Any]]
 LARGEST_FILE, MOST_VALUES, LONGEST_TEXT = 2**27, 2**24, 2**20
 # Maximum number of inputs or outputs of a model; a descriptor has a few hundred, a pose forty.
 MOST_NUMBERS = 10_000
-# Range of positive numbers, and of variances. Products of a few of them are finite.
-LEAST, LEAST_VARIANCE, LARGEST = 1e-15, 1e-30, 1e30
+# Ranges of positive numbers and of variances, and the largest ratio of variances. Products of a
+# few of them are finite, and sums of covariances keep what the least adds.
+LEAST, LARGEST = 1e-15, 1e30
+LEAST_VARIANCE, LARGEST_VARIANCE, LARGEST_RATIO = 1e-25, 1e12, 1e13
 # Least eigenvalue of a correlation matrix of which Cholesky factors are taken.
 LEAST_EIGENVALUE = 1e-13
 # Difference of an answer from the stored one, in standard deviations and in nats per variable.
@@ -52,6 +54,7 @@ LEAST_EIGENVALUE = 1e-13
 TOLERANCE = 1e-3
 # The exceptions that wrong arrays cause wherever they are used.
 FAULTS = (
+    OSError,
     LookupError,
     TypeError,
     ValueError,
@@ -59,16 +62,13 @@ FAULTS = (
     ArithmeticError,
     RuntimeError,
     MemoryError,
+    np.linalg.LinAlgError,
 )
 
-_HEADER = ('format', 'version', 'kind', 'parameters')
+_HEADER = ('format', 'version', 'kind')
 _TEXTS = ('format', 'kind', 'parameters', 'card', 'checksum')
 _WHOLE_NUMBERS = ('version', 'shape', 'active', 'n_experts')
 _INPUT, _ANSWER = 'example/input', 'example/answer'
-
-
-class ModelFileError(ValueError):
-    """Raised for a file that is no model, or none that can be used; one line with its path."""
 
 
 class LearnedModel(Protocol):
@@ -76,9 +76,6 @@ class LearnedModel(Protocol):
 
     def to_arrays(self) -> Arrays:
         """The header and the learned arrays."""
-
-    def example_input(self) -> Array:
-        """An input, of any shape, such as the model meets."""
 
     def answer(self, given: Array) -> GaussianMixture:
         """What the model predicts for an input."""
@@ -89,17 +86,24 @@ Model = TypeVar('Model', bound=LearnedModel)
 
 @contextmanager
 def named_faults(where: str) -> Iterator[None]:
-    """Makes every exception that wrong arrays cause a `ModelFileError`."""
+    """Makes every exception that wrong arrays cause a ValueError of one line, with a path.
+
+    It repeats the texts of ValueErrors alone, which have no content of the file.
+    """
     try:
         with np.errstate(all='ignore'):
             yield
-    except ModelFileError:
-        raise
     except FAULTS as fault:
-        raise ModelFileError(
-            f'{where}: a wrong model file ({type(fault).__name__}: {error_line(fault)}); '
-            'train it again'
+        text = error_line(fault)[:150] if isinstance(fault, ValueError) else type(fault).__name__
+        raise ValueError(
+            f'{where}: not a model file that can be used ({text}); train or learn it again'
         ) from fault
+
+
+def require(condition: object, what: str) -> None:
+    """Raises ValueError, which says what is wrong, unless a condition holds."""
+    if not condition:
+        raise ValueError(what)
 
 
 def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
@@ -112,24 +116,17 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
         'format': np.array(FORMAT),
         'version': np.array(VERSION),
         'kind': np.array(kind),
-        'parameters': _json(parameters),
+        'parameters': np.array(json.dumps(dict(parameters), sort_keys=True)),
     }
 
 
-def check_header(arrays: Mapping[str, NDArray[Any]], kind: str, where: str) -> None:
-    """Checks the arrays of `header`.
-
-    Raises:
-        ModelFileError: the format, the version or the kind is another one.
-    """
+def check_header(arrays: Mapping[str, NDArray[Any]], kind: str) -> None:
+    """Raises ValueError unless the arrays are those of `header`, for models of a kind."""
     single = [name for name in _HEADER if name in arrays and not arrays[name].ndim]
     found = {name: str(arrays[name]) for name in single}
-    if len(found) != len(_HEADER) or found['format'] != FORMAT:
-        raise ModelFileError(f'{where}: not a model file of hmt_ros; train one')
-    if found['version'] != str(VERSION):
-        raise ModelFileError(f'{where}: a model file of another version; train it again')
-    if found['kind'] != kind:
-        raise ModelFileError(f'{where}: not a model of kind {kind!r}; load it as such')
+    require(found.get('format') == FORMAT, 'it is none of hmt_ros')
+    require(found.get('version') == str(VERSION), 'it is of another version')
+    require(found.get('kind') == kind, f'it is none of kind {kind!r}')
 
 
 def parameters_of(arrays: Mapping[str, NDArray[Any]], name: str = 'parameters') -> dict[str, Any]:
@@ -138,131 +135,129 @@ def parameters_of(arrays: Mapping[str, NDArray[Any]], name: str = 'parameters') 
     Raises:
         ValueError: they are no JSON of a mapping.
     """
-    result = json.loads(str(arrays[name]), parse_constant=_no_number)
-    if not isinstance(result, dict):
-        raise ValueError(f'{name} are a {type(result).__name__}, wanted a mapping')
-    return result
+    result = json.loads(str(arrays[name]))
+    require(isinstance(result, dict), f'{name} are no mapping')
+    return dict(result)
 
 
-def body_of(parameters: Mapping[str, Any], where: str) -> Body:
+def body_of(parameters: Mapping[str, Any]) -> Body:
     """The body that ships under the name in a file, which must not lead to other files.
 
     Raises:
-        ModelFileError: none ships under this name.
+        ValueError: none ships under this name.
     """
-    if parameters['body'] not in model_names():
-        raise ModelFileError(f'{where}: learned for a body that does not ship: give it')
+    require(parameters['body'] in model_names(), 'it is for a body that does not ship: give it')
     return load_body(parameters['body'])
 
 
 def check_shapes(arrays: Mapping[str, NDArray[Any]], **wanted: tuple[int, ...]) -> None:
     """Raises ValueError if arrays have other shapes than those wanted by name."""
     for name, shape in wanted.items():
-        if arrays[name].shape != shape:
-            raise ValueError(f'{name} has shape {arrays[name].shape}, wanted {shape}')
+        seen = arrays[name].shape
+        require(seen == shape, f'{name} has shape {seen}, wanted {shape}')
 
 
 def check_positive(name: str, values: Any) -> None:
     """Raises ValueError if numbers are not positive, or so small or large that none are."""
-    if not ((np.asarray(values) >= LEAST) & (np.asarray(values) <= LARGEST)).all():
-        raise ValueError(f'{name} must be positive, from {LEAST:g} to {LARGEST:g}')
+    require(
+        np.min(values) >= LEAST and np.max(values) <= LARGEST,
+        f'{name} must be positive, from {LEAST:g} to {LARGEST:g}',
+    )
 
 
 def check_covariances(name: str, values: Array, slack: float = -LEAST_EIGENVALUE) -> None:
-    """Raises ValueError if covariances (..., D, D) are not symmetric and positive definite.
+    """Checks covariances (..., D, D).
 
     Args:
         slack: added to the eigenvalues of the correlations; above 0, they may be semidefinite.
+
+    Raises:
+        ValueError: they are not symmetric and positive definite, or variances are out of range.
     """
     variances = np.diagonal(values, axis1=-2, axis2=-1)
-    if not ((variances >= LEAST_VARIANCE) & (variances <= LARGEST)).all():
-        raise ValueError(f'{name} has variances out of {LEAST_VARIANCE:g} to {LARGEST:g}')
+    least, largest = variances.min(initial=1.0), variances.max(initial=1.0)
+    require(
+        least >= LEAST_VARIANCE and largest <= min(LARGEST_VARIANCE, LARGEST_RATIO * least),
+        f'{name} has variances out of {LEAST_VARIANCE:g} to {LARGEST_VARIANCE:g}, or apart',
+    )
     deviations = np.sqrt(variances)
     correlations = values / deviations[..., None] / deviations[..., None, :]
-    if not np.allclose(correlations, np.swapaxes(correlations, -1, -2), atol=1e-6):
-        raise ValueError(f'{name} is not symmetric')
-    try:
-        np.linalg.cholesky(correlations + slack * np.eye(values.shape[-1]))
-    except np.linalg.LinAlgError:
-        raise ValueError(f'{name} is not positive definite') from None
+    same = np.allclose(correlations, np.swapaxes(correlations, -1, -2), atol=1e-6)
+    require(same, f'{name} is not symmetric')
+    np.linalg.cholesky(correlations + slack * np.eye(values.shape[-1]))
 
 
 def write_model(
     path: str | Path,
     model: LearnedModel,
-    read: Callable[[Arrays, str], LearnedModel],
+    read: Callable[[Arrays], LearnedModel],
     card: Mapping[str, Any],
+    example: Array,
 ) -> Path:
     """Writes a model that can be read again completely, or not at all.
 
     Args:
         path: File to write; '.npz' is appended where it is missing.
-        read: makes the model from its arrays, given the name of the file for errors.
+        read: makes the model from its arrays.
         card: what it was learned from, licence, method; JSON must be able to hold it.
+        example: an input, for `LearnedModel.answer`.
 
     Returns:
         The path written.
 
     Raises:
-        ModelFileError: a reader would refuse the file.
+        ValueError: a reader would refuse the file.
     """
     arrays = model.to_arrays()
-    size = sum(values.size for values in arrays.values())
-    arrays |= {'card': _json({**card, 'numbers': size}), _INPUT: model.example_input()}
+    whole = {**card, 'numbers': sum(values.size for values in arrays.values())}
+    arrays |= {'card': np.array(json.dumps(whole, sort_keys=True)), _INPUT: example}
     with named_faults(str(path)):
         # In the precision of the file, as a reader computes it.
-        arrays[_ANSWER] = _answer(read(arrays, str(path)), arrays)
-    arrays['checksum'] = np.array(checksum(arrays))
-    checked_model(arrays, read, str(path))
+        arrays[_ANSWER] = _answer(read(arrays), arrays)
+        arrays['checksum'] = np.array(checksum(arrays))
+        checked_model(arrays, read)
     return write_arrays(path, arrays)
 
 
-def read_model(path: str | Path, kind: str, read: Callable[[Arrays, str], Model]) -> Model:
+def read_model(path: str | Path, kind: str, read: Callable[[Arrays], Model]) -> Model:
     """The model in a file.
 
     Args:
-        read: makes the model from the arrays, given the name of the file for errors.
+        read: makes the model from its arrays.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ModelFileError: the file is none of this format, version and kind, or damaged, or wrong.
+        ValueError: the file is none of this format, version and kind, or damaged, or wrong.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f'{path}: no such model file; train one')
-    try:
-        arrays = read_archive(path, LARGEST_FILE)
-    except (OSError, *FAULTS) as fault:
-        raise ModelFileError(
-            f'{path}: not a model file of hmt_ros ({error_line(fault)}); train one'
-        ) from fault
+    if not Path(path).is_file():
+        raise FileNotFoundError(f'{path}: no such model file; train or learn one')
     with named_faults(str(path)):
-        check_header(arrays, kind, str(path))
-        return checked_model(arrays, read, str(path))
+        arrays = read_archive(path, LARGEST_FILE)
+        check_header(arrays, kind)
+        return checked_model(arrays, read)
 
 
-def checked_model(arrays: Arrays, read: Callable[[Arrays, str], Model], where: str) -> Model:
+def checked_model(arrays: Arrays, read: Callable[[Arrays], Model]) -> Model:
     """The model of the arrays of a whole file.
 
     Raises:
-        ModelFileError: the arrays are damaged or wrong.
+        Exception: the arrays are damaged or wrong; some of `FAULTS`.
     """
-    with named_faults(where):
-        if str(arrays.get('checksum')) != checksum(arrays):
-            raise ModelFileError(f'{where}: a damaged model file (other checksum); copy it again')
-        _check_values(arrays)
-        model = read(arrays, where)
-        written = {name: (x.dtype, x.shape) for name, x in model.to_arrays().items()}
-        found = {name: (x.dtype, x.shape) for name, x in arrays.items()}
-        for name in {*written, *found} - {'card', 'checksum', _INPUT, _ANSWER}:
-            if name.rpartition('/')[2] not in _TEXTS and written.get(name) != found.get(name):
-                raise ValueError(f'an array has another name, type or shape than {FORMAT}s have')
-        parameters_of(arrays, 'card')
-        answer, stored = _answer(model, arrays), arrays[_ANSWER]
-        size = len(answer) // 2
-        allowed = TOLERANCE * np.r_[answer[size:-1], answer[size:-1], size]
-        if answer.shape != stored.shape or not (np.abs(answer - stored) <= allowed).all():
-            raise ValueError('it does not answer as when it was written')
+    own = str(arrays.get('checksum'))
+    require(own == checksum(arrays), 'it is damaged, its checksum is another one: copy it again')
+    _check_values(arrays)
+    model = read(arrays)
+    numbers = [
+        {name: (x.dtype, x.shape) for name, x in some.items() if x.dtype.kind != 'U'}
+        for some in (arrays, model.to_arrays() | {x: arrays[x] for x in (_INPUT, _ANSWER)})
+    ]
+    require(numbers[0] == numbers[1], 'an array has another name, type or shape than usual')
+    parameters_of(arrays, 'card')
+    answer, stored = _answer(model, arrays), arrays[_ANSWER]
+    size = len(answer) // 2
+    allowed = TOLERANCE * np.r_[answer[size:-1], answer[size:-1], size]
+    same = answer.shape == stored.shape and (np.abs(answer - stored) <= allowed).all()
+    require(same, 'it does not answer as when it was written')
     return model
 
 
@@ -279,33 +274,25 @@ def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
 def _answer(model: LearnedModel, arrays: Arrays) -> Array:
     """What a model says for the stored input: mean, deviations (D,) and log density at the mean."""
     found = model.answer(arrays[_INPUT])
-    if not abs(float(found.weights.sum()) - 1.0) < TOLERANCE:
-        raise ValueError('the weights of its answer do not sum to 1')
+    require(abs(found.weights.sum() - 1.0) < TOLERANCE, 'its weights do not sum to 1')
     check_covariances('its answer', found.covariances)
     mean, whole = found.mean(), found.covariance()
     return np.r_[mean, np.sqrt(np.diagonal(whole)), found.log_density(mean[None])]
 
 
 def _check_values(arrays: Arrays) -> None:
-    if sum(values.size for values in arrays.values()) > MOST_VALUES:
-        raise ValueError(f'it has more than {MOST_VALUES} numbers')
+    """Raises ValueError for types that models do not have, and numbers that are none."""
+    size = sum(values.size for values in arrays.values())
+    require(size <= MOST_VALUES, f'it has more than {MOST_VALUES} numbers')
     for name, values in arrays.items():
-        own = name.rpartition('/')[2]
-        kind = 'U' if own in _TEXTS else 'i' if own in _WHOLE_NUMBERS else 'f'
-        if values.dtype.kind != kind or (kind == 'U' and values.ndim):
-            raise ValueError('an array has another type than those of model files')
-        if kind == 'U' and values.dtype.itemsize > 4 * LONGEST_TEXT:
-            raise ValueError(f'a text is longer than {LONGEST_TEXT} characters')
-        if kind == 'f' and not float(np.abs(values).max(initial=0.0)) <= LARGEST:
-            raise ValueError('an array has values that are not finite, or too large')
-
-
-def _json(values: Mapping[str, Any]) -> NDArray[Any]:
-    return np.array(json.dumps(dict(values), sort_keys=True))
-
-
-def _no_number(text: str) -> None:
-    raise ValueError('a number is not finite')
+        own, kind = name.rpartition('/')[2], values.dtype.kind
+        usual = 'U' if own in _TEXTS else 'i' if own in _WHOLE_NUMBERS else 'f'
+        require(kind == usual, 'an array has another type than usual')
+        if kind == 'U':
+            require(values.nbytes <= 4 * LONGEST_TEXT, 'a text is too long')
+        else:
+            largest = float(np.abs(values).max(initial=0))
+            require(largest <= LARGEST, 'an array has values that are not finite, or too large')
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:

@@ -19,12 +19,10 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.learned_file import (
     Arrays,
     check_covariances,
-    check_positive,
-    check_shapes,
     header,
-    named_faults,
     parameters_of,
     read_model,
+    require,
 )
 from hmt_ros.body.model_file import shipped_file
 from hmt_ros.inference.arrays import Array
@@ -60,11 +58,8 @@ class LearnedMotion:
     card: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if self.dynamics.dimension != len(self.dof_names):
-            raise ValueError(
-                f'{len(self.dof_names)} degrees of freedom are named, and '
-                f'{self.dynamics.dimension} move'
-            )
+        named, moved = len(self.dof_names), self.dynamics.dimension
+        require(named == moved, f'{named} degrees of freedom are named, and {moved} move')
 
     @cached_property
     def dynamics(self) -> DampedVelocity:
@@ -81,28 +76,18 @@ class LearnedMotion:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Arrays, where: str = 'motion prior') -> LearnedMotion:
+    def from_arrays(cls, arrays: Arrays) -> LearnedMotion:
         """The motion prior that `to_arrays` and a card describe.
 
         Raises:
-            ValueError: arrays or parameters are missing, or wrong.
+            ValueError, KeyError, TypeError: arrays or parameters are missing, or wrong.
         """
-        with named_faults(where):
-            parameters = parameters_of(arrays)
-            names = tuple(map(str, parameters['dof_names']))
-            damping, diffusion, white = (
-                arrays[name].astype(np.float64) for name in ('damping', 'diffusion', 'white')
-            )
-            d = len(names)
-            check_shapes(arrays, damping=(d,), diffusion=(d, d), white=(d,))
-            check_positive('damping and white noise', np.append(damping, white))
-            check_covariances('diffusion', diffusion)
-            card = parameters_of(arrays, 'card')
-            return cls(str(parameters['body']), names, damping, diffusion, white, card)
-
-    def example_input(self) -> Array:
-        """A state (2 d,): a pose and its velocity."""
-        return np.random.default_rng(0).normal(size=self.dynamics.state_dimension)
+        parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
+        names = tuple(map(str, parameters['dof_names']))
+        moved = (arrays[x].astype(np.float64) for x in ('damping', 'diffusion', 'white'))
+        made = cls(str(parameters['body']), names, *moved, card)
+        check_covariances('the velocity', made.dynamics.unknown_velocity)
+        return made
 
     def answer(self, given: Array) -> GaussianMixture:
         """The state that follows on a state (2 d,) after `INTERVAL`."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.body.learned_file import Arrays, check_positive, check_shapes
+from hmt_ros.body.learned_file import Arrays, check_positive
 from hmt_ros.experts.training_pairs import Standardisation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import squared_distances
@@ -99,16 +99,14 @@ class RadialBasis:
 Basis = LinearBasis | RadialBasis
 
 
-def basis_of(arrays: Mapping[str, NDArray[Any]], inputs: int) -> Basis:
-    """The basis over p inputs that `arrays` describes.
+def basis_of(arrays: Mapping[str, NDArray[Any]]) -> Basis:
+    """The basis that `arrays` describes.
 
     Raises:
-        ValueError: the arrays do not fit, or the width is not positive.
+        ValueError: the width or a scale is not positive.
     """
-    check_shapes(arrays, centre=(inputs,))
     standardisation = Standardisation(arrays['centre'], arrays['scale'])
     if 'centres' in arrays:
-        check_shapes(arrays, centres=(len(arrays['centres']), inputs))
         check_positive('width', arrays['width'])
         return RadialBasis(standardisation, arrays['centres'], float(arrays['width']))
     return LinearBasis(standardisation)

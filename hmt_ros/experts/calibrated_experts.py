@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmt_ros.body.learned_file import LARGEST, Arrays, check_shapes, nested, part
+from hmt_ros.body.learned_file import LARGEST, Arrays, nested, parameters_of, part, require
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity, stored_model
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.inference.arrays import Array
@@ -48,15 +48,12 @@ class Calibration:
 
     def __post_init__(self) -> None:
         size = len(self.added)
-        check_shapes({'added': self.added}, added=(size, size))
-        smallest = float(np.linalg.eigvalsh(self.added)[0])
-        if not smallest >= -1e-9 * np.abs(self.added).max() or not np.allclose(
-            self.added, self.added.T
-        ):
-            raise ValueError('added must be symmetric and positive semidefinite')
+        require(self.added.shape == (size, size), 'added must be (D, D)')
+        least, largest = np.linalg.eigvalsh(self.added)[[0, -1]]
+        same = np.allclose(self.added, self.added.T)
+        require(same and least >= -1e-9 * largest, 'added must be positive semidefinite')
         for name in ('temperature', 'factor'):
-            if not 1.0 <= getattr(self, name) <= LARGEST:
-                raise ValueError(f'{name} must be at least 1, saw {getattr(self, name)}')
+            require(1.0 <= getattr(self, name) <= LARGEST, f'{name} must be at least 1')
 
     def of(self, found: Components) -> Components:
         """The calibrated mixtures."""
@@ -99,12 +96,11 @@ class CalibratedExperts(ConditionalDensity):
         return {'folds': self.folds}
 
     @classmethod
-    def _constructed(cls, arrays: Mapping[str, NDArray[Any]], where: str) -> Self:
+    def _constructed(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         own = part('model', arrays)
         # Files could nest models without end.
-        if str(own['kind']) == cls.kind:
-            raise ValueError('a calibrated model inside a calibrated model')
-        return cls(stored_model(own, where), **cls._checked_parameters(arrays))
+        require(str(own['kind']) != cls.kind, 'a calibrated model inside a calibrated model')
+        return cls(stored_model(own), **parameters_of(arrays))
 
     def _learned(self) -> Arrays:
         found = self.calibration_
@@ -115,8 +111,8 @@ class CalibratedExperts(ConditionalDensity):
         } | nested('model', self.model.to_arrays())
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        if (self.model.n_inputs_, self.model.n_outputs_) != (self.n_inputs_, self.n_outputs_):
-            raise ValueError('its model has other inputs or outputs')
+        same = (self.model.n_inputs_, self.model.n_outputs_) == (self.n_inputs_, self.n_outputs_)
+        require(same, 'its model has other inputs or outputs')
         self.calibration_ = Calibration(
             float(arrays['temperature']),
             np.asarray(arrays['added'], dtype=np.float64),

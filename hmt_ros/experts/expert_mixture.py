@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from hmt_ros.body.learned_file import (
     Arrays,
     check_covariances,
-    check_shapes,
     nested,
     part,
+    require,
 )
 from hmt_ros.experts.basis import (
     BASES,
@@ -172,12 +172,11 @@ class ExpertMixture(ConditionalDensity):
 
     def _check_parameters(self) -> None:
         for name in ('n_experts', 'max_kernels', 'n_starts', 'max_iterations'):
-            if getattr(self, name) < 1:
-                raise ValueError(f'{name} is {getattr(self, name)}, wanted at least 1')
-        if self.basis not in BASES:
-            raise ValueError(f'basis is {self.basis!r}, wanted one of {", ".join(BASES)}')
-        if self.width is not None and not self.width > 0:
-            raise ValueError(f'width is {self.width}, wanted a positive number or None')
+            value = getattr(self, name)
+            require(value >= 1, f'{name} is {value}, wanted at least 1')
+        require(self.basis in BASES, f'basis is {self.basis!r}, wanted one of {", ".join(BASES)}')
+        right = self.width is None or self.width > 0
+        require(right, f'width is {self.width}, wanted a positive number or None')
 
     def _bases(self, pairs: TrainingPairs) -> list[Basis]:
         """The candidate basis functions, for each candidate width."""
@@ -300,32 +299,16 @@ class ExpertMixture(ConditionalDensity):
         )
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        p, d, count = self.n_inputs_, self.n_outputs_, int(arrays['n_experts'])
-        if not 1 <= count <= MOST_EXPERTS:
-            raise ValueError(f'it has {count} experts, wanted 1 to {MOST_EXPERTS}')
-        check_shapes(arrays, input_centre=(p,), target_centre=(d,))
+        count = int(arrays['n_experts'])
+        require(1 <= count <= MOST_EXPERTS, f'{count} experts, wanted 1 to {MOST_EXPERTS}')
         self._scaling = Standardisation(arrays['input_centre'], arrays['input_scale'])
         self._target_scaling = Standardisation(arrays['target_centre'], arrays['target_scale'])
-        self.basis_ = basis_of(part('basis', arrays), p)
+        self.basis_ = basis_of(part('basis', arrays))
         if isinstance(self.basis_, RadialBasis):
             self._candidates = arrays['candidates']
-            check_shapes(arrays, candidates=(max(len(self._candidates), 1), p))
-        self.experts_ = tuple(self._stored_expert(part(f'expert{i}', arrays)) for i in range(count))
-        self.gates_ = self._gates.of_arrays(part('gates', arrays), count, p)
+        self.experts_ = tuple(_stored_expert(part(f'expert{i}', arrays)) for i in range(count))
+        self.gates_ = self._gates.of_arrays(part('gates', arrays))
         self._prepare()
-
-    def _stored_expert(self, own: Mapping[str, NDArray[Any]]) -> SparseRegression:
-        active, d = own['active'], self.n_outputs_
-        m = len(active)
-        if not np.array_equal(np.unique(active[active >= 0]), np.sort(active)) or m > MOST_ACTIVE:
-            raise ValueError(f'an expert names functions twice, or more than {MOST_ACTIVE}')
-        check_shapes(own, active=(m,), precisions=(m,), weights=(m, d), covariance=(m, m))
-        check_shapes(own, noise=(d, d))
-        check_covariances('the covariance of weights', own['covariance'], SEMIDEFINITE)
-        evidence = np.nan
-        return SparseRegression(
-            active, own['precisions'], own['weights'], own['covariance'], own['noise'], evidence
-        )
 
 
 class ConditionalExperts(ExpertMixture):
@@ -384,3 +367,15 @@ class RelevanceVectorRegression(ExpertMixture):
 
     def _expert(self, sums: WeightedSums, old: SparseRegression | None) -> SparseRegression:
         return maximise_evidence(sums, self._prior, old)
+
+
+def _stored_expert(own: Mapping[str, NDArray[Any]]) -> SparseRegression:
+    """The regression in a file; raises ValueError if its functions or covariances are none."""
+    active, covariance = own['active'], own['covariance']
+    m = len(active)
+    different = m == len(np.unique(active)) <= MOST_ACTIVE and (active >= 0).all()
+    require(different, f'an expert names functions twice, or more than {MOST_ACTIVE}')
+    check_covariances('the covariance of weights', covariance, SEMIDEFINITE)
+    return SparseRegression(
+        active, own['precisions'], own['weights'], covariance, own['noise'], np.nan
+    )

@@ -30,7 +30,6 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from hmt_ros.body.learned_file import (
     Arrays,
     check_covariances,
-    check_shapes,
     nested,
     part,
 )
@@ -120,16 +119,9 @@ class SoftmaxGates:
         return own | nested('basis', self.basis.arrays())
 
     @classmethod
-    def of_arrays(
-        cls, arrays: Mapping[str, NDArray[Any]], experts: int, inputs: int
-    ) -> SoftmaxGates:
-        """The gates of M experts over p inputs that `arrays` describes.
-
-        Raises:
-            ValueError: the arrays do not fit.
-        """
-        basis = basis_of(part('basis', arrays), inputs)
-        check_shapes(arrays, weights=(experts, len(basis)), precisions=(len(basis),))
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> SoftmaxGates:
+        """The gates that `arrays` describes."""
+        basis = basis_of(part('basis', arrays))
         return cls(basis, arrays['weights'], arrays['precisions'], 0.0)
 
 
@@ -356,20 +348,11 @@ class GaussianGates:
         } | nested('basis', LinearBasis(self.standardisation).arrays())
 
     @classmethod
-    def of_arrays(
-        cls, arrays: Mapping[str, NDArray[Any]], experts: int, inputs: int
-    ) -> GaussianGates:
-        """The gates of M experts over p inputs that `arrays` describes.
-
-        Raises:
-            ValueError: the arrays do not fit, or covariances are none.
-        """
-        square = inputs, inputs
-        check_shapes(arrays, log_shares=(experts,), means=(experts, inputs), target=square)
-        check_shapes(arrays, covariances=(experts, *square), strength=())
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> GaussianGates:
+        """The gates that `arrays` describes; raises ValueError if covariances are none."""
         check_covariances('the covariances of gates', arrays['covariances'])
         return cls(
-            basis_of(part('basis', arrays), inputs).standardisation,
+            basis_of(part('basis', arrays)).standardisation,
             arrays['log_shares'],
             arrays['means'],
             arrays['covariances'],

@@ -36,9 +36,9 @@ from hmt_ros.body.learned_file import (
     check_positive,
     check_shapes,
     header,
-    named_faults,
     parameters_of,
     read_model,
+    require,
     write_model,
 )
 from hmt_ros.experts.gates import log_softmax
@@ -358,33 +358,24 @@ class Lifter:
         return header(KIND, parameters) | self.network.to_arrays()
 
     @classmethod
-    def from_arrays(cls, arrays: Arrays, where: str = 'lifter') -> Lifter:
+    def from_arrays(cls, arrays: Arrays) -> Lifter:
         """The lifter that `to_arrays` and a card describe.
 
         Raises:
-            ValueError: arrays or parameters are missing, or wrong.
+            ValueError, LookupError, TypeError: arrays or parameters are missing, or wrong.
         """
-        with named_faults(where):
-            parameters = parameters_of(arrays)
-            if parameters['landmarks'] != list(LANDMARKS) or parameters['times'] != TIMES.tolist():
-                raise ValueError('it has learned for other windows')
-            joints = tuple(map(str, parameters['joints']))
-            if len({*joints}) != len(joints) or not {*joints} >= WHOLE:
-                raise ValueError('its joints are not those of a whole pose')
-            network = Network.from_arrays(arrays)
-            p, numbers = INPUTS, 1 + 6 * len(joints)
-            experts = max(len(network.last_bias) // numbers, 1)
-            check_shapes(vars(network), mean=(p,), scale=(p,), middle=(len(joints), 3))
-            check_shapes(vars(network), first=(p, len(network.first_bias)))
-            check_shapes(vars(network), last_bias=(experts * numbers,))
-            check_positive('scale', network.scale)
-            usual = body_of(parameters, where)
-            return cls(network, joints, usual, parameters_of(arrays, 'card'))
-
-    def example_input(self) -> Array:
-        """The inputs (p,) of a window like those that it has learned from."""
-        drawn = np.random.default_rng(0).normal(size=len(self.network.mean))
-        return self.network.mean + self.network.scale * drawn
+        parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
+        windows = parameters['landmarks'], parameters['times']
+        require(windows == (list(LANDMARKS), TIMES.tolist()), 'it has learned other windows')
+        joints = tuple(map(str, parameters['joints']))
+        whole = len({*joints}) == len(joints) and {*joints} >= WHOLE
+        require(whole, 'its joints are not those of a whole pose')
+        numbers = 1 + 6 * len(joints)
+        experts = max(len(arrays['last_bias']) // numbers, 1)
+        network = Network.from_arrays(arrays, INPUTS, experts * numbers)
+        check_shapes(arrays, mean=(INPUTS,), scale=(INPUTS,), middle=(len(joints), 3))
+        check_positive('scale', network.scale)
+        return cls(network, joints, body_of(parameters), card)
 
     def answer(self, given: Array) -> GaussianMixture:
         """The mixture over joints, (3 J,), for the inputs (p,) of a window."""
@@ -394,7 +385,9 @@ class Lifter:
 
     def save(self, path: str | Path) -> Path:
         """Writes the lifter into an .npz file, with its notes as the card; returns its path."""
-        return write_model(path, self, self.from_arrays, self.notes)
+        drawn = np.random.default_rng(0).normal(size=INPUTS)
+        example = self.network.mean + self.network.scale * drawn
+        return write_model(path, self, self.from_arrays, self.notes, example)
 
     @classmethod
     def load(cls, path: str | Path) -> Lifter:

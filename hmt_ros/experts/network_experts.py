@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmt_ros.body.learned_file import Arrays, check_positive, check_shapes
+from hmt_ros.body.learned_file import Arrays, check_positive, check_shapes, require
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.training_pairs import Standardisation
@@ -81,22 +81,21 @@ class Layers:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """The layers that `to_arrays` stored.
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], p: int, o: int) -> Self:
+        """The layers that `to_arrays` stored, between p inputs and O numbers.
 
         Raises:
             KeyError, ValueError: arrays are missing, do not fit, or have outputs without bounds.
         """
         own = {name: np.asarray(arrays[name], np.float32) for name in cls.__dataclass_fields__}
-        (p, h), m, o = own['first'].shape, len(own['hidden']), own['last_bias'].size
-        check_shapes(own, first_bias=(h,), hidden=(m, h, h), hidden_biases=(m, h))
-        check_shapes(own, last=(h, o), last_bias=(o,))
-        if m > MOST_LAYERS:
-            raise ValueError(f'it has {m} hidden layers, wanted at most {MOST_LAYERS}')
+        m, h = len(own['hidden']), len(own['first_bias'])
+        require(m <= MOST_LAYERS, f'it has {m} hidden layers, wanted at most {MOST_LAYERS}')
+        check_shapes(own, first=(p, h), hidden=(m, h, h), hidden_biases=(m, h))
+        check_shapes(own, first_bias=(h,), last=(h, o), last_bias=(o,))
         # No output is larger than that of the sizes of all weights for the largest inputs.
         bound = cls(**{name: np.abs(values) for name, values in own.items()})
-        if not (bound.outputs(np.full((1, p), LARGEST_INPUT)) <= LARGEST_OUTPUT).all():
-            raise ValueError(f'its outputs may be larger than {LARGEST_OUTPUT:g}')
+        largest = bound.outputs(np.full((1, p), LARGEST_INPUT)).max()
+        require(largest <= LARGEST_OUTPUT, f'its outputs may be larger than {LARGEST_OUTPUT:g}')
         return cls(**own)
 
 
@@ -194,13 +193,12 @@ class NetworkExperts(ConditionalDensity):
         }
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        a, m, p, d = dict(arrays), self.n_experts, self.n_inputs_, self.n_outputs_
-        check_shapes(a, input_centre=(p,), target_centre=(d,), noise=(m, d, d))
-        check_shapes(a, first=(p, len(a['first_bias'])), last_bias=(m * (2 + d),))
-        check_shapes(a, centres=(max(len(a['centres']), 1), p))
+        a, p, d = dict(arrays), self.n_inputs_, self.n_outputs_
+        m = len(a['noise'])
+        require(m == self.n_experts, f'it has {m} experts, and says otherwise')
         check_positive('spacing', a['spacing'])
         self.set_parts(
-            Layers.from_arrays(a),
+            Layers.from_arrays(a, p, m * (2 + d)),
             Standardisation(a['input_centre'], a['input_scale']),
             Standardisation(a['target_centre'], a['target_scale']),
             a['noise'].astype(np.float64),

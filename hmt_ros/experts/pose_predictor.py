@@ -23,15 +23,14 @@ from numpy.typing import ArrayLike
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.learned_file import (
     Arrays,
-    ModelFileError,
     body_of,
     check_covariances,
     header,
-    named_faults,
     nested,
     parameters_of,
     part,
     read_model,
+    require,
     write_model,
 )
 from hmt_ros.body.motion_prior import motion_prior
@@ -79,18 +78,8 @@ FORGETTING, LASTING = 5.0, 0.02
 # Axes of unit length have no spread along themselves, and those that are predicted have no unit
 # length: variance that is added to both.
 OF_AXES = 0.5**2
-# The person whose silhouette is the example of a file: rows and columns of rectangles.
-FIGURE = (
-    (5, 22, 33, 47),
-    (22, 30, 20, 60),
-    (30, 65, 28, 52),
-    (30, 60, 20, 25),
-    (30, 55, 55, 60),
-    (65, 115, 28, 37),
-    (65, 115, 43, 52),
-)
 # Largest condition of a basis of targets; how much an offset may differ from the usual one, m.
-WORST_CONDITION, OFFSET = 1e12, 0.15
+WORST_CONDITION, OFFSET = 1e12, 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,14 +132,13 @@ class PosePredictor:
         _check_fit('model', model, descriptor.size, size)
         if dynamics is not None:
             _check_fit('dynamics', dynamics, size + descriptor.size, size)
-        if target_basis.shape != (size, size) or not np.isfinite(target_basis).all():
-            raise ValueError(
-                f'target_basis must be finite and ({size}, {size}), saw {target_basis.shape}'
-            )
-        if (len(equilibrium), equilibrium.dimension) != (1, size):
-            raise ValueError(f'equilibrium must be one component over {size} numbers')
-        if not np.linalg.cond(target_basis) <= WORST_CONDITION:
-            raise ValueError('target_basis is singular')
+        require(
+            target_basis.shape == (size, size) and np.isfinite(target_basis).all(),
+            f'target_basis must be finite and ({size}, {size}), saw {target_basis.shape}',
+        )
+        right = (len(equilibrium), equilibrium.dimension) == (1, size)
+        require(right, f'equilibrium must be one component over {size} numbers')
+        require(np.linalg.cond(target_basis) <= WORST_CONDITION, 'target_basis is singular')
         self._from_basis = np.asarray(np.linalg.inv(target_basis), dtype=np.float64)
 
     @property
@@ -164,7 +152,7 @@ class PosePredictor:
         Raises:
             ValueError: the body has other degrees of freedom.
         """
-        _check_body(body, self.body.dof_names, f'this predictor, of {self.body.name}')
+        _check_body(body, self.body.dof_names, f'this predictor, of {self.body.name},')
         return PosePredictor(
             body,
             self.descriptor,
@@ -206,11 +194,11 @@ class PosePredictor:
             ValueError: the mask has not the size of the camera's image.
         """
         seen = np.asarray(mask)
-        if seen.shape != (camera.height, camera.width):
-            raise ValueError(
-                f'the mask has shape {seen.shape}, but the camera gives '
-                f'({camera.height}, {camera.width})'
-            )
+        require(
+            seen.shape == (camera.height, camera.width),
+            f'the mask has shape {seen.shape}, but the camera gives '
+            f'({camera.height}, {camera.width})',
+        )
         blob = person_blob(seen)
         descriptor = self.described(blob, camera)
         support = float(self.model.support(descriptor[None])[0])
@@ -352,49 +340,40 @@ class PosePredictor:
         return arrays
 
     @classmethod
-    def from_arrays(
-        cls, arrays: Arrays, where: str = 'predictor', body: Body | None = None
-    ) -> PosePredictor:
+    def from_arrays(cls, arrays: Arrays, body: Body | None = None) -> PosePredictor:
         """The predictor that `to_arrays` and a card describe; see `load`.
 
         Raises:
-            ValueError: arrays or parameters are missing or wrong, or the body is another one.
+            ValueError, LookupError, TypeError: arrays or parameters are missing or wrong, or the
+                body is another one.
         """
-        with named_faults(where):
-            parameters = parameters_of(arrays)
-            names = tuple(map(str, parameters['dof_names']))
-            if body is None:
-                body = body_of(parameters, where)
-                _check_body(body, names, where)
-                body = body.with_segment_lengths(_checked_lengths(body, parameters['lengths']))
-            else:
-                _check_body(body, names, where)
-            descriptor = SilhouetteDescriptor.from_arrays(
-                part('descriptor', arrays), parameters['points']
-            )
-            model = stored_model(part('model', arrays), where)
-            dynamics = part('dynamics', arrays)
-            equilibrium = GaussianMixture(
-                np.ones(1), arrays['equilibrium_mean'][None], arrays['equilibrium_covariance'][None]
-            )
-            check_covariances('equilibrium', equilibrium.covariances)
-            return cls(
-                body,
-                descriptor,
-                model,
-                arrays['target_basis'],
-                equilibrium,
-                stored_model(dynamics, where) if dynamics else None,
-                parameters_of(arrays, 'card'),
-            )
-
-    def example_input(self) -> Array:
-        """The parts of a silhouette, one after the other: a figure of rectangles."""
-        mask = np.zeros((120, 80), dtype=np.uint8)
-        for top, bottom, left, right in FIGURE:
-            mask[top:bottom, left:right] = 1
-        parts = vars(silhouette_parts(mask, self.descriptor.points)).values()
-        return np.concatenate([x.ravel() for x in parts])
+        parameters = parameters_of(arrays)
+        if body is None:
+            body, own = body_of(parameters), parameters['lengths']
+            usual = body.segment_lengths
+            # Some are offsets near zero, of either sign.
+            allowed = {k: 0.9 * x if x > OFFSET else OFFSET for k, x in usual.items()}
+            human = all(abs(own[k] - x) <= allowed[k] for k, x in usual.items())
+            require(human and own.keys() == usual.keys(), 'nobody has its lengths')
+            body = body.with_segment_lengths(own)
+        _check_body(body, parameters['dof_names'], 'the predictor')
+        descriptor = SilhouetteDescriptor.from_arrays(
+            part('descriptor', arrays), parameters['points']
+        )
+        dynamics = part('dynamics', arrays)
+        equilibrium = GaussianMixture(
+            np.ones(1), arrays['equilibrium_mean'][None], arrays['equilibrium_covariance'][None]
+        )
+        check_covariances('equilibrium', equilibrium.covariances)
+        return cls(
+            body,
+            descriptor,
+            stored_model(part('model', arrays)),
+            arrays['target_basis'],
+            equilibrium,
+            stored_model(dynamics) if dynamics else None,
+            parameters_of(arrays, 'card'),
+        )
 
     def answer(self, given: Array) -> GaussianMixture:
         """The mixture over targets (D,) for the parts of a silhouette; with dynamics, by these."""
@@ -408,7 +387,11 @@ class PosePredictor:
 
     def save(self, path: str | Path) -> Path:
         """Writes the predictor into an .npz file, with its notes as the card; returns its path."""
-        return write_model(path, self, partial(self.from_arrays, body=self.body), self.notes)
+        read = partial(self.from_arrays, body=self.body)
+        # Most numbers of the parts of a silhouette lie between 0 and 1.
+        size = self.descriptor.points * RADIAL * ANGULAR + FIXED
+        example = np.random.default_rng(0).integers(0, 64, size) / 64.0
+        return write_model(path, self, read, self.notes, example)
 
     @classmethod
     def load(cls, path: str | Path, body: Body | None = None) -> PosePredictor:
@@ -440,33 +423,20 @@ def load_predictor(model: str | Path = SHIPPED) -> PosePredictor:
     return PosePredictor.load(model)
 
 
-def _check_body(body: Body, names: Sequence[str], where: str) -> None:
-    if tuple(names) != body.dof_names:
-        missing = sorted(set(body.dof_names) - set(names))
-        raise ModelFileError(
-            f'{where}: trained for a body of {len(names)} degrees of freedom, but {body.name} has '
-            f'{body.dimension} (more: {missing}); use that body or train again'
-        )
-
-
-def _checked_lengths(body: Body, lengths: Mapping[str, Any]) -> Mapping[str, float]:
-    """Lengths (m) in a file by name; raises ValueError if nobody has them."""
-    usual = body.segment_lengths
-    if lengths.keys() != usual.keys():
-        raise ValueError(f'its lengths are not those of {body.name}')
-    for name, value in lengths.items():
-        # Some are offsets near zero, of either sign.
-        if not abs(value - usual[name]) <= max(0.9 * usual[name], OFFSET):
-            raise ValueError(f'nobody has its length {name}')
-    return lengths
+def _check_body(body: Body, names: Sequence[str], what: str) -> None:
+    require(
+        tuple(names) == body.dof_names,
+        f'{what} is for a body of {len(names)} degrees of freedom, but {body.name} has '
+        f'{body.dimension} or others: use that body or train again',
+    )
 
 
 def _check_fit(what: str, model: ConditionalDensity, inputs: int, outputs: int) -> None:
-    if (model.n_inputs_, model.n_outputs_) != (inputs, outputs):
-        raise ValueError(
-            f'the {what} has {model.n_inputs_} inputs and {model.n_outputs_} outputs, wanted '
-            f'{inputs} and {outputs}'
-        )
+    require(
+        (model.n_inputs_, model.n_outputs_) == (inputs, outputs),
+        f'the {what} has {model.n_inputs_} inputs and {model.n_outputs_} outputs, wanted '
+        f'{inputs} and {outputs}',
+    )
 
 
 def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:

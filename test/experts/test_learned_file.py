@@ -21,13 +21,13 @@ def test_same_model_same_bytes(model, tmp_path):
 
 def test_other_versions_are_refused(model, tmp_path):
     path = write_forged(tmp_path / 'm.npz', model.save(tmp_path / 'm'), {'version': np.array(1)})
-    with pytest.raises(ValueError, match='a model file of another version; train it again'):
+    with pytest.raises(ValueError, match='it is of another version'):
         NearestNeighbours.load(path)
 
 
 def test_other_kind_is_refused(model, tmp_path):
     path = model.save(tmp_path / 'm')
-    with pytest.raises(ValueError, match="not a model of kind 'joint_experts'"):
+    with pytest.raises(ValueError, match="it is none of kind 'joint_experts'"):
         JointExperts.load(path)
 
 
@@ -35,7 +35,7 @@ def test_other_kind_is_refused(model, tmp_path):
 @pytest.mark.parametrize('value', ['a\nsecret\x85' + 1000 * 'b', ['secret'] * 3])
 def test_a_strange_header_makes_one_line_that_repeats_nothing_of_it(name, value, model, tmp_path):
     path = write_forged(tmp_path / 'm.npz', model.save(tmp_path / 'm'), {name: np.array(value)})
-    with pytest.raises(ValueError, match=r'train it again|train one|load it as such') as error:
+    with pytest.raises(ValueError, match='train or learn it again') as error:
         NearestNeighbours.load(path)
     assert len(str(error.value).splitlines()) == 1
     assert 'secret' not in str(error.value)
@@ -45,10 +45,10 @@ def test_damage_is_told_from_a_model_that_is_wrong(model, tmp_path):
     path = model.save(tmp_path / 'm')
     arrays = arrays_of(path)
     arrays['targets'][3, 1] += 1e-9
-    with pytest.raises(ValueError, match=r'a damaged model file \(other checksum\); copy it again'):
+    with pytest.raises(ValueError, match='it is damaged, its checksum'):
         NearestNeighbours.load(write_arrays(path, arrays))
     write_arrays(path, forged(arrays, {'targets': arrays['targets'] + 1.0}))
-    with pytest.raises(ValueError, match=r'a wrong model file .* does not answer as when'):
+    with pytest.raises(ValueError, match='it does not answer as when'):
         NearestNeighbours.load(path)
 
 
@@ -73,7 +73,7 @@ def test_missing_file_is_named(tmp_path):
 def test_other_files_are_refused(content, tmp_path):
     path = tmp_path / 'm.npz'
     path.write_bytes(content)
-    with pytest.raises(ValueError, match='not a model file of hmt_ros'):
+    with pytest.raises(ValueError, match='not a model file that can be used'):
         NearestNeighbours.load(path)
 
 
@@ -81,15 +81,14 @@ def test_foreign_archive_and_pickles_are_refused(tmp_path):
     np.savez(tmp_path / 'a.npz', x=np.zeros(3))
     np.savez(tmp_path / 'b.npz', x=np.array([{'a': 1}], dtype=object))
     for name in ('a.npz', 'b.npz'):
-        with pytest.raises(ValueError, match='not a model file of hmt_ros'):
+        with pytest.raises(ValueError, match='not a model file that can be used'):
             NearestNeighbours.load(tmp_path / name)
 
 
-def test_a_model_without_an_array_is_refused(model):
-    arrays = model.to_arrays()
-    del arrays['targets']
-    with pytest.raises(ValueError, match=r'a wrong model file \(KeyError'):
-        NearestNeighbours.from_arrays(arrays)
+def test_a_model_without_an_array_is_refused(model, tmp_path):
+    path = write_forged(tmp_path / 'm.npz', model.save(tmp_path / 'm'), {'targets': None})
+    with pytest.raises(ValueError, match=r'can be used \(KeyError\); train or learn it again'):
+        NearestNeighbours.load(path)
 
 
 def test_sizes_that_no_model_has_are_refused(model):
