@@ -87,7 +87,7 @@ def test_a_file_brings_it_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         again.log_density(inputs, targets), model.log_density(inputs, targets), rtol=1e-9
     )
-    with pytest.raises(ValueError, match="'calibrated_experts', wanted 'joint_experts'"):
+    with pytest.raises(ValueError, match="it is none of kind 'joint_experts'"):
         JointExperts.load(tmp_path / 'model.npz')
 
 
