@@ -277,7 +277,8 @@ def _answer(model: LearnedModel, arrays: Arrays) -> Array:
     require(abs(found.weights.sum() - 1.0) < TOLERANCE, 'its weights do not sum to 1')
     check_covariances('its answer', found.covariances)
     mean, whole = found.mean(), found.covariance()
-    return np.r_[mean, np.sqrt(np.diagonal(whole)), found.log_density(mean[None])]
+    told: Array = np.r_[mean, np.sqrt(np.diagonal(whole)), found.log_density(mean[None])]
+    return told
 
 
 def _check_values(arrays: Arrays) -> None:

@@ -84,8 +84,10 @@ class LearnedMotion:
         """
         parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
         names = tuple(map(str, parameters['dof_names']))
-        moved = (arrays[x].astype(np.float64) for x in ('damping', 'diffusion', 'white'))
-        made = cls(str(parameters['body']), names, *moved, card)
+        damping, diffusion, white = (
+            arrays[name].astype(np.float64) for name in ('damping', 'diffusion', 'white')
+        )
+        made = cls(str(parameters['body']), names, damping, diffusion, white, card)
         check_covariances('the velocity', made.dynamics.unknown_velocity)
         return made
 

@@ -239,11 +239,11 @@ class ConditionalDensity(ABC):
         """Raises ValueError if predictions do not fit each other, are none, or are too large."""
         inputs, d = np.eye(2, self.n_inputs_), self.n_outputs_
         found = self.components(inputs)
-        m, parts = found.log_weights.shape[-1], vars(found).values()
+        m, parts = found.log_weights.shape[-1], [*vars(found).values()]
         shapes = [x.shape for x in parts]
         require(shapes == [(2, m), (2, m, d), (2, m), (m, d, d)], 'its predictions do not fit')
         require(m * d * max(d, self.n_inputs_) <= MOST_VALUES, 'its predictions are too large')
-        parts = [*parts, self.jacobians(inputs), self.support(inputs)]
+        parts += [self.jacobians(inputs), self.support(inputs)]
         require(all(np.isfinite(x).all() for x in parts), 'its predictions are not finite')
         check_covariances('noise', found.noise)
 
