@@ -39,8 +39,10 @@ VERSION = 2
 
 Arrays = dict[str, NDArray[Any]]
 
-# Maximum sizes of a file: bytes and numbers of all arrays, characters of a text.
-LARGEST_FILE, MOST_VALUES, LONGEST_TEXT = 2**27, 2**24, 2**20
+# Maximum sizes of a file: numbers and bytes of all arrays, characters of a text. Neighbours of
+# 80,000 silhouettes, with a model for rule (1), have 19 million numbers.
+MOST_VALUES, LONGEST_TEXT = 20_000_000, 2**20
+LARGEST_FILE = 8 * MOST_VALUES
 # Maximum number of inputs or outputs of a model; a descriptor has a few hundred, a pose forty.
 MOST_NUMBERS = 10_000
 # Ranges of positive numbers and of variances, and the largest ratio of variances. Products of a
