@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
+from hmt_ros.body import load_body
+from hmt_ros.body.angle_mixture import read_pose_prior
 from hmt_ros.body.learned_file import nested, parameters_of, part, write_arrays
-from hmt_ros.experts import JointExperts, NearestNeighbours
+from hmt_ros.body.motion_prior import read_motion_prior
+from hmt_ros.experts import JointExperts, Lifter, NearestNeighbours, PosePredictor
+from hmt_ros.experts.network_experts import Layers
 from test.forged_models import arrays_of, forged, write_forged
+from test.test_docs import ROOT
 
 
 @pytest.fixture(scope='module')
@@ -108,3 +113,39 @@ def test_parts_come_back():
 def test_model_that_has_not_learned_is_not_saved(tmp_path):
     with pytest.raises(ValueError, match='call fit first'):
         NearestNeighbours().save(tmp_path / 'm')
+
+
+SHIPPED = sorted(ROOT.glob('hmt_ros/*/models/*.npz'))
+
+
+@pytest.mark.parametrize('path', SHIPPED, ids=lambda path: path.stem)
+def test_a_file_that_ships_has_a_card_and_shows_damage(path, tmp_path):
+    readers = {
+        'keypoints': Lifter.load,
+        'silhouettes': PosePredictor.load,
+        'human37_motion': read_motion_prior,
+        'human37_prior': lambda file: read_pose_prior(file, load_body('human37')),
+    }
+    read, arrays = readers[path.stem], arrays_of(path)
+    read(path)
+    card = parameters_of(arrays, 'card')
+    assert 'NSF EIA-0196217' in card['source']
+    assert {'date', 'made by', 'licence', 'numbers'} <= card.keys()
+    assert ('UI-PRMD' in card['source']) == ('prmd_' in str(card.get('motions')))
+    name = next(name for name, values in arrays.items() if values.dtype.kind == 'f')
+    damaged = arrays[name].copy()
+    damaged.view(np.uint8).ravel()[0] ^= 1
+    with pytest.raises(ValueError, match='it is damaged, its checksum is another one'):
+        read(write_arrays(tmp_path / 'damaged.npz', arrays | {name: damaged}))
+
+
+def test_a_network_of_a_million_layers_is_refused_before_it_is_computed():
+    layers = {
+        'first': np.ones((1, 1)),
+        'hidden': np.zeros((10**6, 1, 1)),
+        'hidden_biases': np.zeros((10**6, 1)),
+        'last': np.ones((1, 3)),
+    }
+    one, three = np.zeros(1), np.zeros(3)
+    with pytest.raises(ValueError, match='1000000 hidden layers, wanted at most 100'):
+        Layers.from_arrays(layers | {'first_bias': one, 'last_bias': three}, 1, 3)
