@@ -152,13 +152,6 @@ def body_of(parameters: Mapping[str, Any]) -> Body:
     return load_body(parameters['body'])
 
 
-def check_shapes(arrays: Mapping[str, NDArray[Any]], **wanted: tuple[int, ...]) -> None:
-    """Raises ValueError if arrays have other shapes than those wanted by name."""
-    for name, shape in wanted.items():
-        seen = arrays[name].shape
-        require(seen == shape, f'{name} has shape {seen}, wanted {shape}')
-
-
 def check_positive(name: str, values: Any) -> None:
     """Raises ValueError if numbers are not positive, or so small or large that none are."""
     require(

@@ -34,7 +34,6 @@ from hmt_ros.body.learned_file import (
     Arrays,
     body_of,
     check_positive,
-    check_shapes,
     header,
     parameters_of,
     read_model,
@@ -370,10 +369,9 @@ class Lifter:
         joints = tuple(map(str, parameters['joints']))
         whole = len({*joints}) == len(joints) and {*joints} >= WHOLE
         require(whole, 'its joints are not those of a whole pose')
-        numbers = 1 + 6 * len(joints)
-        experts = max(len(arrays['last_bias']) // numbers, 1)
-        network = Network.from_arrays(arrays, INPUTS, experts * numbers)
-        check_shapes(arrays, mean=(INPUTS,), scale=(INPUTS,), middle=(len(joints), 3))
+        network = Network.from_arrays(arrays, INPUTS)
+        sizes = network.mean.shape, network.scale.shape
+        require(sizes == ((INPUTS,), (INPUTS,)), f'mean and scale are not those of {INPUTS} inputs')
         check_positive('scale', network.scale)
         return cls(network, joints, body_of(parameters), card)
 

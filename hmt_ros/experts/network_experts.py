@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmt_ros.body.learned_file import Arrays, check_positive, check_shapes, require
+from hmt_ros.body.learned_file import Arrays, check_positive, require
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.training_pairs import Standardisation
@@ -81,17 +81,15 @@ class Layers:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], p: int, o: int) -> Self:
-        """The layers that `to_arrays` stored, between p inputs and O numbers.
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], p: int) -> Self:
+        """The layers that `to_arrays` stored, of p inputs.
 
         Raises:
             KeyError, ValueError: arrays are missing, do not fit, or have outputs without bounds.
         """
         own = {name: np.asarray(arrays[name], np.float32) for name in cls.__dataclass_fields__}
-        m, h = len(own['hidden']), len(own['first_bias'])
+        m = len(own['hidden'])
         require(m <= MOST_LAYERS, f'it has {m} hidden layers, wanted at most {MOST_LAYERS}')
-        check_shapes(own, first=(p, h), hidden=(m, h, h), hidden_biases=(m, h))
-        check_shapes(own, first_bias=(h,), last=(h, o), last_bias=(o,))
         # No output is larger than that of the sizes of all weights for the largest inputs.
         bound = cls(**{name: np.abs(values) for name, values in own.items()})
         largest = bound.outputs(np.full((1, p), LARGEST_INPUT)).max()
@@ -193,12 +191,11 @@ class NetworkExperts(ConditionalDensity):
         }
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        a, p, d = dict(arrays), self.n_inputs_, self.n_outputs_
-        m = len(a['noise'])
+        a, m = dict(arrays), len(arrays['noise'])
         require(m == self.n_experts, f'it has {m} experts, and says otherwise')
         check_positive('spacing', a['spacing'])
         self.set_parts(
-            Layers.from_arrays(a, p, m * (2 + d)),
+            Layers.from_arrays(a, self.n_inputs_),
             Standardisation(a['input_centre'], a['input_scale']),
             Standardisation(a['target_centre'], a['target_scale']),
             a['noise'].astype(np.float64),

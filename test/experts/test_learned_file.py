@@ -148,4 +148,4 @@ def test_a_network_of_a_million_layers_is_refused_before_it_is_computed():
     }
     one, three = np.zeros(1), np.zeros(3)
     with pytest.raises(ValueError, match='1000000 hidden layers, wanted at most 100'):
-        Layers.from_arrays(layers | {'first_bias': one, 'last_bias': three}, 1, 3)
+        Layers.from_arrays(layers | {'first_bias': one, 'last_bias': three}, 1)
