@@ -180,6 +180,7 @@ setup(
     version='1.0.0',
     description='Monocular 3D human motion tracking with mixtures, for ROS 2',
     license='Apache-2.0',
+    license_files=['LICENSE', 'LICENSES/*'],
     author='hmt_ros contributors',
     url='https://example.com/hmt_ros',  # stands for a public address, as in package.xml
     maintainer='hmt_ros maintainers',
@@ -202,7 +203,8 @@ setup(
         (target, sources)
         for target, sources in (
             ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
-            (f'share/{PACKAGE}', ['package.xml']),
+            (f'share/{PACKAGE}', ['package.xml', *files('.', 'LICENSE')]),
+            (f'share/{PACKAGE}/LICENSES', files('LICENSES', '*')),
             (f'share/{PACKAGE}/config', files(f'{PACKAGE}/config', '*.*ml')),
             (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
             (f'share/{PACKAGE}/rviz', files('rviz', '*.rviz')),

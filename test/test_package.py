@@ -203,6 +203,58 @@ def test_package_data_covers_every_data_file(setup_arguments):
                 assert any(fnmatch(name, pattern) for pattern in patterns), name
 
 
+# Data that people made, or that was learned from such; everything else that git tracks is our text.
+LEARNED = ('hmt_ros/body/models/*', 'hmt_ros/experts/models/*', 'hmt_ros/image/*.yaml')
+
+
+def tracked_files():
+    done = subprocess.run(
+        ['git', 'ls-files', '-z'], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        pytest.skip('the sources are no clone of git')
+    return [name for name in done.stdout.split('\0') if (ROOT / name).is_file()]
+
+
+def is_text(path):
+    try:
+        return '\0' not in path.read_bytes().decode('utf-8')
+    except UnicodeDecodeError:
+        return False
+
+
+def test_licences_name_every_file_that_others_had_a_part_in():
+    tracked = tracked_files()
+    rows = (ROOT / 'LICENSES' / 'README.md').read_text('utf-8').splitlines()
+    cells = [row.split('|')[1] for row in rows if row.startswith('| `')]
+    named = [name for cell in cells for name in re.findall(r'`([^`]+)`', cell)]
+    for name in named:
+        assert any(fnmatch(one, name) for one in tracked), f'{name} is not there'
+    wanted = [
+        one
+        for one in tracked
+        if not is_text(ROOT / one) or any(fnmatch(one, pattern) for pattern in LEARNED)
+    ]
+    assert len(wanted) > 20
+    for one in wanted:
+        assert any(fnmatch(one, name) for name in named), f'LICENSES/README.md does not name {one}'
+
+
+def test_licences_are_complete_and_installed(setup_arguments):
+    text = (ROOT / 'LICENSES' / 'README.md').read_text('utf-8')
+    headings = {line[3:].lower() for line in text.splitlines() if line.startswith('## ')}
+    assert set(re.findall(r'\]\(#([^)]+)\)', text)) == headings - {'dependencies'}
+    for link in re.findall(r'\]\(([^)#:]+)\)', text):
+        assert (ROOT / 'LICENSES' / link).is_file(), link
+    for said in ('NSF EIA-0196217', 'PDDL', 'CC BY 4.0', 'BSD-3-Clause', 'CC0', 'Apache-2.0'):
+        assert said in text
+    installed = dict(setup_arguments['data_files'])
+    every = sorted(f'LICENSES/{path.name}' for path in (ROOT / 'LICENSES').iterdir())
+    assert installed['share/hmt_ros/LICENSES'] == every
+    assert 'LICENSE' in installed['share/hmt_ros']
+    assert setup_arguments['license_files'] == ['LICENSE', 'LICENSES/*']
+
+
 def test_entry_points_are_all_nodes_and_commands(setup_arguments):
     lines = setup_arguments['entry_points']['console_scripts']
     points = dict(line.split(' = ') for line in lines)
@@ -238,11 +290,11 @@ def test_a_wheel_has_the_library_and_one_command(tmp_path):
     sources = tmp_path / 'sources'
     for name in (
         *('hmt_ros', 'msg_tools', 'hmt_learning', 'resource'),
-        *('launch', 'rviz', 'foxglove', 'security'),
+        *('launch', 'rviz', 'foxglove', 'security', 'LICENSES'),
     ):
         ignored = shutil.ignore_patterns('__pycache__')
         shutil.copytree(ROOT / name, sources / name, ignore=ignored)
-    for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml'):
+    for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE'):
         shutil.copy(ROOT / name, sources)
     command = [sys.executable, '-m', 'pip', 'wheel', '--no-deps', '--no-build-isolation']
     made = subprocess.run(
@@ -253,6 +305,8 @@ def test_a_wheel_has_the_library_and_one_command(tmp_path):
     with zipfile.ZipFile(path) as archive:
         archive.extractall(tmp_path / 'site')
     assert not (tmp_path / 'site' / 'hmt_learning').exists()
+    installed = {x.name for x in tmp_path.glob('site/*.dist-info/**/*')}
+    assert {'LICENSE', *(x.name for x in (ROOT / 'LICENSES').iterdir())} <= installed
     (text,) = (x.read_text('utf-8') for x in tmp_path.glob('site/*.dist-info/entry_points.txt'))
     assert text.split() == ['[console_scripts]', 'hmt_ros', '=', 'hmt_ros.app:main']
     program = (

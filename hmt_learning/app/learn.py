@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -62,8 +63,10 @@ from hmt_learning.training.prior_learning import (
 from hmt_learning.training.training_set import PoseSequence, recorded_sequence
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.progress import say, show_progress, with_progress
-from hmt_ros.body import Body, load_body
-from hmt_ros.experts.model_file import write_arrays
+from hmt_ros.body import Body, load_body, model_names
+from hmt_ros.body.angle_mixture import AngleMixture
+from hmt_ros.body.learned_file import write_model
+from hmt_ros.body.motion_prior import LearnedMotion
 from hmt_ros.experts.pose_predictor import RATE
 from hmt_ros.inference.arrays import Array, Index
 
@@ -191,7 +194,9 @@ def _motion(arguments: argparse.Namespace) -> int:
     card = data_card(sequences, arguments.acknowledgement)
     with show_progress('learning', quiet=quiet):
         model = learned_motion(body, [one.poses for one in sequences], RATE, card)
-    write_arrays(output, model.arrays())
+    # At rest.
+    example = np.zeros(model.dynamics.state_dimension)
+    write_model(output, model, LearnedMotion.from_arrays, model.card, example)
     if not quiet:
         skipped = len(paths) - len(sequences)
         skips = f', {skipped} skipped' if skipped else ''
@@ -216,6 +221,8 @@ def _lifter(arguments: argparse.Namespace) -> int:
         raise ValueError(f'{mark} marks a training that was broken off: --resume, or remove it')
     check_tools()
     body = load_body(arguments.body)
+    if body.name not in model_names():
+        raise ValueError(f'--body {arguments.body}: wanted one that ships: {model_names()}')
     learned, tested = (
         _read(arguments, paths, recorded_sequence)
         for paths in (
@@ -234,7 +241,7 @@ def _lifter(arguments: argparse.Namespace) -> int:
     with show_progress('placing', quiet=quiet):
         tracks = keypoint_tracks(body, learned, shares, seed=arguments.seed)
     notes = {
-        'card': data_card(learned, arguments.acknowledgement),
+        **data_card(learned, arguments.acknowledgement),
         'scored on': sorted(one.name for one in tested),
         'learning': asdict(settings),
         'windows': asdict(windows),
@@ -276,9 +283,11 @@ def _prior(arguments: argparse.Namespace) -> int:
     def bar(counts: Iterable[int], total: int) -> Iterable[int]:
         return with_progress(counts, 'learning', 'mixtures', total, quiet=arguments.quiet)
 
-    card = {'source': arguments.acknowledgement, 'method': _method(settings, data.people)}
+    card = data_card(sequences, arguments.acknowledgement)
+    card['method'] = _method(settings, data.people)
     found = learned_prior(data, dofs, card, settings, bar)
-    write_arrays(output, found.mixture.arrays())
+    read = partial(AngleMixture.from_arrays, skeleton=body.skeleton)
+    write_model(output, found.mixture, read, found.mixture.card, np.zeros(0))
     if arguments.quiet:
         return 0
     _describe(output, found)

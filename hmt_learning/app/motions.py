@@ -8,13 +8,15 @@ import fnmatch
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
+from datetime import datetime, timezone
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
+import hmt_ros
 from hmt_learning.training.training_set import MOTION_SUFFIXES, PoseSequence, motion_files
 from hmt_ros.app.command_line import number, whole_number
 from hmt_ros.app.progress import tell_user, with_progress
@@ -225,9 +227,12 @@ def shares_of(sequences: list[PoseSequence], alike: str, share: float) -> list[f
     return [share if alike and one.name.startswith(alike) else 1.0 for one in sequences]
 
 
-def data_card(sequences: list[PoseSequence], acknowledgement: str) -> str:
-    """Note on the motions that a file was learned from."""
-    seconds = sum(len(one.poses) for one in sequences) / RATE
-    names = ', '.join(sorted(one.name for one in sequences))
-    said = f'{acknowledgement.strip()}\n' if acknowledgement.strip() else ''
-    return f'{said}Learned from {len(sequences)} motions, {seconds:.0f} s: {names}.'
+def data_card(sequences: list[PoseSequence], acknowledgement: str) -> dict[str, Any]:
+    """The card of a file that is learned from motions now, by heading."""
+    return {
+        'source': acknowledgement.strip(),
+        'motions': sorted(one.name for one in sequences),
+        'seconds': round(sum(len(one.poses) for one in sequences) / RATE),
+        'date': datetime.now(tz=timezone.utc).date().isoformat(),
+        'made by': f'hmt_ros {hmt_ros.__version__}',
+    }

@@ -161,9 +161,8 @@ def _train(options: argparse.Namespace) -> int:
     notes = {
         'model': options.model,
         'samples': len(pairs),
-        'motions': len(sequences),
         'seed': options.seed,
-        'card': data_card(sequences, options.acknowledgement),
+        **data_card(sequences, options.acknowledgement),
     }
     _say(options, f'learning {options.model} from {len(pairs)} silhouettes')
     with show_progress('learning', quiet=options.quiet):

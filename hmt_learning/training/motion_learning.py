@@ -16,7 +16,8 @@ only changes of the heading count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -41,7 +42,7 @@ FEWEST = 200  # pairs of displacements that are needed
 
 
 def learned_motion(
-    body: Body, sequences: Sequence[Array], rate: float, card: str = ''
+    body: Body, sequences: Sequence[Array], rate: float, card: Mapping[str, Any] | None = None
 ) -> LearnedMotion:
     """The motion prior of a body, from motions.
 
@@ -70,7 +71,7 @@ def learned_motion(
     correlation[apart, apart] = 1.0
     scale = np.sqrt(2.0 * damping * variance)
     diffusion = correlation * np.outer(scale, scale)
-    return LearnedMotion(body.name, tuple(body.dof_names), damping, diffusion, white, card)
+    return LearnedMotion(body.name, tuple(body.dof_names), damping, diffusion, white, card or {})
 
 
 def _displacements(body: Body, sequences: Sequence[Array], step: int) -> Array:

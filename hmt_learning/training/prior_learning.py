@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
@@ -307,7 +308,7 @@ def recorded_dofs(body: Body, sequences: Sequence[PoseSequence], people: Sequenc
 def learned_prior(
     data: PriorData,
     dofs: Index,
-    card: Mapping[str, str],
+    card: Mapping[str, Any],
     settings: PriorSettings,
     progress: Progress | None = None,
 ) -> LearnedPrior:
@@ -352,7 +353,7 @@ def plain_log_density(body: Body, dofs: Index, poses: Array) -> Array:
 
 
 def _mixture(
-    data: PriorData, dofs: Index, count: int, card: Mapping[str, str], s: PriorSettings
+    data: PriorData, dofs: Index, count: int, card: Mapping[str, Any], s: PriorSettings
 ) -> AngleMixture:
     body, samples = data.body, data.samples(dofs)
     _, everything = samples.scatter()

@@ -8,34 +8,34 @@ the energy of a pose that resembles nothing learned.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.learned_file import (
+    Arrays,
+    header,
+    parameters_of,
+    read_model,
+    require,
+)
 from hmt_ros.body.mirror import mirror_order
 from hmt_ros.body.model_file import load_body, shipped_file
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.mixture import GaussianMixture
-from msg_tools.files.array_file import read_archive
 
-FORMAT = 'hmt_ros pose prior'
-VERSION = 1
-LARGEST_FILE = 10_000_000  # bytes of all arrays; the file that ships has some tens of kB
+KIND = 'pose_prior'
 MOST_COMPONENTS = 1000
 # Steps of the climb to the highest density, and the step at which it ends, rad.
 CLIMB, ARRIVED = 1000, 1e-7
 SAME = 1e-4  # difference of two rotations at rest that single precision explains
-
-_ARRAYS = ('format', 'version', 'body', 'dofs', 'mounts', 'weights', 'means', 'factors', 'card')
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class AngleMixture:
         dofs: names of the n degrees of freedom that it covers.
         components: broad component first, then K components; the weight of each of these is that
             of the component and its mirror image together.
-        card: data, method and licence, text by heading.
+        card: data, method and licence; JSON must be able to hold it.
 
     Raises:
         ValueError: names that the body does not have or that lack their mirror image, or
@@ -57,23 +57,22 @@ class AngleMixture:
     skeleton: Skeleton
     dofs: tuple[str, ...]
     components: GaussianMixture
-    card: Mapping[str, str]
+    card: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.dofs if name not in self.skeleton.dof_names]
-        if unknown:
-            raise ValueError(f'{self.skeleton.name} has no degrees of freedom {unknown}')
+        known = {*self.dofs} <= {*self.skeleton.dof_names}
+        require(known, f'it names degrees of freedom that {self.skeleton.name} has not')
         rotation = self.skeleton.dof_is_rotation[self.indices]
-        if len(set(self.dofs)) != len(self.dofs) or not rotation.all():
-            raise ValueError(f'wanted different angles, saw {list(self.dofs)}')
-        count, total = len(self.components), float(self.components.weights.sum())
-        if self.components.dimension != len(self.dofs) or not 2 <= count <= MOST_COMPONENTS:
-            raise ValueError(
-                f'{count} components over {self.components.dimension} angles, wanted 2 to '
-                f'{MOST_COMPONENTS} over {len(self.dofs)}'
-            )
-        if not abs(total - 1.0) < 1e-3 or not (self.components.weights > 0).all():
-            raise ValueError(f'weights must be positive and sum to 1, saw a sum of {total:g}')
+        different = len(set(self.dofs)) == len(self.dofs)
+        require(different and rotation.all(), 'wanted different angles')
+        own, total = self.components, float(self.components.weights.sum())
+        require(
+            own.dimension == len(self.dofs) and 2 <= len(own) <= MOST_COMPONENTS,
+            f'{len(own)} components over {own.dimension} angles, wanted 2 to {MOST_COMPONENTS} '
+            f'over {len(self.dofs)}',
+        )
+        right = abs(total - 1.0) < 1e-3 and (own.weights > 0).all()
+        require(right, f'weights must be positive and sum to 1, saw a sum of {total:g}')
         self.components.cholesky()
         _ = self._mirror_order
 
@@ -127,21 +126,40 @@ class AngleMixture:
         """log p (N,) of the angles of poses (N, d), rad^-n."""
         return self.whole.log_density(poses[:, self.indices])
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def to_arrays(self) -> Arrays:
         """The arrays of a file; numbers in single precision."""
-        own, n = self.components, len(self.dofs)
-        lower = np.tril_indices(n)
-        return {
-            'format': np.array(FORMAT),
-            'version': np.array(VERSION),
-            'body': np.array(self.skeleton.name),
-            'dofs': np.array(self.dofs),
+        own, lower = self.components, np.tril_indices(len(self.dofs))
+        parameters = {'body': self.skeleton.name, 'dofs': list(self.dofs)}
+        return header(KIND, parameters) | {
             'mounts': self.skeleton.mounts.astype(np.float32),
             'weights': own.weights.astype(np.float32),
             'means': own.means.astype(np.float32),
             'factors': own.cholesky()[:, lower[0], lower[1]].astype(np.float32),
-            'card': np.array(json.dumps(dict(self.card), sort_keys=True)),
         }
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays, skeleton: Skeleton) -> AngleMixture:
+        """The mixture that `to_arrays` and a card describe, of the angles of a skeleton.
+
+        Raises:
+            ValueError, LookupError, TypeError: arrays or parameters are missing or wrong, or the
+                skeleton is another one.
+        """
+        parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
+        same = np.allclose(arrays['mounts'], skeleton.mounts, atol=SAME)
+        same = same and parameters['body'] == skeleton.name
+        require(same, f'it is for another body than {skeleton.name}, or other frames at rest')
+        dofs, means = tuple(map(str, parameters['dofs'])), arrays['means']
+        factors = np.zeros((*means.shape, len(dofs)))
+        lower = np.tril_indices(len(dofs))
+        factors[:, lower[0], lower[1]] = arrays['factors']
+        covariances = factors @ factors.transpose(0, 2, 1)
+        components = GaussianMixture(arrays['weights'], means, covariances)
+        return cls(skeleton, dofs, components, card)
+
+    def answer(self, given: Array) -> GaussianMixture:
+        """The mixture."""
+        return self.whole
 
     @cached_property
     def _mirror_order(self) -> tuple[Index, Array]:
@@ -150,8 +168,7 @@ class AngleMixture:
         place = {int(j): i for i, j in enumerate(self.indices)}
         wanted = order[self.indices].tolist()
         lonely = [name for name, j in zip(self.dofs, wanted, strict=True) if j not in place]
-        if lonely:
-            raise ValueError(f'the mirror images of {lonely} are missing')
+        require(not lonely, f'the mirror images of {lonely} are missing')
         return np.array([place[j] for j in wanted], dtype=np.intp), signs[self.indices]
 
 
@@ -186,67 +203,4 @@ def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged, none of this format, or of another body; one line.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f'{path}: no such file; learn one with `learn prior`')
-    arrays = _read(path)
-    skeleton, mounts = body.skeleton, arrays['mounts']
-    name = str(arrays['body'])
-    if (
-        name != body.name
-        or mounts.shape != skeleton.mounts.shape
-        or mounts.dtype.kind != 'f'
-        or not np.allclose(mounts, skeleton.mounts, atol=SAME)
-    ):
-        raise ValueError(
-            f'{path}: a pose prior of the body {name!r}, wanted one of {body.name!r} with the same '
-            'frames at rest; learn one with `learn prior --body`'
-        )
-    try:
-        return _mixture_of(arrays, skeleton)
-    except (ValueError, TypeError, IndexError, RecursionError) as fault:
-        raise ValueError(f'{path}: a damaged pose prior ({fault}); learn it again') from fault
-
-
-def _read(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        arrays = read_archive(path, LARGEST_FILE)
-    except (OSError, ValueError) as fault:
-        text = ' '.join(str(fault).split())
-        raise ValueError(
-            f'{path}: not a pose prior ({text}); learn one with `learn prior`'
-        ) from fault
-    missing = [name for name in _ARRAYS if name not in arrays]
-    if missing or str(arrays['format']) != FORMAT:
-        seen = f'it lacks {missing[0]}' if missing else f'its format is {str(arrays["format"])!r}'
-        raise ValueError(f'{path}: not a pose prior ({seen}); learn one with `learn prior`')
-    version = str(arrays['version'])
-    if version != str(VERSION):
-        raise ValueError(
-            f'{path}: pose prior of version {version!r}, wanted {VERSION}; learn it again'
-        )
-    return arrays
-
-
-def _mixture_of(arrays: Mapping[str, NDArray[Any]], skeleton: Skeleton) -> AngleMixture:
-    dofs = tuple(map(str, arrays['dofs'].tolist()))
-    n = len(dofs)
-    weights, means, packed = (
-        np.asarray(arrays[name], dtype=np.float64) for name in ('weights', 'means', 'factors')
-    )
-    count = len(weights) if weights.ndim == 1 else 0
-    shapes = (count, n), (count, n * (n + 1) // 2)
-    if (means.shape, packed.shape) != shapes or not np.isfinite(packed).all():
-        raise ValueError(
-            f'means {means.shape} and factors {packed.shape}, wanted finite ones of '
-            f'{shapes[0]} and {shapes[1]}'
-        )
-    factors = np.zeros((count, n, n))
-    lower = np.tril_indices(n)
-    factors[:, lower[0], lower[1]] = packed
-    card = json.loads(str(arrays['card']))
-    if not isinstance(card, dict):
-        raise ValueError(f'the card is a {type(card).__name__}, wanted a mapping')
-    covariances = factors @ factors.transpose(0, 2, 1)
-    texts = {str(key): str(text) for key, text in card.items()}
-    return AngleMixture(skeleton, dofs, GaussianMixture(weights, means, covariances), texts)
+    return read_model(path, KIND, partial(AngleMixture.from_arrays, skeleton=body.skeleton))

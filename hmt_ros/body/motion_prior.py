@@ -14,18 +14,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.learned_file import (
+    Arrays,
+    check_covariances,
+    header,
+    parameters_of,
+    read_model,
+    require,
+)
 from hmt_ros.body.model_file import shipped_file
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.damped_velocity import DampedVelocity
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from msg_tools.files.array_file import read_archive
+from hmt_ros.inference.mixture import GaussianMixture
 
-FORMAT, VERSION = 'hmt_ros motion prior', 1
-LARGEST_FILE = 1_000_000  # bytes of its arrays; a file has some kB
-_ENTRIES = ('format', 'version', 'body', 'dof_names', 'damping', 'diffusion', 'white', 'card')
+KIND = 'motion_prior'
+INTERVAL = 1.0 / 30.0  # of the example of a file, s
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +44,7 @@ class LearnedMotion:
         damping: (d,) share of the velocity lost per second.
         diffusion: (d, d) covariance that the velocity gains per second, (m/s)^2 and (rad/s)^2.
         white: (d,) variance that the pose gains per second besides, m^2 and rad^2.
-        card: data and method of the learning; plain text.
+        card: data, method and licence; JSON must be able to hold it.
 
     Raises:
         ValueError: values that make no motion prior.
@@ -49,32 +55,47 @@ class LearnedMotion:
     damping: Array
     diffusion: Array
     white: Array
-    card: str
+    card: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if self.dynamics.dimension != len(self.dof_names):
-            raise ValueError(
-                f'{len(self.dof_names)} degrees of freedom are named, and '
-                f'{self.dynamics.dimension} move'
-            )
+        named, moved = len(self.dof_names), self.dynamics.dimension
+        require(named == moved, f'{named} degrees of freedom are named, and {moved} move')
 
     @cached_property
     def dynamics(self) -> DampedVelocity:
         """The dynamics of poses and velocities."""
         return DampedVelocity.of(self.damping, self.diffusion, self.white)
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def to_arrays(self) -> Arrays:
         """The arrays of a file, with a precision of 32 bits."""
-        return {
-            'format': np.array(FORMAT),
-            'version': np.array(VERSION),
-            'body': np.array(self.body),
-            'dof_names': np.array(self.dof_names),
+        parameters = {'body': self.body, 'dof_names': list(self.dof_names)}
+        return header(KIND, parameters) | {
             'damping': self.damping.astype(np.float32),
             'diffusion': self.diffusion.astype(np.float32),
             'white': self.white.astype(np.float32),
-            'card': np.array(self.card),
         }
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> LearnedMotion:
+        """The motion prior that `to_arrays` and a card describe.
+
+        Raises:
+            ValueError, KeyError, TypeError: arrays or parameters are missing, or wrong.
+        """
+        parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
+        names = tuple(map(str, parameters['dof_names']))
+        damping, diffusion, white = (
+            arrays[name].astype(np.float64) for name in ('damping', 'diffusion', 'white')
+        )
+        made = cls(str(parameters['body']), names, damping, diffusion, white, card)
+        check_covariances('the velocity', made.dynamics.unknown_velocity)
+        return made
+
+    def answer(self, given: Array) -> GaussianMixture:
+        """The state that follows on a state (2 d,) after `INTERVAL`."""
+        nothing = np.zeros((1, len(given), len(given)))
+        moved = self.dynamics.predict(given[None], nothing, INTERVAL)
+        return GaussianMixture(np.ones(1), *moved)
 
 
 def motion_prior(body: Body) -> LinearGaussianDynamics:
@@ -103,28 +124,4 @@ def read_motion_prior(path: str | Path) -> LearnedMotion:
         FileNotFoundError: there is no such file.
         ValueError: the file is no motion prior, or damaged; one line.
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f'{path}: no such file; `learn motion` makes one')
-    try:
-        return _checked(read_archive(path, LARGEST_FILE))
-    except (OSError, KeyError, TypeError, ValueError, IndexError) as fault:
-        text = ' '.join(str(fault).split())
-        raise ValueError(
-            f'{path}: not a motion prior ({text}); make one with `learn motion`'
-        ) from fault
-
-
-def _checked(content: Mapping[str, NDArray[Any]]) -> LearnedMotion:
-    missing = [name for name in _ENTRIES if name not in content]
-    if missing or str(content['format']) != FORMAT:
-        raise ValueError(f'it lacks {missing}' if missing else f'it is {content["format"]}')
-    if str(content['version']) != str(VERSION):
-        raise ValueError(f'it has version {content["version"]}, wanted {VERSION}')
-    numbers: dict[str, Array] = {}
-    for name in ('damping', 'diffusion', 'white'):
-        value = content[name]
-        if value.dtype.kind != 'f' or not np.isfinite(value).all():
-            raise ValueError(f'{name} has values that are not finite numbers')
-        numbers[name] = np.asarray(value, dtype=np.float64)
-    names = tuple(str(name) for name in np.atleast_1d(content['dof_names']).tolist())
-    return LearnedMotion(str(content['body']), names, **numbers, card=str(content['card']))
+    return read_model(path, KIND, LearnedMotion.from_arrays)

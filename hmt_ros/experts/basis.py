@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.experts.model_file import Arrays
+from hmt_ros.body.learned_file import Arrays, check_positive
 from hmt_ros.experts.training_pairs import Standardisation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import squared_distances
@@ -100,9 +100,14 @@ Basis = LinearBasis | RadialBasis
 
 
 def basis_of(arrays: Mapping[str, NDArray[Any]]) -> Basis:
-    """The basis that `arrays` describes."""
+    """The basis that `arrays` describes.
+
+    Raises:
+        ValueError: the width or a scale is not positive.
+    """
     standardisation = Standardisation(arrays['centre'], arrays['scale'])
     if 'centres' in arrays:
+        check_positive('width', arrays['width'])
         return RadialBasis(standardisation, arrays['centres'], float(arrays['width']))
     return LinearBasis(standardisation)
 

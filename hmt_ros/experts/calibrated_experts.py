@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.learned_file import LARGEST, Arrays, nested, parameters_of, part, require
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity, stored_model
 from hmt_ros.experts.gates import log_softmax
-from hmt_ros.experts.model_file import Arrays, nested, parameters_of, part
 from hmt_ros.inference.arrays import Array
 
 if TYPE_CHECKING:
@@ -48,11 +48,12 @@ class Calibration:
 
     def __post_init__(self) -> None:
         size = len(self.added)
-        if self.added.shape != (size, size) or not np.isfinite(self.added).all():
-            raise ValueError(f'added must be finite and (D, D), saw {self.added.shape}')
+        require(self.added.shape == (size, size), 'added must be (D, D)')
+        least, largest = np.linalg.eigvalsh(self.added)[[0, -1]]
+        same = np.allclose(self.added, self.added.T)
+        require(same and least >= -1e-9 * largest, 'added must be positive semidefinite')
         for name in ('temperature', 'factor'):
-            if not 1.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f'{name} must be at least 1, saw {getattr(self, name)}')
+            require(1.0 <= getattr(self, name) <= LARGEST, f'{name} must be at least 1')
 
     def of(self, found: Components) -> Components:
         """The calibrated mixtures."""
@@ -95,12 +96,11 @@ class CalibratedExperts(ConditionalDensity):
         return {'folds': self.folds}
 
     @classmethod
-    def _constructed(cls, arrays: Mapping[str, NDArray[Any]], where: str) -> Self:
+    def _constructed(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         own = part('model', arrays)
         # Files could nest models without end.
-        if str(own['kind']) == cls.kind:
-            raise ValueError('a calibrated model inside a calibrated model')
-        return cls(stored_model(own, where), **parameters_of(arrays))
+        require(str(own['kind']) != cls.kind, 'a calibrated model inside a calibrated model')
+        return cls(stored_model(own), **parameters_of(arrays))
 
     def _learned(self) -> Arrays:
         found = self.calibration_
@@ -111,6 +111,8 @@ class CalibratedExperts(ConditionalDensity):
         } | nested('model', self.model.to_arrays())
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        same = (self.model.n_inputs_, self.model.n_outputs_) == (self.n_inputs_, self.n_outputs_)
+        require(same, 'its model has other inputs or outputs')
         self.calibration_ = Calibration(
             float(arrays['temperature']),
             np.asarray(arrays['added'], dtype=np.float64),

@@ -21,16 +21,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
-from hmt_ros.experts.model_file import (
-    FAULTS,
+from hmt_ros.body.learned_file import (
     MOST_NUMBERS,
+    MOST_VALUES,
     Arrays,
+    check_covariances,
     check_header,
-    damaged,
     header,
     parameters_of,
-    read_arrays,
-    write_arrays,
+    read_model,
+    require,
+    write_model,
 )
 from hmt_ros.experts.training_pairs import finite_matrix
 from hmt_ros.inference import GaussianMixture
@@ -38,6 +39,10 @@ from hmt_ros.inference.arrays import Array
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+
+# Maximum number of outputs of a model; a pose has forty.
+MOST_OUTPUTS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,11 +153,11 @@ class ConditionalDensity(ABC):
         """log p(x | r), (n,), of targets (n, D) at inputs (n, p)."""
         found = self.components(inputs)
         targets = finite_matrix(targets, 'targets', f'(n, {self.n_outputs_})')
-        if targets.shape != found.means.shape[::2]:
-            raise ValueError(
-                f'targets have shape {targets.shape}, wanted {found.means.shape[::2]}: '
-                'one row for each input'
-            )
+        require(
+            targets.shape == found.means.shape[::2],
+            f'targets have shape {targets.shape}, wanted {found.means.shape[::2]}: one row for '
+            'each input',
+        )
         return found.log_density(targets)
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
@@ -167,11 +172,11 @@ class ConditionalDensity(ABC):
         """
         known = self._parameter_names()
         for name, value in parameters.items():
-            if name not in known:
-                raise ValueError(
-                    f'{type(self).__name__} has no parameter {name!r}, wanted some of '
-                    f'{", ".join(known)}'
-                )
+            require(
+                name in known,
+                f'{type(self).__name__} has no parameter {name!r}, wanted some of '
+                f'{", ".join(known)}',
+            )
             setattr(self, name, value)
         return self
 
@@ -186,30 +191,35 @@ class ConditionalDensity(ABC):
         return header(self.kind, self._stored_parameters()) | {'shape': shape} | self._learned()
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], where: str = 'model') -> Self:
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         """The model that `to_arrays` stored.
 
         Raises:
-            ValueError: the kind or the version is another one, or arrays are missing or wrong.
+            ValueError, KeyError, TypeError, IndexError: the kind or the version is another one, or
+                arrays are missing or wrong.
         """
-        check_header(arrays, cls.kind, where)
-        try:
-            inputs, outputs = (int(n) for n in arrays['shape'])
-            if not (1 <= inputs <= MOST_NUMBERS and 1 <= outputs <= MOST_NUMBERS):
-                raise ValueError(
-                    f'{inputs} inputs and {outputs} outputs, wanted 1 to {MOST_NUMBERS}'
-                )
-            model = cls._constructed(arrays, where)
-            model.n_inputs_, model.n_outputs_ = inputs, outputs
-            model._set_learned(arrays)
-            model.components(np.zeros((1, model.n_inputs_)))
-        except FAULTS as fault:
-            raise damaged(where, fault) from fault
+        check_header(arrays, cls.kind)
+        inputs, outputs = (int(n) for n in arrays['shape'])
+        require(
+            1 <= inputs <= MOST_NUMBERS and 1 <= outputs <= MOST_OUTPUTS,
+            f'{inputs} inputs and {outputs} outputs, wanted 1 to {MOST_NUMBERS} and 1 to '
+            f'{MOST_OUTPUTS}',
+        )
+        model = cls._constructed(arrays)
+        model.n_inputs_, model.n_outputs_ = inputs, outputs
+        model._set_learned(arrays)
+        model._check_components()
         return model
 
-    def save(self, path: str | Path) -> Path:
-        """Writes the model into an .npz file and returns its path."""
-        return write_arrays(path, self.to_arrays())
+    def save(self, path: str | Path, card: Mapping[str, Any] | None = None) -> Path:
+        """Writes the model into an .npz file and returns its path.
+
+        Args:
+            card: what it was learned from, licence, method; JSON must be able to hold it.
+        """
+        self._check_learned()
+        example = np.random.default_rng(0).normal(size=self.n_inputs_)
+        return write_model(path, self, stored_model, card or {}, example)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -217,32 +227,48 @@ class ConditionalDensity(ABC):
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is no model, or one of another version or kind.
+            ValueError: the file is no model, or one of another version or kind, or a wrong one.
         """
-        return cls.from_arrays(read_arrays(path, cls.kind), str(path))
+        return read_model(path, cls.kind, cls.from_arrays)
+
+    def answer(self, given: Array) -> GaussianMixture:
+        """The mixture at one input (p,)."""
+        return self.predict(given[None])[0]
+
+    def _check_components(self) -> None:
+        """Raises ValueError if predictions do not fit each other, are none, or are too large."""
+        inputs, d = np.eye(2, self.n_inputs_), self.n_outputs_
+        found = self.components(inputs)
+        m, parts = found.log_weights.shape[-1], [*vars(found).values()]
+        shapes = [x.shape for x in parts]
+        require(shapes == [(2, m), (2, m, d), (2, m), (m, d, d)], 'its predictions do not fit')
+        require(m * d * max(d, self.n_inputs_) <= MOST_VALUES, 'its predictions are too large')
+        parts += [self.jacobians(inputs), self.support(inputs)]
+        require(all(np.isfinite(x).all() for x in parts), 'its predictions are not finite')
+        check_covariances('noise', found.noise)
 
     def _stored_parameters(self) -> dict[str, Any]:
         """The constructor's arguments that JSON can hold."""
         return self.get_params()
 
     @classmethod
-    def _constructed(cls, arrays: Mapping[str, NDArray[Any]], where: str) -> Self:
+    def _constructed(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         """The model of a file before its learned arrays are set."""
         return cls(**parameters_of(arrays))
 
     def _check_learned(self) -> None:
-        if not hasattr(self, 'n_inputs_'):
-            raise ValueError(f'this {type(self).__name__} has not learned yet; call fit first')
+        fault = f'this {type(self).__name__} has not learned yet; call fit first'
+        require(hasattr(self, 'n_inputs_'), fault)
 
     def _checked(self, inputs: ArrayLike) -> Array:
         """Inputs as a matrix (n, p) with as many columns as in training."""
         self._check_learned()
         inputs = finite_matrix(inputs, 'inputs', f'(n, {self.n_inputs_})')
-        if inputs.shape[1] != self.n_inputs_:
-            raise ValueError(
-                f'inputs have {inputs.shape[1]} columns, wanted {self.n_inputs_} as in training; '
-                'describe them as the training data were'
-            )
+        require(
+            inputs.shape[1] == self.n_inputs_,
+            f'inputs have {inputs.shape[1]} columns, wanted {self.n_inputs_} as in training; '
+            'describe them as the training data were',
+        )
         return inputs
 
     @classmethod
@@ -250,16 +276,13 @@ class ConditionalDensity(ABC):
         return [name for name in inspect.signature(cls.__init__).parameters if name != 'self']
 
 
-def stored_model(arrays: Mapping[str, NDArray[Any]], where: str) -> ConditionalDensity:
+def stored_model(arrays: Mapping[str, NDArray[Any]]) -> ConditionalDensity:
     """The model that `ConditionalDensity.to_arrays` stored, of the kind that the arrays name.
 
     Raises:
-        KeyError: no kind is named.
-        ValueError: the kind is unknown, or arrays are missing or wrong.
+        ValueError, KeyError, TypeError, IndexError: the kind is unknown, or arrays are missing or
+            wrong.
     """
-    kind = str(arrays['kind'])
-    if kind not in ConditionalDensity.kinds:
-        raise ValueError(
-            f'a model of kind {kind!r}, wanted one of {sorted(ConditionalDensity.kinds)}'
-        )
-    return ConditionalDensity.kinds[kind].from_arrays(arrays, where)
+    kind, kinds = str(arrays['kind']), ConditionalDensity.kinds
+    require(kind in kinds, f'its kind is none of {sorted(kinds)}')
+    return kinds[kind].from_arrays(arrays)

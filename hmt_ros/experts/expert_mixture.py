@@ -18,6 +18,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.learned_file import (
+    Arrays,
+    check_covariances,
+    nested,
+    part,
+    require,
+)
 from hmt_ros.experts.basis import (
     BASES,
     Basis,
@@ -29,7 +36,6 @@ from hmt_ros.experts.basis import (
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.expectation_maximisation import EMState, climb, e_step, m_step
 from hmt_ros.experts.gates import Gates, GaussianGates, SoftmaxGates, log_softmax
-from hmt_ros.experts.model_file import Arrays, nested, part
 from hmt_ros.experts.sparse_bayes import (
     RegressionPrior,
     SparseRegression,
@@ -51,6 +57,10 @@ TRIAL_ITERATIONS = (2, 4, 8)
 TRIAL_SAMPLES = 1000
 # Share of the targets' variance that the prior of the noise pulls to.
 NOISE_FLOOR = 1e-2
+# Maximum numbers of experts, and of functions of an expert, in a file.
+MOST_EXPERTS, MOST_ACTIVE = 1000, 2000
+# Rounding of covariances of weights, which span many orders of magnitude, in their correlations.
+SEMIDEFINITE = 1e-6
 
 
 class ExpertMixture(ConditionalDensity):
@@ -162,12 +172,11 @@ class ExpertMixture(ConditionalDensity):
 
     def _check_parameters(self) -> None:
         for name in ('n_experts', 'max_kernels', 'n_starts', 'max_iterations'):
-            if getattr(self, name) < 1:
-                raise ValueError(f'{name} is {getattr(self, name)}, wanted at least 1')
-        if self.basis not in BASES:
-            raise ValueError(f'basis is {self.basis!r}, wanted one of {", ".join(BASES)}')
-        if self.width is not None and not self.width > 0:
-            raise ValueError(f'width is {self.width}, wanted a positive number or None')
+            value = getattr(self, name)
+            require(value >= 1, f'{name} is {value}, wanted at least 1')
+        require(self.basis in BASES, f'basis is {self.basis!r}, wanted one of {", ".join(BASES)}')
+        right = self.width is None or self.width > 0
+        require(right, f'width is {self.width}, wanted a positive number or None')
 
     def _bases(self, pairs: TrainingPairs) -> list[Basis]:
         """The candidate basis functions, for each candidate width."""
@@ -290,23 +299,14 @@ class ExpertMixture(ConditionalDensity):
         )
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        count = int(arrays['n_experts'])
+        require(1 <= count <= MOST_EXPERTS, f'{count} experts, wanted 1 to {MOST_EXPERTS}')
         self._scaling = Standardisation(arrays['input_centre'], arrays['input_scale'])
         self._target_scaling = Standardisation(arrays['target_centre'], arrays['target_scale'])
         self.basis_ = basis_of(part('basis', arrays))
         if isinstance(self.basis_, RadialBasis):
-            self._candidates = np.asarray(arrays['candidates'])
-        stored = [part(f'expert{i}', arrays) for i in range(int(arrays['n_experts']))]
-        self.experts_ = tuple(
-            SparseRegression(
-                own['active'],
-                own['precisions'],
-                own['weights'],
-                own['covariance'],
-                own['noise'],
-                np.nan,
-            )
-            for own in stored
-        )
+            self._candidates = arrays['candidates']
+        self.experts_ = tuple(_stored_expert(part(f'expert{i}', arrays)) for i in range(count))
         self.gates_ = self._gates.of_arrays(part('gates', arrays))
         self._prepare()
 
@@ -367,3 +367,15 @@ class RelevanceVectorRegression(ExpertMixture):
 
     def _expert(self, sums: WeightedSums, old: SparseRegression | None) -> SparseRegression:
         return maximise_evidence(sums, self._prior, old)
+
+
+def _stored_expert(own: Mapping[str, NDArray[Any]]) -> SparseRegression:
+    """The regression in a file; raises ValueError if its functions or covariances are none."""
+    active, covariance = own['active'], own['covariance']
+    m = len(active)
+    different = m == len(np.unique(active)) <= MOST_ACTIVE and (active >= 0).all()
+    require(different, f'an expert names functions twice, or more than {MOST_ACTIVE}')
+    check_covariances('the covariance of weights', covariance, SEMIDEFINITE)
+    return SparseRegression(
+        active, own['precisions'], own['weights'], covariance, own['noise'], np.nan
+    )

@@ -27,8 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
+from hmt_ros.body.learned_file import (
+    Arrays,
+    check_covariances,
+    nested,
+    part,
+)
 from hmt_ros.experts.basis import Basis, LinearBasis, RadialBasis, basis_of
-from hmt_ros.experts.model_file import Arrays, nested, part
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs
 from hmt_ros.inference.arrays import Array, Index
 
@@ -344,7 +349,8 @@ class GaussianGates:
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> GaussianGates:
-        """The gates that `arrays` describes."""
+        """The gates that `arrays` describes; raises ValueError if covariances are none."""
+        check_covariances('the covariances of gates', arrays['covariances'])
         return cls(
             basis_of(part('basis', arrays)).standardisation,
             arrays['log_shares'],

@@ -30,22 +30,24 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Body
 from hmt_ros.body.camera import Camera, roll
-from hmt_ros.body.model_file import load_body
-from hmt_ros.experts.gates import log_softmax
-from hmt_ros.experts.model_file import (
-    FAULTS,
-    damaged,
+from hmt_ros.body.learned_file import (
+    Arrays,
+    body_of,
+    check_positive,
     header,
     parameters_of,
-    read_arrays,
-    write_arrays,
+    read_model,
+    require,
+    write_model,
 )
+from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.network_experts import Floats, Layers
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.image.keypoint_schemes import AUTO, landmarks, landmarks_of, position_deviations
-from hmt_ros.image.lifted_poses import LiftedPoses, bone_lengths, from_positions
+from hmt_ros.image.lifted_poses import WHOLE, LiftedPoses, bone_lengths, from_positions
 from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.mixture import GaussianMixture
 
 # Times of a window relative to now, s, and how far an image may be from each.
 TIMES = np.array([0.0, -0.067, -0.15, -0.3, -0.5, -0.8, 0.067, 0.15, 0.3, 0.5, 0.8])
@@ -240,6 +242,8 @@ FOLDER = Path(__file__).resolve().parent / 'models'
 SHIPPED = 'keypoints'
 KIND = 'lifter'
 
+# Length of the inputs of a window.
+INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
 # Earliest time of a window, s. Least z of a ray: one from beside the camera says little.
 EARLIEST, BEFORE = float((TIMES - NEAR).min()), 0.1
 # Standard deviation with which a keypoint is not looked at, m at the person.
@@ -282,6 +286,7 @@ class Lifter:
 
     Args:
         usual: body with the usual lengths, to which the joints belong.
+        notes: card of its file; JSON must be able to hold it.
     """
 
     def __init__(
@@ -341,16 +346,46 @@ class Lifter:
                 )
         return result
 
-    def save(self, path: str | Path) -> Path:
-        """Writes the lifter into an .npz file, with half precision, and returns its path."""
+    def to_arrays(self) -> Arrays:
+        """The arrays of a file, with half precision."""
         parameters = {
             'joints': list(self.joints),
             'landmarks': list(LANDMARKS),
             'times': TIMES.tolist(),
             'body': self.usual.name,
-            'notes': self.notes,
         }
-        return write_arrays(path, header(KIND, parameters) | self.network.to_arrays())
+        return header(KIND, parameters) | self.network.to_arrays()
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> Lifter:
+        """The lifter that `to_arrays` and a card describe.
+
+        Raises:
+            ValueError, LookupError, TypeError: arrays or parameters are missing, or wrong.
+        """
+        parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
+        windows = parameters['landmarks'], parameters['times']
+        require(windows == (list(LANDMARKS), TIMES.tolist()), 'it has learned other windows')
+        joints = tuple(map(str, parameters['joints']))
+        whole = len({*joints}) == len(joints) and {*joints} >= WHOLE
+        require(whole, 'its joints are not those of a whole pose')
+        network = Network.from_arrays(arrays, INPUTS)
+        sizes = network.mean.shape, network.scale.shape
+        require(sizes == ((INPUTS,), (INPUTS,)), f'mean and scale are not those of {INPUTS} inputs')
+        check_positive('scale', network.scale)
+        return cls(network, joints, body_of(parameters), card)
+
+    def answer(self, given: Array) -> GaussianMixture:
+        """The mixture over joints, (3 J,), for the inputs (p,) of a window."""
+        gates, means, deviations = (x[0] for x in self.network(given[None].astype(np.float32)))
+        spread = deviations.reshape(len(gates), -1, 1) ** 2 * np.eye(3 * len(self.joints))
+        return GaussianMixture(np.exp(gates), means.reshape(len(gates), -1), spread)
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the lifter into an .npz file, with its notes as the card; returns its path."""
+        drawn = np.random.default_rng(0).normal(size=INPUTS)
+        example = self.network.mean + self.network.scale * drawn
+        return write_model(path, self, self.from_arrays, self.notes, example)
 
     @classmethod
     def load(cls, path: str | Path) -> Lifter:
@@ -358,20 +393,9 @@ class Lifter:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is no lifter, or one of another version.
+            ValueError: the file is no lifter, or one of another version, or a wrong one.
         """
-        arrays = read_arrays(path, KIND)
-        try:
-            parameters = parameters_of(arrays)
-            if parameters['landmarks'] != list(LANDMARKS) or parameters['times'] != TIMES.tolist():
-                raise ValueError(f'{path}: learned for other windows: train it anew')
-            network = Network.from_arrays(arrays)
-            usual = load_body(parameters['body'])
-            made = cls(network, parameters['joints'], usual, parameters['notes'])
-            network(np.zeros((1, len(network.mean)), dtype=np.float32))
-        except FAULTS as fault:
-            raise damaged(str(path), fault) from fault
-        return made
+        return read_model(path, KIND, cls.from_arrays)
 
 
 def load_lifter(model: str = SHIPPED) -> Lifter:

@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from hmt_ros.body.learned_file import Arrays, check_positive, require
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
-from hmt_ros.experts.model_file import Arrays
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs, checked_pairs
 from hmt_ros.inference.arrays import Array, Index
 
@@ -40,6 +40,7 @@ CLOSEST = 1e-3
 SWEEPS = 8  # of the clustering
 LEFT_OUT = 600  # training samples whose residuals give the covariance of local experts
 FAINT = 1e-12  # weight of an expert without neighbours
+MOST = 1000  # maximum number of neighbours, and of experts, in a file
 
 
 class _NeighbourModel(ConditionalDensity):
@@ -114,8 +115,12 @@ class _NeighbourModel(ConditionalDensity):
             np.asarray(arrays[name], dtype=np.float64)
             for name in ('inputs', 'targets', 'sample_weight')
         )
-        if len(inputs) != len(targets) or weights.shape != inputs.shape[:1]:
-            raise ValueError(f'inputs {inputs.shape} and targets {targets.shape} do not pair')
+        n, count = len(inputs), self.n_neighbours
+        require(n == len(targets) == len(weights), 'samples do not pair')
+        check_positive('weights and spacing', np.append(weights, arrays['spacing']))
+        experts, nearest = (vars(self).get(x, 1) for x in ('n_experts', 'width_neighbour'))
+        right = 1 <= nearest <= count <= min(n, MOST) and 1 <= experts <= MOST
+        require(right, f'wanted 1 to {MOST} experts and neighbours, and no more than samples')
         scale = Standardisation(arrays['centre'], arrays['scale'])
         self._keep(TrainingPairs(inputs, targets, weights), scale)
         self.noise_ = np.asarray(arrays['noise'], dtype=np.float64)
@@ -143,8 +148,7 @@ class NearestNeighbours(_NeighbourModel):
         self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> Self:
         """Keeps the samples; see `ConditionalDensity.fit`."""
-        if self.n_neighbours < 1:
-            raise ValueError(f'n_neighbours is {self.n_neighbours}, wanted at least 1')
+        require(self.n_neighbours >= 1, f'n_neighbours is {self.n_neighbours}, wanted at least 1')
         pairs = checked_pairs(
             inputs,
             targets,
@@ -226,11 +230,11 @@ class LocalExperts(_NeighbourModel):
         self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> Self:
         """Keeps the samples; see `ConditionalDensity.fit`."""
-        if not 1 <= self.width_neighbour <= self.n_neighbours or self.n_experts < 1:
-            raise ValueError(
-                f'n_experts {self.n_experts}, n_neighbours {self.n_neighbours}, width_neighbour '
-                f'{self.width_neighbour}: wanted at least 1 of each, the width among the neighbours'
-            )
+        require(
+            1 <= self.width_neighbour <= self.n_neighbours and self.n_experts >= 1,
+            f'n_experts {self.n_experts}, n_neighbours {self.n_neighbours}, width_neighbour '
+            f'{self.width_neighbour}: wanted at least 1 of each, the width among the neighbours',
+        )
         pairs = checked_pairs(
             inputs,
             targets,

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.learned_file import Arrays, check_positive, require
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.gates import log_softmax
-from hmt_ros.experts.model_file import Arrays
 from hmt_ros.experts.training_pairs import Standardisation
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import squared_distances
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 # Limits of log sqrt(c).
 WIDTHS = 2.0
 LEAK = 0.1  # slope of a unit below 0
+# Maximum number of layers in a file, and of its outputs for inputs of a size, whitened.
+MOST_LAYERS, LARGEST_INPUT, LARGEST_OUTPUT = 100, np.float32(100.0), 1e15
 
 Floats = NDArray[np.float32]
 
@@ -79,14 +81,20 @@ class Layers:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """The layers that `to_arrays` stored.
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], p: int) -> Self:
+        """The layers that `to_arrays` stored, of p inputs.
 
         Raises:
-            KeyError, ValueError: arrays are missing or do not fit.
+            KeyError, ValueError: arrays are missing, do not fit, or have outputs without bounds.
         """
-        names = cls.__dataclass_fields__
-        return cls(**{name: np.asarray(arrays[name], dtype=np.float32) for name in names})
+        own = {name: np.asarray(arrays[name], np.float32) for name in cls.__dataclass_fields__}
+        m = len(own['hidden'])
+        require(m <= MOST_LAYERS, f'it has {m} hidden layers, wanted at most {MOST_LAYERS}')
+        # No output is larger than that of the sizes of all weights for the largest inputs.
+        bound = cls(**{name: np.abs(values) for name, values in own.items()})
+        largest = bound.outputs(np.full((1, p), LARGEST_INPUT)).max()
+        require(largest <= LARGEST_OUTPUT, f'its outputs may be larger than {LARGEST_OUTPUT:g}')
+        return cls(**own)
 
 
 class NetworkExperts(ConditionalDensity):
@@ -183,9 +191,11 @@ class NetworkExperts(ConditionalDensity):
         }
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        a = {name: np.asarray(value) for name, value in arrays.items()}
+        a, m = dict(arrays), len(arrays['noise'])
+        require(m == self.n_experts, f'it has {m} experts, and says otherwise')
+        check_positive('spacing', a['spacing'])
         self.set_parts(
-            Layers.from_arrays(a),
+            Layers.from_arrays(a, self.n_inputs_),
             Standardisation(a['input_centre'], a['input_scale']),
             Standardisation(a['target_centre'], a['target_scale']),
             a['noise'].astype(np.float64),

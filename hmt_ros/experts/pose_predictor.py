@@ -13,28 +13,39 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.motion_prior import motion_prior
-from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
-from hmt_ros.experts.density_propagation import joined, propagate, propagate_by_dynamics
-from hmt_ros.experts.descriptor.contour import PersonBlob, centred_view, person_blob
-from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor, silhouette_parts
-from hmt_ros.experts.model_file import (
-    FAULTS,
+from hmt_ros.body import Body, Camera
+from hmt_ros.body.learned_file import (
     Arrays,
-    damaged,
+    body_of,
+    check_covariances,
     header,
     nested,
     parameters_of,
     part,
-    read_arrays,
-    write_arrays,
+    read_model,
+    require,
+    write_model,
+)
+from hmt_ros.body.motion_prior import motion_prior
+from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
+from hmt_ros.experts.density_propagation import joined, propagate, propagate_by_dynamics
+from hmt_ros.experts.descriptor.contour import PersonBlob, centred_view, person_blob
+from hmt_ros.experts.descriptor.silhouette_descriptor import (
+    ANGULAR,
+    FIXED,
+    MAP,
+    PAIR_BINS,
+    RADIAL,
+    SilhouetteDescriptor,
+    SilhouetteParts,
+    silhouette_parts,
 )
 from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
 from hmt_ros.experts.root_placement import (
@@ -48,7 +59,7 @@ from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.inference.reduction import reduced
 
 FOLDER = Path(__file__).resolve().parent / 'models'
-# Learned from motion capture: its card is in its notes.
+# Learned from motion capture: its notes are its card.
 SHIPPED = 'silhouettes'
 
 KIND = 'pose_predictor'
@@ -67,6 +78,8 @@ FORGETTING, LASTING = 5.0, 0.02
 # Axes of unit length have no spread along themselves, and those that are predicted have no unit
 # length: variance that is added to both.
 OF_AXES = 0.5**2
+# Largest condition of a basis of targets; how much an offset may differ from the usual one, m.
+WORST_CONDITION, OFFSET = 1e12, 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +105,7 @@ class PosePredictor:
         target_basis: (D, D) B; models learn z = B' x of a target x.
         equilibrium: p(x) of targets: a mixture of one component.
         dynamics: Model of p(z | previous z, descriptor) that has learned, or None.
-        notes: Origin of the model, for its file; JSON must be able to hold it.
+        notes: Card of its file; JSON must be able to hold it.
 
     Raises:
         ValueError: the parts do not fit each other.
@@ -119,12 +132,13 @@ class PosePredictor:
         _check_fit('model', model, descriptor.size, size)
         if dynamics is not None:
             _check_fit('dynamics', dynamics, size + descriptor.size, size)
-        if target_basis.shape != (size, size) or not np.isfinite(target_basis).all():
-            raise ValueError(
-                f'target_basis must be finite and ({size}, {size}), saw {target_basis.shape}'
-            )
-        if (len(equilibrium), equilibrium.dimension) != (1, size):
-            raise ValueError(f'equilibrium must be one component over {size} numbers')
+        require(
+            target_basis.shape == (size, size) and np.isfinite(target_basis).all(),
+            f'target_basis must be finite and ({size}, {size}), saw {target_basis.shape}',
+        )
+        right = (len(equilibrium), equilibrium.dimension) == (1, size)
+        require(right, f'equilibrium must be one component over {size} numbers')
+        require(np.linalg.cond(target_basis) <= WORST_CONDITION, 'target_basis is singular')
         self._from_basis = np.asarray(np.linalg.inv(target_basis), dtype=np.float64)
 
     @property
@@ -138,7 +152,7 @@ class PosePredictor:
         Raises:
             ValueError: the body has other degrees of freedom.
         """
-        _check_body(body, self.body.dof_names, f'this predictor, of {self.body.name}')
+        _check_body(body, self.body.dof_names, f'this predictor, of {self.body.name},')
         return PosePredictor(
             body,
             self.descriptor,
@@ -180,11 +194,11 @@ class PosePredictor:
             ValueError: the mask has not the size of the camera's image.
         """
         seen = np.asarray(mask)
-        if seen.shape != (camera.height, camera.width):
-            raise ValueError(
-                f'the mask has shape {seen.shape}, but the camera gives '
-                f'({camera.height}, {camera.width})'
-            )
+        require(
+            seen.shape == (camera.height, camera.width),
+            f'the mask has shape {seen.shape}, but the camera gives '
+            f'({camera.height}, {camera.width})',
+        )
         blob = person_blob(seen)
         descriptor = self.described(blob, camera)
         support = float(self.model.support(descriptor[None])[0])
@@ -306,15 +320,14 @@ class PosePredictor:
         covariances += JITTER * np.eye(self.encoding.size)
         return GaussianMixture(poses.weights, self.encoding.encode(poses.means), covariances)
 
-    def save(self, path: str | Path) -> Path:
-        """Writes the predictor into an .npz file without pickled objects and returns its path."""
+    def to_arrays(self) -> Arrays:
+        """The arrays of a file."""
         body = self.body
         parameters = {
             'body': body.name,
             'dof_names': list(body.dof_names),
             'lengths': body.segment_lengths,
-            'descriptor': {'points': self.descriptor.points},
-            'notes': self.notes,
+            'points': self.descriptor.points,
         }
         arrays: Arrays = header(KIND, parameters)
         arrays |= nested('descriptor', self.descriptor.to_arrays())
@@ -324,7 +337,61 @@ class PosePredictor:
         arrays['target_basis'] = self.target_basis
         arrays['equilibrium_mean'] = self.equilibrium.means[0]
         arrays['equilibrium_covariance'] = self.equilibrium.covariances[0]
-        return write_arrays(path, arrays)
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays, body: Body | None = None) -> PosePredictor:
+        """The predictor that `to_arrays` and a card describe; see `load`.
+
+        Raises:
+            ValueError, LookupError, TypeError: arrays or parameters are missing or wrong, or the
+                body is another one.
+        """
+        parameters = parameters_of(arrays)
+        if body is None:
+            body, own = body_of(parameters), parameters['lengths']
+            usual = body.segment_lengths
+            # Some are offsets near zero, of either sign.
+            allowed = {k: 0.9 * x if x > OFFSET else OFFSET for k, x in usual.items()}
+            human = all(abs(own[k] - x) <= allowed[k] for k, x in usual.items())
+            require(human and own.keys() == usual.keys(), 'nobody has its lengths')
+            body = body.with_segment_lengths(own)
+        _check_body(body, parameters['dof_names'], 'the predictor')
+        descriptor = SilhouetteDescriptor.from_arrays(
+            part('descriptor', arrays), parameters['points']
+        )
+        dynamics = part('dynamics', arrays)
+        equilibrium = GaussianMixture(
+            np.ones(1), arrays['equilibrium_mean'][None], arrays['equilibrium_covariance'][None]
+        )
+        check_covariances('equilibrium', equilibrium.covariances)
+        return cls(
+            body,
+            descriptor,
+            stored_model(part('model', arrays)),
+            arrays['target_basis'],
+            equilibrium,
+            stored_model(dynamics) if dynamics else None,
+            parameters_of(arrays, 'card'),
+        )
+
+    def answer(self, given: Array) -> GaussianMixture:
+        """The mixture over targets (D,) for the parts of a silhouette; with dynamics, by these."""
+        contexts, *others = np.split(given, np.cumsum([-FIXED, PAIR_BINS, MAP * MAP]))
+        parts = SilhouetteParts(contexts.reshape(-1, RADIAL * ANGULAR), *others)
+        row = self.descriptor.describe([parts])[0]
+        found = self.model.answer(row)
+        if self.dynamics is not None:
+            found = self.dynamics.answer(np.concatenate([found.mean(), row]))
+        return _transformed(found, self._from_basis)
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the predictor into an .npz file, with its notes as the card; returns its path."""
+        read = partial(self.from_arrays, body=self.body)
+        # Most numbers of the parts of a silhouette lie between 0 and 1.
+        size = self.descriptor.points * RADIAL * ANGULAR + FIXED
+        example = np.random.default_rng(0).integers(0, 64, size) / 64.0
+        return write_model(path, self, read, self.notes, example)
 
     @classmethod
     def load(cls, path: str | Path, body: Body | None = None) -> PosePredictor:
@@ -336,44 +403,9 @@ class PosePredictor:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is no predictor, or one of another version or body.
+            ValueError: the file is no predictor, or one of another version or body, or a wrong one.
         """
-        arrays = read_arrays(path, KIND)
-        where = str(path)
-        try:
-            parameters = parameters_of(arrays)
-            names = tuple(str(x) for x in parameters['dof_names'])
-            if body is None:
-                body = load_body(str(parameters['body']))
-                _check_body(body, names, where)
-                body = body.with_segment_lengths(parameters['lengths'])
-            else:
-                _check_body(body, names, where)
-            descriptor = SilhouetteDescriptor.from_arrays(
-                part('descriptor', arrays), int(parameters['descriptor']['points'])
-            )
-            model = stored_model(part('model', arrays), where)
-            dynamics = part('dynamics', arrays)
-            equilibrium = GaussianMixture(
-                np.ones(1), arrays['equilibrium_mean'][None], arrays['equilibrium_covariance'][None]
-            )
-            return cls(
-                body,
-                descriptor,
-                model,
-                np.asarray(arrays['target_basis'], dtype=np.float64),
-                equilibrium,
-                stored_model(dynamics, where) if dynamics else None,
-                parameters['notes'],
-            )
-        except _WrongBodyError as fault:
-            raise ValueError(str(fault)) from None
-        except FileNotFoundError as fault:
-            raise ValueError(
-                f'{where}: trained for a body {parameters["body"]!r}, which does not ship: give it'
-            ) from fault
-        except FAULTS as fault:
-            raise damaged(where, fault) from fault
+        return read_model(path, KIND, partial(cls.from_arrays, body=body))
 
 
 def load_predictor(model: str | Path = SHIPPED) -> PosePredictor:
@@ -391,26 +423,20 @@ def load_predictor(model: str | Path = SHIPPED) -> PosePredictor:
     return PosePredictor.load(model)
 
 
-class _WrongBodyError(ValueError):
-    """Raised for a body that a predictor was not trained for."""
-
-
-def _check_body(body: Body, names: Sequence[str], where: str) -> None:
-    if tuple(names) != body.dof_names:
-        missing = sorted(set(names) - set(body.dof_names))
-        more = sorted(set(body.dof_names) - set(names))
-        raise _WrongBodyError(
-            f'{where}: trained for a body of {len(names)} degrees of freedom, but {body.name} has '
-            f'{body.dimension} (missing {missing}, more {more}); use that body or train again'
-        )
+def _check_body(body: Body, names: Sequence[str], what: str) -> None:
+    require(
+        tuple(names) == body.dof_names,
+        f'{what} is for a body of {len(names)} degrees of freedom, but {body.name} has '
+        f'{body.dimension} or others: use that body or train again',
+    )
 
 
 def _check_fit(what: str, model: ConditionalDensity, inputs: int, outputs: int) -> None:
-    if (model.n_inputs_, model.n_outputs_) != (inputs, outputs):
-        raise ValueError(
-            f'the {what} has {model.n_inputs_} inputs and {model.n_outputs_} outputs, wanted '
-            f'{inputs} and {outputs}'
-        )
+    require(
+        (model.n_inputs_, model.n_outputs_) == (inputs, outputs),
+        f'the {what} has {model.n_inputs_} inputs and {model.n_outputs_} outputs, wanted '
+        f'{inputs} and {outputs}',
+    )
 
 
 def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:

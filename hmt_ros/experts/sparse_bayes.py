@@ -101,7 +101,7 @@ class SparseRegression:
     def spread(self, features: Array) -> Array:
         """phi' L^-1 phi, (n,): the variance of the mean in units of the noise."""
         phi = features[:, self.active]
-        return np.asarray(((phi @ self.covariance) * phi).sum(1))
+        return np.asarray(np.maximum(((phi @ self.covariance) * phi).sum(1), 0.0))
 
 
 def posterior(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.learned_file import check_positive, require
 from hmt_ros.inference.arrays import Array
 
 SCALINGS = ('each', 'common')
@@ -41,15 +42,15 @@ class Standardisation:
         centre, scale: (p,) each.
 
     Raises:
-        ValueError: a scale is not positive.
+        ValueError: shapes that differ, or a scale that is not positive.
     """
 
     centre: Array
     scale: Array
 
     def __post_init__(self) -> None:
-        if not (self.scale > 0).all():
-            raise ValueError(f'scales must be positive, saw {np.min(self.scale)}')
+        require(self.scale.shape == self.centre.shape, 'centre and scale do not fit')
+        check_positive('scales', self.scale)
 
     @classmethod
     def of(cls, values: Array, weights: Array, scaling: str = 'each') -> Standardisation:
@@ -64,8 +65,7 @@ class Standardisation:
         Raises:
             ValueError: the scaling is another one.
         """
-        if scaling not in SCALINGS:
-            raise ValueError(f'scaling is {scaling!r}, wanted one of {", ".join(SCALINGS)}')
+        require(scaling in SCALINGS, f'scaling is {scaling!r}, wanted one of {", ".join(SCALINGS)}')
         share = weights / weights.sum()
         centre = share @ values
         variance = share @ (values - centre) ** 2
@@ -99,30 +99,32 @@ def checked_pairs(
     """
     inputs = finite_matrix(inputs, 'inputs', '(N, p)')
     targets = finite_matrix(targets, 'targets', '(N, D)')
-    if len(inputs) != len(targets):
-        raise ValueError(
-            f'{len(inputs)} inputs and {len(targets)} targets, wanted as many of both; pair them up'
-        )
-    if inputs.shape[1] == 0 or targets.shape[1] == 0:
-        raise ValueError(
-            f'inputs {inputs.shape} and targets {targets.shape}, wanted at least one column each'
-        )
+    require(
+        len(inputs) == len(targets),
+        f'{len(inputs)} inputs and {len(targets)} targets, wanted as many of both; pair them up',
+    )
+    require(
+        inputs.shape[1] > 0 and targets.shape[1] > 0,
+        f'inputs {inputs.shape} and targets {targets.shape}, wanted at least one column each',
+    )
     if sample_weight is None:
         weights = np.ones(len(inputs))
     else:
         weights = np.asarray(sample_weight, dtype=np.float64)
-        if weights.shape != (len(inputs),):
-            raise ValueError(f'sample_weight has shape {weights.shape}, wanted ({len(inputs)},)')
-        if not (np.isfinite(weights).all() and (weights >= 0).all()):
-            raise ValueError(
-                'sample_weight has values that are negative or not finite, wanted >= 0'
-            )
-    kept = np.flatnonzero(weights > 0)
-    if len(kept) < at_least:
-        raise ValueError(
-            f'{len(kept)} samples, wanted at least {at_least} ({what}); '
-            'give more samples or ask for less'
+        require(
+            weights.shape == (len(inputs),),
+            f'sample_weight has shape {weights.shape}, wanted ({len(inputs)},)',
         )
+        require(
+            np.isfinite(weights).all() and (weights >= 0).all(),
+            'sample_weight has values that are negative or not finite, wanted >= 0',
+        )
+    kept = np.flatnonzero(weights > 0)
+    require(
+        len(kept) >= at_least,
+        f'{len(kept)} samples, wanted at least {at_least} ({what}); give more samples or ask for '
+        'less',
+    )
     return TrainingPairs(inputs[kept], targets[kept], weights[kept])
 
 
@@ -133,8 +135,7 @@ def finite_matrix(values: ArrayLike, name: str, wanted: str) -> Array:
         ValueError: the values have not two axes, or are not finite.
     """
     matrix = np.asarray(values, dtype=np.float64)
-    if matrix.ndim != 2:
-        raise ValueError(f'{name} have shape {matrix.shape}, wanted {wanted}')
+    require(matrix.ndim == 2, f'{name} have shape {matrix.shape}, wanted {wanted}')
     bad = ~np.isfinite(matrix)
     if bad.any():
         row, column = (int(i) for i in np.argwhere(bad)[0])

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_ros.body.learned_file import write_model
 from hmt_ros.body.mirror import mirror
 from hmt_ros.body.motion_prior import (
     LearnedMotion,
@@ -15,10 +16,11 @@ from hmt_ros.body.motion_prior import (
     read_motion_prior,
     shipped_motion,
 )
+from test.forged_models import write_forged
 
 SMALL = LearnedMotion(
     'stick', ('a', 'b'), np.array([1.0, 4.0]), np.array([[2.0, 0.5], [0.5, 1.0]]),
-    np.array([1e-3, 2e-3]), 'two motions',
+    np.array([1e-3, 2e-3]), {'source': 'two motions'},
 )  # fmt: skip
 
 
@@ -27,10 +29,14 @@ def path(tmp_path) -> Path:
     return tmp_path / 'stick_motion.npz'
 
 
+def written(path) -> Path:
+    return write_model(path, SMALL, LearnedMotion.from_arrays, SMALL.card, np.zeros(4))
+
+
 def test_what_was_written_is_read(path):
-    np.savez(path, **SMALL.arrays())
-    found = read_motion_prior(path)
-    assert (found.body, found.dof_names, found.card) == ('stick', ('a', 'b'), 'two motions')
+    found = read_motion_prior(written(path))
+    assert (found.body, found.dof_names) == ('stick', ('a', 'b'))
+    assert found.card == {'source': 'two motions', 'numbers': 12}
     np.testing.assert_allclose(found.damping, SMALL.damping)
     np.testing.assert_allclose(found.diffusion, SMALL.diffusion)
     np.testing.assert_allclose(found.white, SMALL.white, rtol=1e-6)
@@ -66,19 +72,23 @@ def test_bodies_without_a_file_walk_randomly(human32, human37):
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
-        ({'format': np.array('model')}, 'it is model'),
-        ({'version': np.array(7)}, 'version 7, wanted 1'),
-        ({'damping': np.array([1.0, np.nan])}, 'damping has values that are not finite'),
-        ({'damping': np.array([1.0, -1.0])}, 'damping must be positive'),
-        ({'damping': np.array(['a', 'b'])}, 'not finite numbers'),
-        ({'diffusion': np.eye(3)}, 'do not fit'),
-        ({'diffusion': np.array([[1.0, 2.0], [2.0, 1.0]])}, 'not positive definite'),
-        ({'dof_names': np.array(['a'])}, '1 degrees of freedom are named, and 2 move'),
+        ({'format': np.array('secret')}, 'it is none of hmt_ros'),
+        ({'version': np.array(1)}, 'it is of another version'),
+        ({'damping': np.array([1.0, np.nan], 'f')}, 'values that are not finite'),
+        ({'damping': np.array([1.0, -1.0], 'f')}, 'must be positive'),
+        ({'damping': np.array(['secret', 'b'])}, 'another type'),
+        ({'diffusion': np.eye(3, dtype='f')}, 'do not fit'),
+        ({'diffusion': np.array([[1.0, 2.0], [2.0, 1.0]], 'f')}, 'not positive definite'),
+        (
+            {'parameters': np.array('{"body": "secret", "dof_names": ["a"]}')},
+            r'1 degrees of freedom are named, and 2 move',
+        ),
     ],
 )
-def test_damaged_files_are_refused_in_one_line(path, changes, message):
-    np.savez(path, **{**SMALL.arrays(), **changes})
+def test_wrong_files_are_refused_in_one_line(path, changes, message):
+    write_forged(path, written(path), changes)
     with pytest.raises(ValueError, match=message) as caught:
         read_motion_prior(path)
     assert str(path) in str(caught.value)
     assert '\n' not in str(caught.value)
+    assert 'secret' not in str(caught.value)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,13 +11,14 @@ from scipy.stats import multivariate_normal
 
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.angle_mixture import AngleMixture, read_pose_prior, shipped_prior
+from hmt_ros.body.learned_file import write_model
 from hmt_ros.body.mirror import mirror
 from hmt_ros.body.pose_prior import AnglePrior, MixturePrior, pose_prior, prior_energies
-from hmt_ros.experts.model_file import write_arrays
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction
 from hmt_ros.inference.mixture import GaussianMixture
+from test.forged_models import write_forged
 from test.oracles.single_terms import energy_of
 
 HUMAN = load_body('human37')
@@ -176,46 +179,66 @@ def test_which_bodies_have_a_learned_prior():
 # Files.
 
 
+def written(path):
+    mixture = made_mixture()
+    read = partial(AngleMixture.from_arrays, skeleton=HUMAN.skeleton)
+    return write_model(path, mixture, read, mixture.card, np.zeros(0))
+
+
 def test_a_file_gives_the_mixture_back(tmp_path):
     mixture = made_mixture()
-    path = write_arrays(tmp_path / 'prior', mixture.arrays())
-    found = read_pose_prior(path, HUMAN)
+    found = read_pose_prior(written(tmp_path / 'prior'), HUMAN)
     assert found.dofs == mixture.dofs
-    assert found.card == {'source': 'made up'}
+    assert found.card['source'] == 'made up'
     x = poses(20)
     assert np.allclose(found.log_density(x), mixture.log_density(x), rtol=1e-3)
+
+
+def parameters(**changes):
+    own = {'body': 'human37', 'dofs': list(made_mixture().dofs)}
+    return {'parameters': np.array(json.dumps(own | changes))}
+
+
+FIRST = np.float32(np.tril_indices(10)[1] == 0)
+
+
+def single(*shape, value=0.0):
+    return np.full(shape, value, dtype=np.float32)
 
 
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
-        ({'format': np.array('other')}, r"not a pose prior \(its format is 'other'\)"),
-        ({'weights': None}, r'not a pose prior \(it lacks weights\)'),
-        ({'version': np.array(7)}, "pose prior of version '7', wanted 1"),
-        ({'body': np.array('human34')}, "of the body 'human34', wanted one of 'human37'"),
-        ({'mounts': np.zeros((2, 3, 3))}, 'frames at rest'),
-        ({'mounts': np.full(HUMAN.skeleton.mounts.shape, 'none')}, 'frames at rest'),
-        ({'card': np.array('[' * 100_000)}, 'damaged pose prior'),
-        ({'means': np.zeros((4, 3))}, r'damaged pose prior \(means \(4, 3\)'),
-        ({'means': np.full((4, 10), np.nan)}, 'not finite'),
-        ({'factors': np.zeros((4, 55))}, 'not positive definite'),
-        ({'factors': np.full((4, 55), np.inf)}, 'wanted finite ones'),
-        ({'weights': np.full(4, 0.5)}, 'weights must be positive and sum to 1'),
-        ({'weights': np.array(1.0)}, 'damaged pose prior'),
-        ({'dofs': np.array(['trunk_q'] * 10)}, 'has no degrees of freedom'),
-        ({'dofs': np.array(['trunk_x'] * 10)}, 'wanted different angles'),
-        ({'dofs': np.array(1)}, 'damaged pose prior'),
-        ({'card': np.array('{')}, 'damaged pose prior'),
-        ({'card': np.array('[]')}, 'the card is a list'),
+        ({'format': np.array('secret')}, 'it is none of hmt_ros'),
+        ({'weights': None}, 'KeyError'),
+        ({'version': np.array(1)}, 'of another version'),
+        (parameters(body='secret'), 'for another body than human37, or other frames at rest'),
+        ({'mounts': single(2, 3, 3)}, 'broadcast'),
+        ({'mounts': np.zeros(HUMAN.skeleton.mounts.shape, 'f')}, 'other frames at rest'),
+        ({'card': np.array('[' * 100_000)}, 'RecursionError'),
+        ({'means': single(4, 3)}, 'IndexError'),
+        ({'means': single(4, 10, value=np.nan)}, 'not finite'),
+        ({'factors': single(4, 55)}, 'not positive definite'),
+        # Every row is the first column alone: all angles are one.
+        ({'factors': single(4, 55) + FIRST}, 'not positive definite'),
+        ({'factors': single(4, 55, value=np.inf)}, 'not finite'),
+        ({'weights': single(4, value=0.5)}, 'weights must be positive and sum to 1'),
+        ({'weights': np.array(1.0)}, 'not a model file that can be used'),
+        (parameters(dofs=['trunk_q'] * 10), 'degrees of freedom that human37 has not'),
+        (parameters(dofs=['trunk_x'] * 10), 'wanted different angles'),
+        (parameters(dofs=1), 'not a model file that can be used'),
+        ({'card': np.array('{')}, 'not a model file that can be used'),
+        ({'card': np.array('[]')}, 'card are no mapping'),
     ],
 )
 def test_faults_of_a_file_are_named(tmp_path, change, message):
-    arrays = made_mixture().arrays() | change
-    path = write_arrays(tmp_path / 'p', {k: v for k, v in arrays.items() if v is not None})
+    path = written(tmp_path / 'p')
+    write_forged(path, path, change)
     with pytest.raises(ValueError, match=message) as caught:
         read_pose_prior(path, HUMAN)
     assert str(path) in str(caught.value)
     assert '\n' not in str(caught.value)
+    assert 'secret' not in str(caught.value)
 
 
 def test_mixtures_without_their_mirror_image_are_refused():

@@ -33,6 +33,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.learned_file import require
 from hmt_ros.experts.descriptor.contour import person_blob, sample_contour
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import squared_distances
@@ -86,10 +87,10 @@ class ShapeContextCodebook:
 
     def __post_init__(self) -> None:
         shape = self.centres.shape
-        if len(shape) != 2 or shape[1] != RADIAL * ANGULAR or not np.isfinite(self.centres).all():
-            raise ValueError(
-                f'centres of shape contexts must be finite and (C, {RADIAL * ANGULAR}), saw {shape}'
-            )
+        require(
+            shape[1:] == (RADIAL * ANGULAR,) and np.isfinite(self.centres).all(),
+            f'centres of shape contexts must be finite and (C, {RADIAL * ANGULAR}), saw {shape}',
+        )
 
     def histogram(self, contexts: Array) -> Array:
         """Votes (C,) of contexts (N, 60): a histogram that sums to 1."""
@@ -146,6 +147,7 @@ EXTENT = 4.4  # width of the map in radii of gyration; stretched arms and legs a
 DEEPEST, FURTHEST = 0.25, 0.60  # limits of the distances inside and outside, radii of gyration
 MOMENTS = 12
 FIXED = PAIR_BINS + MAP * MAP + MOMENTS  # features besides those of the codebook
+FEWEST_POINTS, MOST_POINTS = 8, 500  # on the outline; time and memory grow with their square
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,12 +207,16 @@ class SilhouetteDescriptor:
 
     def __post_init__(self) -> None:
         for name in ('scale', 'centre', 'basis'):
-            if not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f'{name} of the descriptor must be finite')
+            finite = np.isfinite(getattr(self, name)).all()
+            require(finite, f'{name} of the descriptor must be finite')
         length = len(self.codebook.centres) + FIXED
         shapes = (self.scale.shape, self.centre.shape, self.basis.shape[:1])
-        if shapes != ((length,),) * 3 or self.basis.ndim != 2:
-            raise ValueError(f'arrays of the descriptor have shapes {shapes}, wanted ({length},)')
+        require(
+            shapes == ((length,),) * 3 and self.basis.ndim == 2,
+            f'arrays of the descriptor have shapes {shapes}, wanted ({length},)',
+        )
+        right = type(self.points) is int and FEWEST_POINTS <= self.points <= MOST_POINTS
+        require(right, f'wanted {FEWEST_POINTS} to {MOST_POINTS} points on the outline')
 
     @property
     def size(self) -> int:

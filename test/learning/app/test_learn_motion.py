@@ -39,7 +39,8 @@ def test_motions_give_a_motion_prior(tmp_path, read_here, capsys):
     assert 'skipped slow.bvh: 25 frames per second, wanted a multiple of 30' in told.err
     learned = read_motion_prior(output)
     assert learned.body == 'human37'
-    assert learned.card.startswith('From nobody.\nLearned from 2 motions, 7 s: ')
+    assert learned.card['source'] == 'From nobody.'
+    assert (len(learned.card['motions']), learned.card['seconds']) == (2, 7)
     assert learned.dynamics.dimension == 37
     # The same in one process.
     read_here()

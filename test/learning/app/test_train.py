@@ -44,7 +44,9 @@ def test_procedural_motions_give_a_model_and_figures(tmp_path, capsys, monkeypat
     assert predictor.body.name == 'human37'
     assert predictor.dynamics is not None
     assert predictor.notes['samples'] == 120
-    assert predictor.notes['card'] == 'Thanks.\nLearned from 2 motions, 5 s: reach 3, reach 4.'
+    assert predictor.notes['source'] == 'Thanks.'
+    assert predictor.notes['motions'] == ['reach 3', 'reach 4']
+    assert predictor.notes['seconds'] == 5
     figures = sorted(x.name for x in (tmp_path / 'model_report').iterdir())
     assert figures == ['affinities.png', 'multimodality.png', 'silhouettes.png']
     for name in figures:
@@ -76,7 +78,7 @@ def test_broken_motions_are_skipped_and_counted(
     warnings = [x for x in captured.err.splitlines() if x.startswith('train: skipped')]
     assert sorted(x.split()[2] for x in warnings) == ['alone.amc:', 'broken.bvh:', 'unknown.bvh:']
     assert '1 motions, 3 skipped' in captured.out
-    assert 'Learned from 1 motions' in PosePredictor.load(output).notes['card']
+    assert len(PosePredictor.load(output).notes['motions']) == 1
     read_here()
     # People are left out by their names, and others are what it is scored on.
     more = ['--without', 'broke*', '--test', str(folder / 'deeper'), '--overwrite']

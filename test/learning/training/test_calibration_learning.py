@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hmt_learning.training.calibration_learning import LearningCalibration, calibration, folds_of
+from hmt_ros.body.learned_file import nested
 from hmt_ros.experts import JointExperts, NearestNeighbours, RelevanceVectorRegression
 from hmt_ros.experts.calibrated_experts import CalibratedExperts, Calibration
 from hmt_ros.experts.conditional_density import Components
-from hmt_ros.experts.model_file import nested
 
 GROUPS, EACH = 12, 40
 
@@ -87,7 +87,7 @@ def test_a_file_brings_it_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         again.log_density(inputs, targets), model.log_density(inputs, targets), rtol=1e-9
     )
-    with pytest.raises(ValueError, match="'calibrated_experts', wanted 'joint_experts'"):
+    with pytest.raises(ValueError, match="it is none of kind 'joint_experts'"):
         JointExperts.load(tmp_path / 'model.npz')
 
 

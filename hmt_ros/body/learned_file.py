@@ -1,0 +1,323 @@
+"""Files of learned models: one .npz of plain arrays, which is checked by use when it is read.
+
+An archive names its format, the version of the format and the kind of model. It holds the
+constructor's parameters as JSON and the learned arrays. A model inside another one keeps its
+arrays under a prefix: `nested` and `part`. A whole file has besides
+
+- `card`: what the model was learned from, under which licence, and how; JSON,
+- `checksum`: SHA-256 of all other arrays, which tells damage from a model that is wrong,
+- `example/input` and `example/answer`: an input, and what the model predicts for it.
+
+A reader makes the model, whose own code checks shapes and ranges; the arrays that it would write
+must have the names, types and shapes of those of the file; and it must answer for the stored input,
+by a mixture of finite means and positive definite covariances, as when it was written.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.model_file import load_body, model_names
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.mixture import GaussianMixture
+from msg_tools.files.array_file import read_archive
+from msg_tools.files.error_line import error_line
+from msg_tools.files.new_folder import new_file
+
+FORMAT = 'hmt_ros model'
+VERSION = 2
+
+Arrays = dict[str, NDArray[Any]]
+
+# Maximum sizes of a file: numbers and bytes of all arrays, characters of a text. Neighbours of
+# 80,000 silhouettes, with a model for rule (1), have 19 million numbers.
+MOST_VALUES, LONGEST_TEXT = 20_000_000, 2**20
+LARGEST_FILE = 8 * MOST_VALUES
+# Maximum number of inputs or outputs of a model; a descriptor has a few hundred, a pose forty.
+MOST_NUMBERS = 10_000
+# Ranges of positive numbers and of variances, and the largest ratio of variances. Products of a
+# few of them are finite, and sums of covariances keep what the least adds.
+LEAST, LARGEST = 1e-15, 1e30
+LEAST_VARIANCE, LARGEST_VARIANCE, LARGEST_RATIO = 1e-25, 1e12, 1e13
+# Least eigenvalue of a correlation matrix of which Cholesky factors are taken.
+LEAST_EIGENVALUE = 1e-13
+# Difference of an answer from the stored one, in standard deviations and in nats per variable.
+# Networks compute in single precision: that of another machine explains 1e-5.
+TOLERANCE = 1e-3
+# The exceptions that wrong arrays cause wherever they are used.
+FAULTS = (
+    OSError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+    np.linalg.LinAlgError,
+)
+
+_HEADER = ('format', 'version', 'kind')
+_TEXTS = ('format', 'kind', 'parameters', 'card', 'checksum')
+_WHOLE_NUMBERS = ('version', 'shape', 'active', 'n_experts')
+_INPUT, _ANSWER = 'example/input', 'example/answer'
+
+
+class LearnedModel(Protocol):
+    """What a file asks of a model."""
+
+    def to_arrays(self) -> Arrays:
+        """The header and the learned arrays."""
+
+    def answer(self, given: Array) -> GaussianMixture:
+        """What the model predicts for an input."""
+
+
+Model = TypeVar('Model', bound=LearnedModel)
+
+
+@contextmanager
+def named_faults(where: str) -> Iterator[None]:
+    """Makes every exception that wrong arrays cause a ValueError of one line, with a path.
+
+    It repeats the texts of ValueErrors alone, which have no content of the file.
+    """
+    try:
+        with np.errstate(all='ignore'):
+            yield
+    except FAULTS as fault:
+        text = error_line(fault)[:150] if isinstance(fault, ValueError) else type(fault).__name__
+        raise ValueError(
+            f'{where}: not a model file that can be used ({text}); train or learn it again'
+        ) from fault
+
+
+def require(condition: object, what: str) -> None:
+    """Raises ValueError, which says what is wrong, unless a condition holds."""
+    if not condition:
+        raise ValueError(what)
+
+
+def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
+    """The arrays that identify an archive.
+
+    Args:
+        parameters: Constructor's parameters; JSON must be able to hold them.
+    """
+    return {
+        'format': np.array(FORMAT),
+        'version': np.array(VERSION),
+        'kind': np.array(kind),
+        'parameters': np.array(json.dumps(dict(parameters), sort_keys=True)),
+    }
+
+
+def check_header(arrays: Mapping[str, NDArray[Any]], kind: str) -> None:
+    """Raises ValueError unless the arrays are those of `header`, for models of a kind."""
+    single = [name for name in _HEADER if name in arrays and not arrays[name].ndim]
+    found = {name: str(arrays[name]) for name in single}
+    require(found.get('format') == FORMAT, 'it is none of hmt_ros')
+    require(found.get('version') == str(VERSION), 'it is of another version')
+    require(found.get('kind') == kind, f'it is none of kind {kind!r}')
+
+
+def parameters_of(arrays: Mapping[str, NDArray[Any]], name: str = 'parameters') -> dict[str, Any]:
+    """The constructor's parameters in an archive, or its card.
+
+    Raises:
+        ValueError: they are no JSON of a mapping.
+    """
+    result = json.loads(str(arrays[name]))
+    require(isinstance(result, dict), f'{name} are no mapping')
+    return dict(result)
+
+
+def body_of(parameters: Mapping[str, Any]) -> Body:
+    """The body that ships under the name in a file, which must not lead to other files.
+
+    Raises:
+        ValueError: none ships under this name.
+    """
+    require(parameters['body'] in model_names(), 'it is for a body that does not ship: give it')
+    return load_body(parameters['body'])
+
+
+def check_positive(name: str, values: Any) -> None:
+    """Raises ValueError if numbers are not positive, or so small or large that none are."""
+    require(
+        np.min(values) >= LEAST and np.max(values) <= LARGEST,
+        f'{name} must be positive, from {LEAST:g} to {LARGEST:g}',
+    )
+
+
+def check_covariances(name: str, values: Array, slack: float = -LEAST_EIGENVALUE) -> None:
+    """Checks covariances (..., D, D).
+
+    Args:
+        slack: added to the eigenvalues of the correlations; above 0, they may be semidefinite.
+
+    Raises:
+        ValueError: they are not symmetric and positive definite, or variances are out of range.
+    """
+    variances = np.diagonal(values, axis1=-2, axis2=-1)
+    least, largest = variances.min(initial=1.0), variances.max(initial=1.0)
+    require(
+        least >= LEAST_VARIANCE and largest <= min(LARGEST_VARIANCE, LARGEST_RATIO * least),
+        f'{name} has variances out of {LEAST_VARIANCE:g} to {LARGEST_VARIANCE:g}, or apart',
+    )
+    deviations = np.sqrt(variances)
+    correlations = values / deviations[..., None] / deviations[..., None, :]
+    same = np.allclose(correlations, np.swapaxes(correlations, -1, -2), atol=1e-6)
+    require(same, f'{name} is not symmetric')
+    np.linalg.cholesky(correlations + slack * np.eye(values.shape[-1]))
+
+
+def write_model(
+    path: str | Path,
+    model: LearnedModel,
+    read: Callable[[Arrays], LearnedModel],
+    card: Mapping[str, Any],
+    example: Array,
+) -> Path:
+    """Writes a model that can be read again completely, or not at all.
+
+    Args:
+        path: File to write; '.npz' is appended where it is missing.
+        read: makes the model from its arrays.
+        card: what it was learned from, licence, method; JSON must be able to hold it.
+        example: an input, for `LearnedModel.answer`.
+
+    Returns:
+        The path written.
+
+    Raises:
+        ValueError: a reader would refuse the file.
+    """
+    arrays = model.to_arrays()
+    whole = {**card, 'numbers': sum(values.size for values in arrays.values())}
+    arrays |= {'card': np.array(json.dumps(whole, sort_keys=True)), _INPUT: example}
+    with named_faults(str(path)):
+        # In the precision of the file, as a reader computes it.
+        arrays[_ANSWER] = _answer(read(arrays), arrays)
+        arrays['checksum'] = np.array(checksum(arrays))
+        checked_model(arrays, read)
+    return write_arrays(path, arrays)
+
+
+def read_model(path: str | Path, kind: str, read: Callable[[Arrays], Model]) -> Model:
+    """The model in a file.
+
+    Args:
+        read: makes the model from its arrays.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is none of this format, version and kind, or damaged, or wrong.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f'{path}: no such model file; train or learn one')
+    with named_faults(str(path)):
+        arrays = read_archive(path, LARGEST_FILE)
+        check_header(arrays, kind)
+        return checked_model(arrays, read)
+
+
+def checked_model(arrays: Arrays, read: Callable[[Arrays], Model]) -> Model:
+    """The model of the arrays of a whole file.
+
+    Raises:
+        Exception: the arrays are damaged or wrong; some of `FAULTS`.
+    """
+    own = str(arrays.get('checksum'))
+    require(own == checksum(arrays), 'it is damaged, its checksum is another one: copy it again')
+    _check_values(arrays)
+    model = read(arrays)
+    numbers = [
+        {name: (x.dtype, x.shape) for name, x in some.items() if x.dtype.kind != 'U'}
+        for some in (arrays, model.to_arrays() | {x: arrays[x] for x in (_INPUT, _ANSWER)})
+    ]
+    require(numbers[0] == numbers[1], 'an array has another name, type or shape than usual')
+    parameters_of(arrays, 'card')
+    answer, stored = _answer(model, arrays), arrays[_ANSWER]
+    size = len(answer) // 2
+    allowed = TOLERANCE * np.r_[answer[size:-1], answer[size:-1], size]
+    same = answer.shape == stored.shape and (np.abs(answer - stored) <= allowed).all()
+    require(same, 'it does not answer as when it was written')
+    return model
+
+
+def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """SHA-256 of the names, types, shapes and values of all arrays but the checksum."""
+    result = hashlib.sha256()
+    for name, values in sorted(arrays.items()):
+        if name != 'checksum':
+            result.update(f'{name} {values.dtype.str} {values.shape} '.encode('utf-8', 'replace'))
+            result.update(values.tobytes())
+    return result.hexdigest()
+
+
+def _answer(model: LearnedModel, arrays: Arrays) -> Array:
+    """What a model says for the stored input: mean, deviations (D,) and log density at the mean."""
+    found = model.answer(arrays[_INPUT])
+    require(abs(found.weights.sum() - 1.0) < TOLERANCE, 'its weights do not sum to 1')
+    check_covariances('its answer', found.covariances)
+    mean, whole = found.mean(), found.covariance()
+    told: Array = np.r_[mean, np.sqrt(np.diagonal(whole)), found.log_density(mean[None])]
+    return told
+
+
+def _check_values(arrays: Arrays) -> None:
+    """Raises ValueError for types that models do not have, and numbers that are none."""
+    size = sum(values.size for values in arrays.values())
+    require(size <= MOST_VALUES, f'it has more than {MOST_VALUES} numbers')
+    for name, values in arrays.items():
+        own, kind = name.rpartition('/')[2], values.dtype.kind
+        usual = 'U' if own in _TEXTS else 'i' if own in _WHOLE_NUMBERS else 'f'
+        require(kind == usual, 'an array has another type than usual')
+        if kind == 'U':
+            require(values.nbytes <= 4 * LONGEST_TEXT, 'a text is too long')
+        else:
+            largest = float(np.abs(values).max(initial=0))
+            require(largest <= LARGEST, 'an array has values that are not finite, or too large')
+
+
+def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
+    """Writes an archive completely or not at all; the same arrays give the same bytes.
+
+    Args:
+        path: File to write; '.npz' is appended where it is missing.
+
+    Returns:
+        The path written.
+    """
+    path = Path(path)
+    if path.suffix != '.npz':
+        path = path.with_name(path.name + '.npz')
+    content: dict[str, Any] = dict(arrays)
+    with new_file(path) as file:
+        np.savez_compressed(file, **content)
+    return path
+
+
+def nested(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    """The arrays with names under a prefix, as part of a larger archive."""
+    return {f'{prefix}/{name}': value for name, value in arrays.items()}
+
+
+def part(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    """The arrays that `nested` put under a prefix."""
+    opening = f'{prefix}/'
+    return {
+        name.removeprefix(opening): value
+        for name, value in arrays.items()
+        if name.startswith(opening)
+    }
