@@ -8,7 +8,6 @@ import fnmatch
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
-from datetime import datetime, timezone
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -228,11 +227,10 @@ def shares_of(sequences: list[PoseSequence], alike: str, share: float) -> list[f
 
 
 def data_card(sequences: list[PoseSequence], acknowledgement: str) -> dict[str, Any]:
-    """The card of a file that is learned from motions now, by heading."""
+    """The card of a file that is learned from motions, by heading."""
     return {
         'source': acknowledgement.strip(),
         'motions': sorted(one.name for one in sequences),
         'seconds': round(sum(len(one.poses) for one in sequences) / RATE),
-        'date': datetime.now(tz=timezone.utc).date().isoformat(),
         'made by': f'hmt_ros {hmt_ros.__version__}',
     }

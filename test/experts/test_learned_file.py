@@ -130,7 +130,7 @@ def test_a_file_that_ships_has_a_card_and_shows_damage(path, tmp_path):
     read(path)
     card = parameters_of(arrays, 'card')
     assert 'NSF EIA-0196217' in card['source']
-    assert {'date', 'made by', 'licence', 'numbers'} <= card.keys()
+    assert {'made by', 'licence', 'numbers'} <= card.keys()
     assert ('UI-PRMD' in card['source']) == ('prmd_' in str(card.get('motions')))
     name = next(name for name, values in arrays.items() if values.dtype.kind == 'f')
     damaged = arrays[name].copy()
