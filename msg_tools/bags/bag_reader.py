@@ -38,7 +38,7 @@ from msg_tools.bags.mcap_file import McapFile
 from msg_tools.bags.sqlite_file import MAGIC as _SQLITE_MAGIC
 from msg_tools.bags.sqlite_file import SqliteFile
 from msg_tools.bags.storage import LARGEST, BagFile, Channel, StoredMessage
-from msg_tools.files.budget import Budget
+from msg_tools.files.budget import Budget, BudgetError
 from msg_tools.messages.cdr import ValueBudget, deserialise
 from msg_tools.messages.message_types import typestore, typestore_of_definition
 
@@ -335,7 +335,7 @@ class BagReader(AbstractContextManager['BagReader']):
                 magic = _first_bytes(path)
         except OSError as error:
             raise BagError(f'{name} can not be read: {reason(error)}') from error
-        except ValueError as error:
+        except BudgetError as error:
             raise BagError(f'{name} is refused: {reason(error)}') from error
         except zstandard.ZstdError as error:
             raise BagError(f'{name} is damaged: {reason(error)}') from error
@@ -382,14 +382,14 @@ def _decompressed(packed: bytes | BinaryIO, budget: Budget, largest: int) -> Ite
         largest: bytes that it may have.
 
     Raises:
-        ValueError: it is larger than that, or than the budget allows.
+        BudgetError: it is larger than that, or than the budget allows.
     """
     with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True) as stream:
         while piece := stream.read(_PIECE):
             budget.spend(unpacked=len(piece))
             largest -= len(piece)
             if largest < 0:
-                raise ValueError('its content is too large')
+                raise BudgetError('its content is too large')
             yield piece
 
 

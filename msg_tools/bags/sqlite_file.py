@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from msg_tools.bags.storage import LARGEST, NEVER, Channel, StoredMessage, faults_told
-from msg_tools.files.budget import Budget
+from msg_tools.files.budget import Budget, BudgetError
 from msg_tools.messages.definitions import MAX_BYTES
 
 MAGIC = b'SQLite format 3\x00'
@@ -22,6 +22,7 @@ MAGIC = b'SQLite format 3\x00'
 # Steps of the virtual machine of SQLite for a file, and more for each of its bytes: a row, which
 # has more than ten bytes, takes about thirty. Bytes that SQLite may take for all its work.
 _STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE, _MEMORY = 10**7, 4, 10**5, 2**29
+_MAX_TOPICS = 2**16  # as in an MCAP file
 
 
 class SqliteFile:
@@ -47,13 +48,15 @@ class SqliteFile:
                     definitions[msgtype] = encoding, text
             if not _is_table(database, 'topics') or not _is_table(database, 'messages'):
                 raise sqlite3.DataError('it has no tables topics and messages')
-            query = 'SELECT id, name, type, serialization_format FROM topics'
-            for key, topic, msgtype, encoding in sorted(
-                _rows(database, query, (int, str, str, str), budget)
+            query = 'SELECT id, name, type, serialization_format FROM topics ORDER BY id'
+            for key, topic, msgtype, encoding in _rows(
+                database, query, (int, str, str, str), budget
             ):
                 definition = definitions.get(msgtype, ('', ''))
                 self._channels[key] = Channel(topic, msgtype, encoding, *definition)
                 self.counts[self._channels[key]] += 0
+                if len(self._channels) > _MAX_TOPICS:
+                    raise BudgetError(f'it has more than {_MAX_TOPICS} topics')
             query = 'SELECT topic_id, count(*), min(timestamp) FROM messages GROUP BY topic_id'
             for key, count, start in _rows(database, query, (int, int, int), budget):
                 if key in self._channels:
@@ -70,6 +73,8 @@ class SqliteFile:
         with faults_told(self.name), _connected(self._path) as database:
             for key, time, data in _rows(database, query, (int, int, bytes), budget):
                 budget.spend(unpacked=len(data))
+                if time < 0:
+                    raise sqlite3.DataError('a message before 1970')
                 yield StoredMessage(time, self._channels[key], data)
 
 

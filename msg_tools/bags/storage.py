@@ -8,11 +8,10 @@ from contextlib import contextmanager
 from typing import NamedTuple, Protocol
 
 from msg_tools.bags.bag_metadata import BagError, reason
-from msg_tools.files.budget import Budget
+from msg_tools.files.budget import Budget, BudgetError
 
 # Bytes of a message or a chunk: the largest images that are read have 2**26 pixels, uncompressed.
 LARGEST = 2**28
-MAX_TOPICS = 2**16  # of a file
 NEVER = 2**64  # later than any log time
 
 
@@ -76,7 +75,7 @@ def faults_told(name: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise BagError(f'{name} can not be read: {reason(error)}') from error
-    except ValueError as error:
+    except BudgetError as error:
         raise BagError(f'{name} is refused: {reason(error)}') from error
     except Exception as error:
         raise BagError(f'{name} is damaged: {type(error).__name__}: {reason(error)}') from error

@@ -23,7 +23,7 @@ from msg_tools.messages.message_types import typestore
 
 _HEADER_BYTES = 4
 # Memory that a value takes, and what all those of one message may take.
-_VALUE_BYTES, _MAX_VALUES = 64, 2**21
+_VALUE_BYTES, _MAX_VALUES = 64, 2**20
 
 
 def serialise(message: Any) -> bytes:
@@ -94,31 +94,33 @@ class ValueBudget:
         """
         extent = self._extents.get((msgtype, types))
         if extent is None:
-            extent = self._extents[msgtype, types] = _extent(Nodetype.NAME, msgtype, types)
+            extent = self._extents[msgtype, types] = _extent((Nodetype.NAME, msgtype), types)
         bound = extent[0] + int(extent[2] * len(body))
         if bound <= _MAX_VALUES:
             with suppress(ValueError):  # the values are counted
                 self._bounds.spend(unpacked=_VALUE_BYTES * bound)
                 return
         values = _Values(body, '<I' if little else '>I', types)
-        values.skip(Nodetype.NAME, msgtype, 0)
+        values.skip((Nodetype.NAME, msgtype), 0)
         self._counts.spend(unpacked=_VALUE_BYTES * values.count)
 
 
-def _extent(kind: Nodetype, detail: Any, types: Typestore) -> tuple[int, int, float]:
+def _extent(description: Any, types: Typestore) -> tuple[int, int, float]:
     """Values and bytes of a field with empty sequences, and values for a byte of its sequences."""
+    kind, detail = description
     if kind == Nodetype.BASE:
         return 1, SIZEMAP.get(detail[0], 4), 0.0
     if kind == Nodetype.NAME:
-        fields = [_extent(*each, types) for _, each in types.fielddefs[detail][1]]
-        values, sizes, densities = zip(*fields, strict=True)
+        fields: Any = types.fielddefs[detail][1]
+        extents = [_extent(each, types) for _, each in fields]
+        values, sizes, densities = (list(each) for each in zip(*extents, strict=True))
         return 1 + sum(values), sum(sizes), max(densities)
     one, count = detail
-    values, size, density = _extent(*one, types)
+    one_values, size, density = _extent(one, types)
     numbers = one[1][0] in SIZEMAP
     if kind == Nodetype.ARRAY:
-        return 1 if numbers else 1 + count * values, count * size, density
-    return 1, 4, 0.0 if numbers else max(density, values / size)
+        return 1 if numbers else 1 + count * one_values, count * size, density
+    return 1, 4, 0.0 if numbers else max(density, one_values / size)
 
 
 class _Values:
@@ -132,7 +134,7 @@ class _Values:
         self._body, self._length, self._types = body, length, types
         self.count = 0
 
-    def skip(self, kind: Nodetype, detail: Any, at: int) -> int:
+    def skip(self, description: Any, at: int) -> int:
         """Counts a value, given as `rosbags` describes fields, and returns where it ends.
 
         Raises:
@@ -142,19 +144,21 @@ class _Values:
         self.count += 1
         if self.count > _MAX_VALUES:
             raise ValueError(f'it has more than {_MAX_VALUES} values')
+        kind, detail = description
         if kind == Nodetype.NAME:
-            for _, each in self._types.fielddefs[detail][1]:
-                at = self.skip(*each, at)
+            fields: Any = self._types.fielddefs[detail][1]
+            for _, each in fields:
+                at = self.skip(each, at)
             return at
         count = 1
         if kind != Nodetype.BASE:
-            sequence = kind == Nodetype.SEQUENCE
-            (kind, detail), count = detail
-            if sequence:
+            one, count = detail
+            detail = one[1]
+            if kind == Nodetype.SEQUENCE:
                 count, at = self._number(at)
             if detail[0] not in SIZEMAP:
                 for _ in range(count):
-                    at = self.skip(kind, detail, at)
+                    at = self.skip(one, at)
                 return at
         if detail[0] == 'string':
             length, at = self._number(at)

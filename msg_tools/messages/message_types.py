@@ -90,7 +90,9 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
                 raise ValueError(f'its {encoding} definition can not be parsed: {error}') from error
     if msgtype not in types and msgtype not in known.fielddefs:
         raise ValueError('the type is not known, and the bag does not define it')
-    changed = {name: ([], types[name]) for name in types if not _same_fields(name, types, known)}
+    changed: Any = {
+        name: ([], types[name]) for name in types if not _same_fields(name, types, known)
+    }
     if not changed:
         return known
     check_types({name: types[name] for name in changed}, known.fielddefs)
