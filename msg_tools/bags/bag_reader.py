@@ -320,9 +320,9 @@ class BagReader(AbstractContextManager['BagReader']):
             raise BagError(f'{self.path} is neither a file nor a folder')
         paths = [self.path / name for name in read_file_names(self.path)]
         for path in paths:
-            if not path.is_file():
+            if not os.path.isfile(path):  # noqa: PTH113 - False, too, for names that can not be
                 raise BagError(
-                    f'{self.path}: the file {path.name}, which its metadata names, is missing'
+                    f'{self.path}: the file {path.name[:100]}, which its metadata names, is missing'
                 )
         return paths
 

@@ -50,6 +50,7 @@ _DESCRIPTIONS: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: ChannelR
 # and of the chunks that are open at a time; memory for each byte of a schema or channel.
 _MAX_SUMMARY, _MAX_DESCRIPTION, _MAX_RUN, _MAX_OPEN = 2**25, 2**20, 2**20, 2**28 + 2**27
 _MEMORY = 16
+_SKIPPED = 8  # records that one counts for that is passed over: most of them are larger
 
 
 @dataclass
@@ -318,6 +319,7 @@ def _pieces(file: _File) -> Iterator[tuple[int, int, bool]]:
             if end > file.size:
                 raise EndOfFile(f'{end - file.size} bytes are missing after {file.size}')
             bare = opcode == Opcode.MESSAGE or opcode in _DESCRIPTIONS
+            file.budget.spend(records=0 if bare else _SKIPPED)
             if run < at and (not bare or end - run > _MAX_RUN):
                 yield run, at, True
                 run = at

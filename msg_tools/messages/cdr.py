@@ -19,6 +19,7 @@ from rosbags.serde.utils import SIZEMAP
 from rosbags.typesys.store import Typestore
 
 from msg_tools.files.budget import Budget
+from msg_tools.messages.definitions import Extent, extent_of
 from msg_tools.messages.message_types import typestore
 
 _HEADER_BYTES = 4
@@ -80,7 +81,7 @@ class ValueBudget:
 
     def __init__(self, size: int) -> None:
         self._bounds, self._counts = Budget(size), Budget(size)
-        self._extents: dict[tuple[str, Typestore], tuple[int, int, float]] = {}
+        self._extents: dict[Typestore, dict[str, Extent]] = {}
 
     def spend(self, body: memoryview, msgtype: str, types: Typestore, *, little: bool) -> None:
         """Takes what a message needs.
@@ -92,10 +93,9 @@ class ValueBudget:
             Exception: of many kinds, where the bytes are not a message of this type, or too many
                 values; one line.
         """
-        extent = self._extents.get((msgtype, types))
-        if extent is None:
-            extent = self._extents[msgtype, types] = _extent((Nodetype.NAME, msgtype), types)
-        bound = extent[0] + int(extent[2] * len(body))
+        extents = self._extents.setdefault(types, {})
+        extent = extent_of((Nodetype.NAME, msgtype), types.fielddefs, extents)
+        bound = extent.values + int(extent.density * len(body))
         if bound <= _MAX_VALUES:
             with suppress(ValueError):  # the values are counted
                 self._bounds.spend(unpacked=_VALUE_BYTES * bound)
@@ -103,24 +103,6 @@ class ValueBudget:
         values = _Values(body, '<I' if little else '>I', types)
         values.skip((Nodetype.NAME, msgtype), 0)
         self._counts.spend(unpacked=_VALUE_BYTES * values.count)
-
-
-def _extent(description: Any, types: Typestore) -> tuple[int, int, float]:
-    """Values and bytes of a field with empty sequences, and values for a byte of its sequences."""
-    kind, detail = description
-    if kind == Nodetype.BASE:
-        return 1, SIZEMAP.get(detail[0], 4), 0.0
-    if kind == Nodetype.NAME:
-        fields: Any = types.fielddefs[detail][1]
-        extents = [_extent(each, types) for _, each in fields]
-        values, sizes, densities = (list(each) for each in zip(*extents, strict=True))
-        return 1 + sum(values), sum(sizes), max(densities)
-    one, count = detail
-    one_values, size, density = _extent(one, types)
-    numbers = one[1][0] in SIZEMAP
-    if kind == Nodetype.ARRAY:
-        return 1 if numbers else 1 + count * one_values, count * size, density
-    return 1, 4, 0.0 if numbers else max(density, one_values / size)
 
 
 class _Values:

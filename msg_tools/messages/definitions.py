@@ -8,14 +8,15 @@ refused before code is generated from it.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 from rosbags.interfaces import Nodetype
+from rosbags.serde.utils import SIZEMAP
 
-# A definition may have so many bytes, fields, values in fixed arrays, levels of nesting, and
-# strings or messages in fixed arrays, for each of which code is generated.
-MAX_BYTES, MAX_FIELDS, MAX_VALUES, MAX_LEVELS, MAX_UNROLLED = 2**16, 1000, 100_000, 20, 1000
+# A definition may have so many characters, fields, levels of nesting, bytes in fixed arrays of
+# numbers, and strings or messages in fixed arrays, for each of which code is generated.
+MAX_BYTES, MAX_FIELDS, MAX_LEVELS, MAX_SIZE, MAX_UNROLLED = 2**16, 1000, 20, 800_000, 250
 
 # Types by name: name and description of each field, as `rosbags` has them.
 Types = dict[str, list[tuple[str, Any]]]
@@ -28,9 +29,10 @@ _MSG_FIELD = re.compile(
 )
 # Stands before each of the IDL files that a bag strings together.
 _IDL_HEADER = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
-# Space, comments and strings are no tokens.
+# Space, comments, preprocessor lines and annotations are no tokens.
+_STRING = r'"(?:[^"\\]|\\.?)*(?:"|\Z)'
 _IDL_TOKEN = re.compile(
-    r'\s+|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)|"(?:[^"\\]|\\.?)*(?:"|\Z)|(@?[\w:.]+|.)',
+    rf'\s+|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)|@\w+\s*(?:\((?:[^()"]|{_STRING})*\))?|([\w:.]+|.)',
     re.DOTALL | re.ASCII,
 )
 _IDL_FIELD = re.compile(
@@ -38,10 +40,6 @@ _IDL_FIELD = re.compile(
     r'(?: \[ (\w+) \])?',
     re.ASCII,
 )
-_NUMBERS = {
-    *('bool', 'byte', 'char', 'float32', 'float64'),
-    *(f'{sign}int{bits}' for sign in ('', 'u') for bits in (8, 16, 32, 64)),
-}
 # The field that ROS 2 gives a message without fields.
 _NO_FIELDS = 'structure_needs_at_least_one_member', (Nodetype.BASE, ('uint8', 0))
 _ALIASES = {
@@ -95,43 +93,67 @@ def check_types(types: Types, known: Mapping[str, Any]) -> None:
     arrays = [detail for kind, detail in fields if kind == Nodetype.ARRAY]
     if not all(count for _, count in arrays):
         raise ValueError('its definition has an array of length 0')
-    if sum(count for (_, detail), count in arrays if detail[0] not in _NUMBERS) > MAX_UNROLLED:
+    if sum(count for (_, detail), count in arrays if detail[0] not in SIZEMAP) > MAX_UNROLLED:
         raise ValueError(f'its definition has more than {MAX_UNROLLED} messages in fixed arrays')
-    found: dict[str, tuple[int, int]] = {}
+    extents: dict[str, Extent] = {}
     everything = {**known, **{name: ((), types[name]) for name in types}}
     for name in types:
         if not _TYPE_NAME.fullmatch(name):
             raise ValueError(f'its definition has a type named {name[:40]!r}')
-        _extent(name, everything, found, 1)
+        if extent_of((Nodetype.NAME, name), everything, extents).size > MAX_SIZE:
+            raise ValueError(f'its definition has fixed arrays of more than {MAX_SIZE} bytes')
 
 
-def _extent(
-    name: str, types: Mapping[str, Any], found: dict[str, tuple[int, int]], level: int
-) -> tuple[int, int]:
-    """Number of values of a type whose sequences are empty, and of its levels.
+class Extent(NamedTuple):
+    """What a field takes at least, with all its sequences empty.
+
+    Attributes:
+        values: for which objects are made; an array of numbers is one.
+        size: bytes.
+        density: values for a byte, at most, in its sequences.
+        levels: of messages in messages.
+    """
+
+    values: int
+    size: int
+    density: float = 0.0
+    levels: int = 0
+
+
+def extent_of(
+    description: Any, types: Mapping[str, Any], extents: dict[str, Extent], level: int = 0
+) -> Extent:
+    """Extent of a field, given as `rosbags` describes it.
 
     Args:
-        found: those of the types so far.
-        level: that the type has in another one.
+        types: by name; the fields of each come second.
+        extents: of types, as far as they are known; more are added.
+        level: of messages around the field.
+
+    Raises:
+        ValueError: a type that is not known, or that is nested too deeply, as in itself.
     """
-    if name not in types:
-        raise ValueError(f'{name[:40]} is not defined')
-    if name not in found and level <= MAX_LEVELS:
-        values, levels = 1, 1
-        for _, (kind, detail) in types[name][1]:
-            array = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE)
-            (kind, detail), count = detail if array else ((kind, detail), 1)
-            one = 1
-            if kind == Nodetype.NAME:
-                one, below = _extent(detail, types, found, level + 1)
-                levels = max(levels, 1 + below)
-            values += max(count, 1) * one
-        found[name] = values, levels
-    if name not in found or level + found[name][1] - 1 > MAX_LEVELS:
-        raise ValueError(f'its definition is nested deeper than {MAX_LEVELS} levels')
-    if found[name][0] > MAX_VALUES:
-        raise ValueError(f'its definition has more than {MAX_VALUES} values in fixed arrays')
-    return found[name]
+    kind, detail = description
+    if kind == Nodetype.BASE:
+        return Extent(1, SIZEMAP.get(detail[0], 5))
+    if kind == Nodetype.NAME:
+        if detail not in extents and level < MAX_LEVELS:
+            if detail not in types:
+                raise ValueError(f'{detail[:40]} is not defined')
+            fields = [extent_of(each, types, extents, level + 1) for _, each in types[detail][1]]
+            values, sizes, densities, levels = zip(*fields, strict=True)
+            extents[detail] = Extent(1 + sum(values), sum(sizes), max(densities), 1 + max(levels))
+        if detail not in extents or level + extents[detail].levels > MAX_LEVELS:
+            raise ValueError(f'its definition is nested deeper than {MAX_LEVELS} levels')
+        return extents[detail]
+    element, count = detail
+    one = extent_of(element, types, extents, level)
+    number = element[1][0] in SIZEMAP
+    if kind == Nodetype.ARRAY:
+        values = 1 if number else 1 + count * one.values
+        return one._replace(values=values, size=count * one.size)
+    density = 0.0 if number else max(one.density, one.values / one.size)
+    return Extent(1, 4, density, one.levels)
 
 
 def _types_of_msg(text: str, msgtype: str) -> Types:
@@ -159,7 +181,7 @@ def _types_of_idl(text: str) -> Types:
     lengths: dict[str, str] = {}
     scope: list[str] = []
     words: list[str] = []
-    for token in _idl_tokens(text):
+    for token in filter(None, _IDL_TOKEN.findall(text)):
         if token not in '{};':
             words.append(token)
             continue
@@ -185,22 +207,6 @@ def _types_of_idl(text: str) -> Types:
     if words or scope:
         raise ValueError('its end is missing')
     return types
-
-
-def _idl_tokens(text: str) -> Iterator[str]:
-    """Words and signs of an IDL text, without annotations."""
-    level, before = 0, ''
-    for match in _IDL_TOKEN.finditer(text):
-        token = match[1]
-        if not token:
-            continue
-        if token == '(' and (level or before[0] == '@'):
-            level += 1
-        if not level and token[0] != '@':
-            yield token
-        if token == ')' and level:
-            level -= 1
-        before = token
 
 
 def _idl_field(
@@ -237,7 +243,7 @@ def _described(
         longest: number of characters that a string may have.
         count: length of an array, or longest one of a sequence; None: a single value.
     """
-    if kind == 'string' or kind in _NUMBERS:
+    if kind == 'string' or kind in SIZEMAP:
         one: Any = Nodetype.BASE, (kind, int(longest or 0))
     else:
         one = Nodetype.NAME, _full_name(kind, owner)

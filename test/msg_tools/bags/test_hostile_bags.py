@@ -125,6 +125,12 @@ def test_a_chunk_of_nothing_but_empty_records(tmp_path):
     assert 'is refused: it has more than 10' in error_of(path, peak=2**24)
 
 
+def test_a_file_of_nothing_but_empty_records(tmp_path):
+    path = tmp_path / 'records.mcap'
+    path.write_bytes(MAGIC + HEADER + record(0x80, b'') * 200_000 + END)
+    assert 'is refused: it has more than' in error_of(path, peak=2**20)
+
+
 def test_a_summary_that_lists_one_chunk_many_times(tmp_path):
     path = tmp_path / 'again.mcap'
     data = described() + chunk(message(string('once')) + record(0x80, ZEROS))
@@ -363,6 +369,8 @@ def test_a_database_is_opened_for_reading_alone_and_its_steps_are_counted(tmp_pa
         ),
         ('rosbag2_bagfile_information: {relative_file_paths: [pipe]}', 'pipe, which its metadata'),
         ('rosbag2_bagfile_information: {relative_file_paths: [folder]}', 'folder, which its'),
+        (f'rosbag2_bagfile_information: {{relative_file_paths: [{"x" * 5000}]}}', 'is missing'),
+        ('rosbag2_bagfile_information: {relative_file_paths: ["a\\0b"]}', 'is missing'),
     ],
 )
 def test_metadata_from_outside(tmp_path, metadata, error):
