@@ -141,7 +141,8 @@ def extent_of(
             if detail not in types:
                 raise ValueError(f'{detail[:40]} is not defined')
             fields = [extent_of(each, types, extents, level + 1) for _, each in types[detail][1]]
-            values, sizes, densities, levels = zip(*fields, strict=True)
+            columns = zip(*fields, strict=True)
+            values, sizes, densities, levels = (list(each) for each in columns)
             extents[detail] = Extent(1 + sum(values), sum(sizes), max(densities), 1 + max(levels))
         if detail not in extents or level + extents[detail].levels > MAX_LEVELS:
             raise ValueError(f'its definition is nested deeper than {MAX_LEVELS} levels')
@@ -150,8 +151,8 @@ def extent_of(
     one = extent_of(element, types, extents, level)
     number = element[1][0] in SIZEMAP
     if kind == Nodetype.ARRAY:
-        values = 1 if number else 1 + count * one.values
-        return one._replace(values=values, size=count * one.size)
+        made = 1 if number else 1 + count * one.values
+        return one._replace(values=made, size=count * one.size)
     density = 0.0 if number else max(one.density, one.values / one.size)
     return Extent(1, 4, density, one.levels)
 
