@@ -29,10 +29,11 @@ _MSG_FIELD = re.compile(
 )
 # Stands before each of the IDL files that a bag strings together.
 _IDL_HEADER = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
-# Space, comments, preprocessor lines and annotations are no tokens.
+# Space, comments, preprocessor lines, strings and annotations are no tokens.
 _STRING = r'"(?:[^"\\]|\\.?)*(?:"|\Z)'
 _IDL_TOKEN = re.compile(
-    rf'\s+|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)|@\w+\s*(?:\((?:[^()"]|{_STRING})*\))?|([\w:.]+|.)',
+    rf'\s+|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)|{_STRING}|@\w+\s*(?:\((?:[^()"]|{_STRING})*\))?|'
+    r'([\w:.]+|.)',
     re.DOTALL | re.ASCII,
 )
 _IDL_FIELD = re.compile(
@@ -193,7 +194,7 @@ def _types_of_idl(text: str) -> Types:
             scope.append(words[1])
             if words[0] == 'struct':
                 types['/'.join(scope)] = []
-        elif words and words[0] == 'const':
+        elif len(words) > 3 and words[0] == 'const':
             lengths[words[-3]] = words[-1]
         elif words and words[0] == 'typedef':
             name, kind = _idl_field(words[1:], f'{owner}/', named, lengths)

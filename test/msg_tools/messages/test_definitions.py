@@ -67,7 +67,8 @@ def test_idl_definitions():
     header = '=' * 80 + '\nIDL: a/msg/X\n#include "a/msg/Y.idl"\n'
     assert types_of_definition(header + IDL, 'ros2idl', X) == wanted
     check_types(types_of_definition(IDL, 'ros2idl', X), {})
-    text = 'module a { const long N = 4; struct X { string<9> x; long y[N]; sequence<string<7>> z; }; };'
+    text = 'const long N = 4; struct X { string<9> x; long y[N]; sequence<string<7>> z; };'
+    text = f'module a {{ {text} }};'
     assert types_of_definition(text, 'ros2idl', X) == {
         'a/X': [
             ('x', (1, ('string', 9))),
