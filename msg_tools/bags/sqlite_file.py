@@ -20,7 +20,7 @@ from msg_tools.messages.definitions import MAX_BYTES
 MAGIC = b'SQLite format 3\x00'
 
 # Steps of the virtual machine of SQLite for a file, and more for each of its bytes: a row, which
-# has more than ten bytes, takes about thirty. Bytes that SQLite may take for all its work.
+# has more than ten bytes, takes about thirty. Bytes that SQLite may take in the whole process.
 _STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE, _MEMORY = 10**7, 4, 10**5, 2**29
 _MAX_TOPICS = 2**16  # as in an MCAP file
 
