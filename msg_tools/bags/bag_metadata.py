@@ -9,12 +9,13 @@ import yaml
 
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line, one_line
+from msg_tools.files.plain_yaml import load_plain_yaml
 
 FILE_NAME = 'metadata.yaml'
 # Suffixes of the other files of a bag.
 SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 VERSION = 9
-MAX_BYTES = 2**24
+MAX_BYTES = 2**19
 
 # No deadline, no lifespan: rmw writes this for an infinite duration.
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
@@ -65,8 +66,8 @@ def read_file_names(folder: Path) -> list[str]:
     except ValueError as error:
         raise BagError(f'{path}: {error}') from error
     try:
-        document = yaml.safe_load(content.decode('utf-8'))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        document = load_plain_yaml(content.decode('utf-8'))
+    except ValueError as error:
         raise BagError(f'{path} is not YAML: {reason(error)}') from error
     information = None
     if isinstance(document, dict):
@@ -79,7 +80,10 @@ def read_file_names(folder: Path) -> list[str]:
     if not names:
         raise BagError(f'{path} names no file: the bag is empty')
     # The first versions wrote the paths relative to the parent of the folder.
-    return [PurePosixPath(name).name for name in names]
+    names = [PurePosixPath(name).name for name in names]
+    if len(set(names)) < len(names):
+        raise BagError(f'{path} names a file twice')
+    return names
 
 
 def quality_of_service(latched: bool) -> list[dict[str, Any]]:

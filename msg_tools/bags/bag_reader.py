@@ -17,33 +17,41 @@ import heapq
 import logging
 import os
 import stat
+import sys
 import tempfile
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
+from itertools import islice
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import zstandard
 from rosbags.typesys.store import Typestore
 
 from msg_tools.bags.bag_metadata import BagError, read_file_names, reason
-from msg_tools.bags.storage import Channel, McapFile, SqliteFile, StoredMessage
-from msg_tools.messages.cdr import deserialise
+from msg_tools.bags.mcap_file import MAGIC as _MCAP_MAGIC
+from msg_tools.bags.mcap_file import McapFile
+from msg_tools.bags.sqlite_file import MAGIC as _SQLITE_MAGIC
+from msg_tools.bags.sqlite_file import SqliteFile
+from msg_tools.bags.storage import LARGEST, BagFile, Channel, StoredMessage
+from msg_tools.files.budget import Budget, BudgetError
+from msg_tools.messages.cdr import ValueBudget, deserialise
 from msg_tools.messages.message_types import typestore, typestore_of_definition
 
 _log = logging.getLogger(__name__)
 
 Content = TypeVar('Content')
 
-_SQLITE_MAGIC = b'SQLite format 3\x00'
-_MCAP_MAGIC = b'\x89MCAP0\r\n'
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 _OURS = 'hmt_msgs/'
-_NEVER = 2**64  # later than any log time
+# Definitions of the messages of one topic, and names in a line.
+_MOST_DEFINITIONS, _MOST_NAMES = 4, 20
+_PIECE = 2**20
 
 
 @dataclass(frozen=True)
@@ -130,14 +138,19 @@ class BagReader(AbstractContextManager['BagReader']):
         self.path = Path(path)
         self._typestores: dict[Channel, Typestore] = {}
         self._scratch = ExitStack()
+        paths = self._storage_paths()
+        self._size = sum(file.stat().st_size for file in paths)
+        budget = Budget(self._size)
         try:
-            self._files = [self._open_file(file) for file in self._storage_paths()]
+            self._files = [self._open_file(file, budget) for file in paths]
         except BaseException:
             self.close()
             raise
         self.topics: dict[str, Topic] = {}
+        self._channels: defaultdict[str, set[Channel]] = defaultdict(set)  # by topic
         for file in self._files:
             for channel, count in file.counts.items():
+                self._channels[channel.topic].add(channel)
                 known = self.topics.get(channel.topic)
                 self.topics[channel.topic] = Topic(
                     channel.topic,
@@ -181,9 +194,7 @@ class BagReader(AbstractContextManager['BagReader']):
         if len(inside) == 1:
             return self.topics[inside[0]]
         if inside:
-            raise BagError(
-                f'{self.path} has several topics {name}: name one of {", ".join(inside)}'
-            )
+            raise BagError(f'{self.path} has several topics {name}: name one of {_listed(inside)}')
         raise BagError(f'{self.path} has no topic {name}; it has {self._topic_names()}')
 
     def find_topic(self, msgtypes: Iterable[str], name: str | None = None) -> Topic:
@@ -209,7 +220,7 @@ class BagReader(AbstractContextManager['BagReader']):
             found = [topic for topic in self.topics.values() if topic.msgtype in wanted]
             used = [topic for topic in found if topic.message_count]
             if len(used) > 1:
-                names = ', '.join(topic.name for topic in used)
+                names = _listed([topic.name for topic in used])
                 raise BagError(f'{self.path} has several topics of {short}: name one of {names}')
             if not found:
                 raise BagError(
@@ -234,20 +245,21 @@ class BagReader(AbstractContextManager['BagReader']):
             return self._merged(self.topics)
         names = {self.topic(name).name for name in topics}
         for name in names:
-            channels = {
-                (_full_name(channel.msgtype), channel.encoding)
-                for file in self._files
-                for channel in file.counts
-                if channel.topic == name
-            }
-            if len(channels) > 1:
-                kinds = ' and '.join(sorted(' as '.join(kind) for kind in channels))
-                raise BagError(f'{self.path}: topic {name} has messages of several kinds: {kinds}')
+            channels = self._channels[name]
+            kinds = {f'{_full_name(x.msgtype)} as {x.encoding}' for x in channels}
+            if len(kinds) > 1:
+                raise BagError(
+                    f'{self.path}: topic {name} has messages of several kinds: '
+                    f'{" and ".join(sorted(kinds)[:_MOST_NAMES])}'
+                )
+            if len(channels) > _MOST_DEFINITIONS:
+                raise BagError(f'{self.path}: topic {name} has {len(channels)} definitions')
             self._check_encoding(name, self.topics[name].encoding)
         return self._merged(names)
 
     def _merged(self, names: Collection[str]) -> Iterator[BagMessage]:
-        found = (_from_its_start(file, names) for file in self._files)
+        budget, values = Budget(self._size), ValueBudget(self._size)
+        found = (_from_its_start(file, names, budget) for file in self._files)
         for stored in heapq.merge(*found, key=attrgetter('log_time')):
             if stored.channel is not None:
                 yield BagMessage(
@@ -256,10 +268,12 @@ class BagReader(AbstractContextManager['BagReader']):
                     _full_name(stored.channel.msgtype),
                     stored.log_time,
                     stored.data,
-                    partial(self._deserialise, stored.channel),
+                    partial(self._deserialise, stored.channel, budget, values),
                 )
 
-    def _deserialise(self, channel: Channel, stored: BagMessage) -> Any:
+    def _deserialise(
+        self, channel: Channel, budget: Budget, values: ValueBudget, stored: BagMessage
+    ) -> Any:
         self._check_encoding(stored.topic, channel.encoding)
         what = f'{self.path}: message of {stored.topic} at {stored.log_time_ns} ns'
         data = stored.data
@@ -275,8 +289,8 @@ class BagReader(AbstractContextManager['BagReader']):
                 raise ValueError('it was recorded with another definition of this type')
             # Bags with the compression mode "message". No CDR message starts like this.
             if data[:4] == _ZSTD_MAGIC:
-                data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
-            return deserialise(data, stored.msgtype, store)
+                data = b''.join(_decompressed(data, budget, LARGEST))
+            return deserialise(data, stored.msgtype, store, values)
         except Exception as error:
             # Bytes from outside meet generated code here, which does not say what it may raise.
             raise BagError(
@@ -291,7 +305,7 @@ class BagReader(AbstractContextManager['BagReader']):
             )
 
     def _topic_names(self) -> str:
-        return ', '.join(self.topics) or 'none'
+        return _listed(self.topics) or 'none'
 
     # Files
 
@@ -306,27 +320,29 @@ class BagReader(AbstractContextManager['BagReader']):
             raise BagError(f'{self.path} is neither a file nor a folder')
         paths = [self.path / name for name in read_file_names(self.path)]
         for path in paths:
-            if not path.is_file():
+            if not os.path.isfile(path):  # noqa: PTH113 - False, too, for names that can not be
                 raise BagError(
-                    f'{self.path}: the file {path.name}, which its metadata names, is missing'
+                    f'{self.path}: the file {path.name[:100]}, which its metadata names, is missing'
                 )
         return paths
 
-    def _open_file(self, path: Path) -> SqliteFile | McapFile:
+    def _open_file(self, path: Path, budget: Budget) -> BagFile:
         name = str(path)
         try:
             magic = _first_bytes(path)
             if magic.startswith(_ZSTD_MAGIC):
-                path = self._decompressed(path)
+                path = self._decompressed(path, budget)
                 magic = _first_bytes(path)
         except OSError as error:
             raise BagError(f'{name} can not be read: {reason(error)}') from error
+        except BudgetError as error:
+            raise BagError(f'{name} is refused: {reason(error)}') from error
         except zstandard.ZstdError as error:
             raise BagError(f'{name} is damaged: {reason(error)}') from error
         if magic == _SQLITE_MAGIC:
-            return SqliteFile(path, name)
+            return SqliteFile(path, name, budget)
         if magic.startswith(_MCAP_MAGIC):
-            return McapFile(path, name)
+            return McapFile(path, name, budget)
         if magic.startswith(b'#ROSBAG V'):
             raise BagError(
                 f'{name} is a bag of ROS 1, wanted one of ROS 2: convert it with '
@@ -335,12 +351,12 @@ class BagReader(AbstractContextManager['BagReader']):
         seen = f'starts with {magic!r}' if magic else 'is empty'
         raise BagError(f'{name} is not a bag: it {seen}, wanted an MCAP or SQLite recording')
 
-    def _decompressed(self, path: Path) -> Path:
+    def _decompressed(self, path: Path, budget: Budget) -> Path:
         """The content of a zstd file, as a file that lives as long as the reader."""
         folder = self._scratch.enter_context(tempfile.TemporaryDirectory(prefix='bag_reader.'))
         target = Path(folder) / path.stem
         with path.open('rb') as compressed, target.open('wb') as plain:
-            zstandard.ZstdDecompressor().copy_stream(compressed, plain)
+            plain.writelines(_decompressed(compressed, budget, sys.maxsize))
         return target
 
 
@@ -359,12 +375,36 @@ def _first_bytes(path: Path) -> bytes:
         return file.read(len(_SQLITE_MAGIC))
 
 
+def _decompressed(packed: bytes | BinaryIO, budget: Budget, largest: int) -> Iterator[bytes]:
+    """Content of zstd frames, in pieces; each is spent before it is used.
+
+    Args:
+        largest: bytes that it may have.
+
+    Raises:
+        BudgetError: it is larger than that, or than the budget allows.
+    """
+    with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True) as stream:
+        while piece := stream.read(_PIECE):
+            budget.spend(unpacked=len(piece))
+            largest -= len(piece)
+            if largest < 0:
+                raise BudgetError('its content is too large')
+            yield piece
+
+
+def _listed(names: Collection[str]) -> str:
+    """Names for a message."""
+    more = f' and {len(names) - _MOST_NAMES} more' if len(names) > _MOST_NAMES else ''
+    return ', '.join(islice(names, _MOST_NAMES)) + more
+
+
 def _from_its_start(
-    file: SqliteFile | McapFile, topics: Collection[str]
+    file: BagFile, topics: Collection[str], budget: Budget
 ) -> Iterator[StoredMessage]:
     """A mark without a channel, then the messages: no file is opened before its time has come."""
-    yield StoredMessage(_NEVER if file.start is None else file.start, None, b'')
-    yield from file.messages(topics)
+    yield StoredMessage(file.start, None, b'')
+    yield from file.messages(topics, budget)
 
 
 def _full_name(msgtype: str) -> str:

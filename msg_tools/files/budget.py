@@ -14,6 +14,10 @@ FREE_BYTES, BYTES_PER_BYTE = 2**26, 100
 FREE_RECORDS, BYTES_PER_RECORD = 100_000, 4
 
 
+class BudgetError(ValueError):
+    """More than a file may take, in one line; the file need not be damaged."""
+
+
 class Budget:
     """Bytes and records that are left to the reader of one file.
 
@@ -34,11 +38,11 @@ class Budget:
             records: messages, rows or nodes that are made.
 
         Raises:
-            ValueError: that much is not left; one line.
+            BudgetError: that much is not left.
         """
         self._bytes -= unpacked
         self._records -= records
         if self._bytes < 0:
-            raise ValueError(f'it unpacks to more than {self._limits[0]} bytes')
+            raise BudgetError(f'it unpacks to more than {self._limits[0]} bytes')
         if self._records < 0:
-            raise ValueError(f'it has more than {self._limits[1]} records')
+            raise BudgetError(f'it has more than {self._limits[1]} records')

@@ -12,7 +12,6 @@ functions that turn arrays into messages take a `MessageFactory` and work for bo
 from __future__ import annotations
 
 import array
-import re
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from importlib import resources
@@ -22,17 +21,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
+
+from msg_tools.messages.definitions import Types, check_types, types_of_definition
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
-
-# Stands before each of the IDL files that a bag strings together.
-_IDL_HEADER = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
-
-# The field that ROS 2 gives a message without fields.
-_NO_FIELDS = 'uint8 structure_needs_at_least_one_member'
 
 
 @cache
@@ -86,46 +81,42 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
     if not msgtype:
         raise ValueError('the bag does not name the type')
     known = typestore()
-    types: Typesdict = {}
-    if encoding == 'ros2msg' and not definition.strip() and msgtype not in known.fielddefs:
-        definition = _NO_FIELDS
-    if definition.strip():
+    types: Types = {}
+    if definition.strip() or msgtype not in known.fielddefs:
         try:
-            if encoding == 'ros2msg':
-                types = get_types_from_msg(definition, msgtype)
-            elif encoding == 'ros2idl':
-                for part in _IDL_HEADER.split(definition):
-                    if part.strip():
-                        types.update(get_types_from_idl(part))
-        except Exception as error:
-            # The parser meets any text here, and does not say what it may raise.
+            types = types_of_definition(definition, encoding, msgtype)
+        except ValueError as error:
             if msgtype not in known.fielddefs:
-                raise ValueError(f'its {encoding} definition can not be parsed') from error
+                raise ValueError(f'its {encoding} definition can not be parsed: {error}') from error
     if msgtype not in types and msgtype not in known.fielddefs:
         raise ValueError('the type is not known, and the bag does not define it')
-    changed = {name for name in types if not _same_fields(name, types, known)}
+    changed: Any = {
+        name: ([], types[name]) for name in types if not _same_fields(name, types, known)
+    }
     if not changed:
         return known
+    check_types({name: types[name] for name in changed}, known.fielddefs)
     own = Typestore()
     own.fielddefs.update(
         {name: fields for name, fields in known.fielddefs.items() if name not in changed}
     )
     own.types.update({name: cls for name, cls in known.types.items() if name not in changed})
     try:
-        own.register({name: types[name] for name in changed})
+        own.register(changed)
     except Exception as error:
+        # The generator of code does not say what it may raise.
         raise ValueError(f'its {encoding} definition can not be used') from error
     return own
 
 
-def _same_fields(name: str, types: Typesdict, known: Typestore) -> bool:
-    """Whether a definition has the fields of the known one; constants do not matter on the wire.
+def _same_fields(name: str, types: Types, known: Typestore) -> bool:
+    """Whether a definition has the fields of the known one.
 
     Names are compared without case: the first ROS 2 releases wrote D, K, R, P in CameraInfo.
     """
     if name not in known.fielddefs:
         return False
-    return [(field.lower(), kind) for field, kind in types[name][1]] == [
+    return [(field.lower(), kind) for field, kind in types[name]] == [
         (field.lower(), kind) for field, kind in known.fielddefs[name][1]
     ]
 

@@ -237,7 +237,7 @@ def test_find_topic(tmp_path, messages):
         (b'\x89MCA', 'is not a bag: it starts with'),
         (b'hello world, not a bag', 'is not a bag: it starts with'),
         (b'#ROSBAG V2.0\n' + bytes(100), 'is a bag of ROS 1'),
-        (b'SQLite format 3\x00' + bytes(100), 'is damaged: ReaderError: '),
+        (b'SQLite format 3\x00' + bytes(100), 'is damaged: DatabaseError: '),
         (zstandard.compress(b'hello world'), 'is not a bag: it starts with'),
         (b'\x28\xb5\x2f\xfd' + b'\xff' * 30, 'is damaged: zstd'),
     ],

@@ -1,0 +1,111 @@
+"""A .db3 file of a bag, the default storage before ROS 2 Iron.
+
+The database is opened read-only, and only its tables are read: views, virtual tables and generated
+columns could compute without an end. What SQLite does for a query is limited by its steps.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from msg_tools.bags.storage import LARGEST, NEVER, Channel, StoredMessage, faults_told
+from msg_tools.files.budget import Budget, BudgetError
+from msg_tools.messages.definitions import MAX_BYTES
+
+MAGIC = b'SQLite format 3\x00'
+
+# Steps of the virtual machine of SQLite for a file, and more for each of its bytes: a row, which
+# has more than ten bytes, takes about thirty. Bytes that SQLite may take in the whole process.
+_STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE, _MEMORY = 10**7, 4, 10**5, 2**29
+_MAX_TOPICS = 2**16  # as in an MCAP file
+
+
+class SqliteFile:
+    """A file of SQLite; see `BagFile`.
+
+    Args:
+        budget: of opening the bag.
+    """
+
+    cut_off = False
+
+    def __init__(self, path: Path, name: str, budget: Budget) -> None:
+        self._path, self.name = path, name
+        self._channels: dict[int, Channel] = {}
+        self.counts: Counter[Channel] = Counter()
+        self.start = NEVER
+        with faults_told(name), _connected(path) as database:
+            definitions = {}
+            if _is_table(database, 'message_definitions'):
+                text = f'substr(encoded_message_definition, 1, {MAX_BYTES + 1})'
+                query = f'SELECT topic_type, encoding, {text} FROM message_definitions'
+                for msgtype, encoding, text in _rows(database, query, (str, str, str), budget):
+                    definitions[msgtype] = encoding, text
+            if not _is_table(database, 'topics') or not _is_table(database, 'messages'):
+                raise sqlite3.DataError('it has no tables topics and messages')
+            query = 'SELECT id, name, type, serialization_format FROM topics ORDER BY id'
+            for key, topic, msgtype, encoding in _rows(
+                database, query, (int, str, str, str), budget
+            ):
+                definition = definitions.get(msgtype, ('', ''))
+                self._channels[key] = Channel(topic, msgtype, encoding, *definition)
+                self.counts[self._channels[key]] += 0
+                if len(self._channels) > _MAX_TOPICS:
+                    raise BudgetError(f'it has more than {_MAX_TOPICS} topics')
+            query = 'SELECT topic_id, count(*), min(timestamp) FROM messages GROUP BY topic_id'
+            for key, count, start in _rows(database, query, (int, int, int), budget):
+                if key in self._channels:
+                    self.counts[self._channels[key]] += count
+                    self.start = min(self.start, start)
+
+    def messages(self, topics: Collection[str], budget: Budget) -> Iterator[StoredMessage]:
+        """See `BagFile.messages`."""
+        wanted = [str(key) for key, channel in self._channels.items() if channel.topic in topics]
+        query = (
+            f'SELECT topic_id, timestamp, CASE WHEN length(data) <= {LARGEST} THEN data END '
+            f'FROM messages WHERE topic_id IN ({", ".join(wanted)}) ORDER BY timestamp, id'
+        )
+        with faults_told(self.name), _connected(self._path) as database:
+            for key, time, data in _rows(database, query, (int, int, bytes), budget):
+                budget.spend(unpacked=len(data))
+                if time < 0:
+                    raise sqlite3.DataError('a message before 1970')
+                yield StoredMessage(time, self._channels[key], data)
+
+
+@contextmanager
+def _connected(path: Path) -> Iterator[sqlite3.Connection]:
+    """A database for reading, whose queries end."""
+    uri = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
+    with closing(sqlite3.connect(uri, uri=True, check_same_thread=False)) as database:
+        steps = iter(range((_STEPS + _STEPS_PER_BYTE * path.stat().st_size) // _STEPS_AT_ONCE))
+        # True, when none is left, interrupts.
+        database.set_progress_handler(lambda: next(steps, None) is None, _STEPS_AT_ONCE)
+        database.execute('PRAGMA trusted_schema = OFF')
+        database.execute(f'PRAGMA hard_heap_limit = {_MEMORY}')
+        yield database
+
+
+def _is_table(database: sqlite3.Connection, name: str) -> bool:
+    """Whether a name is that of a table, all columns of which are stored."""
+    kinds = database.execute(
+        "SELECT type FROM pragma_table_list(?) WHERE schema = 'main'", (name,)
+    ).fetchall()
+    computed = database.execute('SELECT 1 FROM pragma_table_xinfo(?) WHERE hidden', (name,))
+    return kinds == [('table',)] and computed.fetchone() is None
+
+
+def _rows(
+    database: sqlite3.Connection, query: str, kinds: tuple[type, ...], budget: Budget
+) -> Iterator[Any]:
+    """Rows of a query, each of which is spent; SQLite itself stores any kind in any column."""
+    for row in database.execute(query):
+        budget.spend(records=1)
+        if tuple(map(type, row)) != kinds:
+            raise sqlite3.DataError(f'a row has {[type(x).__name__ for x in row]}')
+        yield row
