@@ -39,7 +39,7 @@ AXES = {
 }
 MIRROR = np.array([-1.0, 1.0, 1.0])
 DIFFUSION = (0.25, 1.4)  # of a root that the model file gives none, m and rad after one second
-LARGEST_FILE = 1_000_000  # bytes; a body is a few kB
+LARGEST_FILE = 250_000  # bytes; a body is a few kB
 
 
 def model_names() -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, person
+from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, image_size_of, person
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools.files.array_file import read_archive
 
@@ -108,5 +108,4 @@ def _size(about: dict[Any, Any]) -> tuple[int, int] | None:
     videos = about.get('video_metadata')
     one = [*videos.values()] if isinstance(videos, dict) else []
     known = len(one) == 1 and isinstance(one[0], dict)
-    width, height = (one[0].get(x) if known else None for x in 'wh')
-    return (width, height) if isinstance(width, int) and isinstance(height, int) else None
+    return image_size_of(one[0].get('w'), one[0].get('h')) if known else None

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hmt_ros.app.import_video.frames import FrameSource, natural_order
-from hmt_ros.app.import_video.keypoint_files.json_layouts import frames_in, person_in, read_json
+from hmt_ros.app.import_video.keypoint_files.json_layouts import frames_in, person_in
 from hmt_ros.app.import_video.keypoint_files.persons import (
     MOST_FRAMES,
     FoundPersons,
@@ -18,6 +18,7 @@ from hmt_ros.app.import_video.keypoint_files.persons import (
 )
 from hmt_ros.image.keypoint_schemes import unnamed_orders
 from msg_tools.files.bounded_file import read_bytes
+from msg_tools.files.plain_json import read_plain_json
 
 LARGEST_FILE = 2**24  # bytes
 _BOX = 5  # class, centre and size of a box come before the keypoints
@@ -51,7 +52,7 @@ def read_folder(path: Path, source: FrameSource) -> FoundPersons:
             if kind == '.txt':
                 _add_labels(found, file, number)
                 continue
-            for _, entries in frames_in(read_json(file), number):
+            for _, entries in frames_in(read_plain_json(file, LARGEST_FILE), number):
                 for entry in entries:
                     found.add(number, person_in(found, entry, 'a person'))
         except ValueError as error:

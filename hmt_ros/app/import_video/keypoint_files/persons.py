@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmt_ros.app.command_line import LARGEST
 from hmt_ros.app.import_video.frames import Frame, FrameSource
 from hmt_ros.image.keypoint_schemes import landmark_called, schemes, unnamed_orders
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -114,6 +115,12 @@ def orders_of(count: int) -> tuple[str, ...]:
     raise ValueError(
         f'{count} keypoints without names; wanted {text}, or names: a .csv with NAME_u, NAME_v'
     )
+
+
+def image_size_of(width: Any, height: Any) -> tuple[int, int] | None:
+    """Width and height that a file gives its images, px; None: no sides that images have."""
+    known = all(isinstance(side, int) and 0 < side <= LARGEST for side in (width, height))
+    return (width, height) if known else None
 
 
 def landmark_name(name: str) -> str:
