@@ -21,7 +21,7 @@ _AROUND = 0.15
 # A track ends when nobody was there for so many frames.
 _PATIENCE = 30
 # Pairs of a person and a track that are compared in a clip, and more for each person in it.
-_FREE_PAIRS, _PAIRS = 100_000, 100
+_FREE_PAIRS, _PAIRS = 20_000, 100
 _LISTED = 8  # names in an error
 
 
