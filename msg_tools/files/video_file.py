@@ -5,7 +5,6 @@ FFmpeg follows lists of other files and of addresses, and series of images by a 
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 from itertools import chain
@@ -24,7 +23,6 @@ _CONTAINERS = re.compile(
     rb'|\x06\x0e\x2b\x34',
     re.DOTALL,
 )
-_QUIET = '-8'  # AV_LOG_QUIET of FFmpeg
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
@@ -34,7 +32,6 @@ def open_video(path: Path) -> cv2.VideoCapture:
         OSError: it can not be read.
         ValueError: of no such container, damaged, or of images that are too large; one line.
     """
-    os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', _QUIET)
     with mapped(path) as data:
         # Tables of images of one size, and those of fragments, have no bytes for each.
         tables = boxes_at(data, 0, len(data), b'moov', b'trak', b'mdia', b'minf', b'stbl', b'stsz')

@@ -290,7 +290,8 @@ def _upright(content: bytes) -> tuple[Image, bytes | None]:
         image = _decoded(content)
         same = image.shape == as_stored.shape and np.array_equal(image, as_stored)
         return image, content if same else None
-    return _decoded(content), None
+    png = content.startswith(b'\x89PNG')
+    return decode_picture(content) if png else _decoded(content), None
 
 
 def _decoded(content: bytes) -> Image:
