@@ -47,7 +47,7 @@ _MAX_SCANNED = 16 * MAX_PIXELS  # pixels of all scans
 # on 1032, which in PNG may be 8 pixels each.
 _JPEG_PIXELS_PER_BYTE = 512
 _PNG_PIXELS_PER_BYTE = 8 * 1032
-# What deflate does not compress at all, of four channels of 16 bits; the rest would be inflated, too.
+# Four channels of 16 bits that deflate does not compress; what follows would be inflated, too.
 _PNG_BYTES_PER_PIXEL, _PNG_BYTES = 9, 10_000
 
 
