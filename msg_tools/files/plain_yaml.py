@@ -36,8 +36,8 @@ class _PlainLoader(yaml.SafeLoader):
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
-        number = node is not None and node.tag.rpartition(':')[2] in ('int', 'float')
-        if number and len(node.value) > _LONGEST_NUMBER:
+        kind = '' if node is None else node.tag.rpartition(':')[2]
+        if node is not None and kind in ('int', 'float') and len(node.value) > _LONGEST_NUMBER:
             raise yaml.YAMLError(f'a number of {len(node.value)} characters')
         return node
 

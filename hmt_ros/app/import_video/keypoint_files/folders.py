@@ -20,7 +20,7 @@ from hmt_ros.image.keypoint_schemes import unnamed_orders
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.plain_json import read_plain_json
 
-LARGEST_FILE = 2**24  # bytes
+LARGEST_FILE, LARGEST_LABELS = 2**24, 2**20  # bytes, of a frame
 _BOX = 5  # class, centre and size of a box come before the keypoints
 # Names of the frames of a video, which Ultralytics counts from 1.
 _OF_VIDEO = re.compile(r'.*_[1-9]\d*')
@@ -62,7 +62,8 @@ def read_folder(path: Path, source: FrameSource) -> FoundPersons:
 
 def _add_labels(found: FoundPersons, file: Path, number: int) -> None:
     """Adds the lines of Ultralytics: class, box, keypoints as fractions, confidence, track."""
-    for i, line in enumerate(read_bytes(file, LARGEST_FILE).decode('utf-8', 'replace').split('\n')):
+    text = read_bytes(file, LARGEST_LABELS).decode('utf-8', 'replace')
+    for i, line in enumerate(text.split('\n')):
         try:
             values = np.array(line.split(), dtype=np.float64)
         except ValueError as error:
