@@ -96,8 +96,7 @@ class Video:
             raise ValueError(f'{source}: no such file; wanted a video, or /dev/video0')
         self._capture = open_video(Path(source)) if self.is_file else cv2.VideoCapture(int(number))
         if not self._capture.isOpened():
-            kind = 'a video that OpenCV reads' if self.is_file else 'a webcam that nobody uses'
-            raise ValueError(f'{source} can not be opened; wanted {kind}')
+            raise ValueError(f'{source} can not be opened; wanted a webcam that nobody uses')
         if self.is_file and is_mirrored(display_matrix(Path(source)) or STORED):
             # OpenCV would turn it by 180 degrees.
             raise ValueError(
