@@ -176,14 +176,14 @@ def _motion(path: Path, lines: list[str], at: int, count: int) -> tuple[Array, f
         raise MotionFileError(path, len(lines), 'the file ends, wanted Frames: and Frame Time:')
     if count == 0:
         raise MotionFileError(path, None, 'no joint has CHANNELS, wanted some')
-    values, seen = np.empty((frames, count)), 0
+    values, rows = np.empty((frames, count)), 0
     for i in range(at, len(lines)):
         words = lines[i].split()
         if words:
-            values[seen % frames] = numbers(path, i + 1, words, count, f'frame {seen + 1}')
-            seen += 1
-    if seen != frames:
-        raise MotionFileError(path, len(lines), f'saw {seen} frames, wanted {frames}')
+            values[rows % frames] = numbers(path, i + 1, words, count, f'frame {rows + 1}')
+            rows += 1
+    if rows != frames:
+        raise MotionFileError(path, len(lines), f'saw {rows} frames, wanted {frames}')
     return values, frame_time
 
 
