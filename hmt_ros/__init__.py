@@ -1,5 +1,6 @@
 """Monocular 3D human motion tracking with mixtures, as a library and as ROS 2 nodes."""
 
+import os
 from pathlib import Path
 
 from hmt_ros.compiled_code import keep_compiled_code_apart
@@ -7,3 +8,12 @@ from hmt_ros.compiled_code import keep_compiled_code_apart
 __version__ = '1.0.0'
 
 keep_compiled_code_apart(Path(__file__).parent)
+
+# OpenCV reads these when it is loaded: pixels of an image, whatever its format, and no lines of its
+# own about files from outside, of which our errors tell.
+for _name, _value in (
+    ('OPENCV_IO_MAX_IMAGE_PIXELS', str(2**26)),
+    ('OPENCV_LOG_LEVEL', 'SILENT'),
+    ('OPENCV_FFMPEG_LOGLEVEL', '-8'),  # AV_LOG_QUIET
+):
+    os.environ.setdefault(_name, _value)

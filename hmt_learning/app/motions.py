@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import fnmatch
+import io
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -21,9 +22,11 @@ from hmt_ros.app.command_line import number, whole_number
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.pose_predictor import RATE
+from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 from msg_tools.files.new_folder import check_file_place
 
+LARGEST_TABLE = 2**22  # bytes
 Item = TypeVar('Item')
 
 
@@ -210,14 +213,19 @@ def people_in(tables: Iterable[Path]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for path in tables:
-        with path.open(encoding='utf-8', newline='') as file:
-            rows = csv.DictReader(file)
-            missing = {'file', 'subject'} - set(rows.fieldnames or ())
-            if missing:
-                raise ValueError(f'{path}: no column {sorted(missing)[0]!r}')
-            for row in rows:
-                # A question mark: the person was guessed.
-                found[Path(row['file'] or '').stem] = (row['subject'] or '').rstrip('?')
+        try:
+            text = read_bytes(path, LARGEST_TABLE).decode('utf-8')
+            columns, *rows = csv.reader(io.StringIO(text, newline='')) if text else [[]]
+        except (ValueError, csv.Error) as error:
+            raise ValueError(f'{path}: {error}') from error
+        missing = {'file', 'subject'} - {*columns}
+        if missing:
+            raise ValueError(f'{path}: no column {sorted(missing)[0]!r}')
+        places = columns.index('file'), columns.index('subject')
+        for row in rows:
+            file, subject = (row[i] if i < len(row) else '' for i in places)
+            # A question mark: the person was guessed.
+            found[Path(file).stem] = subject.rstrip('?')
     return found
 
 

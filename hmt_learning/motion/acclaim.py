@@ -305,7 +305,7 @@ def _order(path: Path, line: int, words: Sequence[str]) -> str:
 
 def _hierarchy(path: Path, lines: Lines, bones: dict[str, _Bone]) -> list[str]:
     """Sets the parents; bones in an order with parents before children."""
-    order = ['root']
+    order = {'root': 0}
     for line, words in lines:
         if words in (['begin'], ['end']):
             continue
@@ -318,11 +318,11 @@ def _hierarchy(path: Path, lines: Lines, bones: dict[str, _Bone]) -> list[str]:
             if name in order:
                 raise MotionFileError(path, line, f'{name} has a parent already')
             bones[name].parent = words[0]
-            order.append(name)
+            order[name] = len(order)
     lost = [name for name in bones if name not in order]
     if lost:
         raise MotionFileError(path, bones[lost[0]].line, f'bone {lost[0]} is not in the hierarchy')
-    return order
+    return list(order)
 
 
 def _acclaim(bones: dict[str, _Bone], order: list[str], length: float, degrees: bool) -> Acclaim:

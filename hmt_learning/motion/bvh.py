@@ -26,6 +26,8 @@ from hmt_learning.motion.rig import (
 )
 from hmt_ros.inference.arrays import Array
 
+_MOST_WORDS = 20_000  # in a line; the time that they take is quadratic
+_LONGEST_NAME = 200  # characters
 CHANNELS = {
     f'{letter}{kind}': (axis, kind == 'rotation')
     for kind in ('position', 'rotation')
@@ -66,6 +68,8 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
     started = False
     for i, line in enumerate(lines):
         words = line.replace('{', ' { ').replace('}', ' } ').split()
+        if len(words) > _MOST_WORDS:
+            raise MotionFileError(path, i + 1, f'{len(words)} words in a line')
         while words:
             word, key = words[0], words[0].upper()
             if not started:
@@ -112,8 +116,8 @@ def _opened(
     parent = stack[-1] if stack else -1
     if key == 'END':
         return _Joint(f'{joints[parent].name}_end', parent, line, True)
-    if not name:
-        raise MotionFileError(path, line, f'saw {words[0]} without a name')
+    if not 0 < len(name) <= _LONGEST_NAME:
+        raise MotionFileError(path, line, f'saw {words[0]} with a name of {len(name)} characters')
     return _Joint(name, parent, line, False)
 
 
@@ -172,20 +176,15 @@ def _motion(path: Path, lines: list[str], at: int, count: int) -> tuple[Array, f
         raise MotionFileError(path, len(lines), 'the file ends, wanted Frames: and Frame Time:')
     if count == 0:
         raise MotionFileError(path, None, 'no joint has CHANNELS, wanted some')
-    rows = [words for line in lines[at:] if (words := line.split())]
-    try:
-        values = np.array(rows, dtype=np.float64)
-        if values.shape == (frames, count) and np.isfinite(values).all():
-            return values, frame_time
-    except ValueError:
-        pass
-    seen_frames = 0  # find the error and its line
+    values, rows = np.empty((frames, count)), 0
     for i in range(at, len(lines)):
         words = lines[i].split()
         if words:
-            numbers(path, i + 1, words, count, f'frame {seen_frames + 1}')
-            seen_frames += 1
-    raise MotionFileError(path, len(lines), f'saw {seen_frames} frames, wanted {frames}')
+            values[rows % frames] = numbers(path, i + 1, words, count, f'frame {rows + 1}')
+            rows += 1
+    if rows != frames:
+        raise MotionFileError(path, len(lines), f'saw {rows} frames, wanted {frames}')
+    return values, frame_time
 
 
 def _rig(path: Path, joints: list[_Joint], values: Array) -> tuple[Rig, Array]:

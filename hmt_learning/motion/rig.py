@@ -30,7 +30,8 @@ from hmt_ros.inference.arrays import Array
 from msg_tools.files.bounded_file import read_bytes
 
 LARGEST_FILE = 500_000_000  # bytes
-LARGEST_MOTION = 100_000_000  # numbers, frames times channels
+LARGEST_MOTION = 30_000_000  # numbers, frames times channels
+_LARGEST_TEXT, _LINE = 700_000_000, 64  # bytes in memory, and those of a line
 MOST_SEGMENTS = 2_000
 
 # Where the file sets no limits, those of the root of a human body: ten turns, and a large hall.
@@ -141,6 +142,10 @@ def read_text(path: Path) -> str:
         content = read_bytes(path, LARGEST_FILE)
     except ValueError as error:
         raise MotionFileError(path, None, str(error)) from error
+    # All that Python splits lines at.
+    lines = sum(content.count(x) for x in b'\n\r\v\f\x1c\x1d\x1e\x85')
+    if 2 * len(content) + _LINE * lines > _LARGEST_TEXT:
+        raise MotionFileError(path, None, f'{lines} lines in {len(content)} bytes are too many')
     if b'\0' in content:
         line = content.count(b'\n', 0, content.index(b'\0')) + 1
         raise MotionFileError(path, line, 'binary data, wanted the text of a motion file')
@@ -290,8 +295,10 @@ def _chains(rig: Rig, names: Sequence[str]) -> dict[str, tuple[int, ...]]:
         ends[f'{side}_arm'] = (f'{side}_{ARM[0]}', f'{side}_{ARM[-2]}')
         ends[f'{side}_leg'] = (f'{side}_{LEG[0]}', f'{side}_{LEG[-2]}')
     chains = {}
+    parents = [joint.parent for joint in rig.joints]
     for chain, (first, last) in ends.items():
-        if first in names and last in names:
+        known = first in names and last in names
+        if known and _leads_to(parents, names.index(first), names.index(last)):
             path = [names.index(last)]
             while names[path[-1]] != first:
                 path.append(rig.joints[path[-1]].parent)

@@ -39,7 +39,9 @@ AXES = {
 }
 MIRROR = np.array([-1.0, 1.0, 1.0])
 DIFFUSION = (0.25, 1.4)  # of a root that the model file gives none, m and rad after one second
-LARGEST_FILE = 1_000_000  # bytes; a body is a few kB
+FARTHEST = 1000.0  # m
+MOST_RINGS = 100
+LARGEST_FILE = 250_000  # bytes; a body is a few kB
 
 
 def model_names() -> list[str]:
@@ -69,7 +71,8 @@ def load_body(source: str | Path) -> Body:
         ValueError: a file that is not a body; the message names the file and the entry.
     """
     try:
-        return _build(_read(source))
+        with np.errstate(all='ignore'):  # a body whose numbers overflow is refused
+            return _build(_read(source))
     except (KeyError, TypeError, AttributeError, IndexError) as fault:
         raise ValueError(
             f'{source}: not a body model ({type(fault).__name__}: {fault}); '
@@ -95,7 +98,7 @@ def named_body(name: str) -> Body:
 
 
 def _read(source: str | Path) -> dict[str, Any]:
-    """The content of a model file, with that of the file it extends."""
+    """The content of a model file, with that of the model it extends."""
     if str(source) in model_names():
         return deepcopy(_shipped(str(source)))
     path = Path(source)
@@ -144,16 +147,15 @@ def joint_errors_of(joint_names: Sequence[str], table: Mapping[str, float] | Non
 
 
 def _whole(content: Any) -> dict[str, Any]:
-    """The content of a model with that of the one it extends."""
+    """The content of a model with that of the one that ships and that it extends."""
     if not isinstance(content, dict):
         raise ValueError(f'wanted a mapping, saw {type(content).__name__}')
     if 'extends' in content:
-        try:
-            base = _read(str(content['extends']))
-        except FileNotFoundError as fault:
-            raise ValueError(f'it extends what is not there: {fault}') from fault
+        name = content.pop('extends')
+        if name not in model_names():
+            raise ValueError(f'it extends {str(name)[:40]!r}, wanted one of {model_names()}')
+        base = deepcopy(_shipped(name))
         fixed = [*base.get('fixed', []), *content.pop('fixed', [])]
-        content.pop('extends')
         return {**base, **content, 'fixed': fixed}
     return content
 
@@ -161,7 +163,7 @@ def _whole(content: Any) -> dict[str, Any]:
 def _sides(template: str) -> list[tuple[str, str]]:
     """Names that a template stands for, each with its side; without a side, as on the right."""
     sides = ('left', 'right') if '{side}' in template else ('right',)
-    return [(template.format(side=side), side) for side in sides]
+    return [(template.replace('{side}', side), side) for side in sides]
 
 
 def _linear(term: Any, names: tuple[str, ...]) -> tuple[float, Array]:
@@ -233,8 +235,10 @@ def _build(content: dict[str, Any]) -> Body:
     length_names = tuple(content['lengths'])
     lengths = np.array([float(v[0]) for v in content['lengths'].values()])
     relative = np.array([float(v[1]) for v in content['lengths'].values()])
-    if not (np.isfinite(lengths).all() and np.isfinite(relative).all()):
-        raise ValueError(f'lengths must be finite, saw {content["lengths"]}')
+    if not (np.abs([lengths, relative]) < FARTHEST).all():
+        raise ValueError(
+            f'lengths must be finite and below {FARTHEST:g} m, saw {content["lengths"]}'
+        )
     stature_spread = float(content.get('stature_spread', STATURE_SPREAD))
     for name in content['stature']:
         _named(name, length_names, 'stature:')
@@ -252,7 +256,7 @@ def _build(content: dict[str, Any]) -> Body:
     for entry, name, side in sided:
         _check_keys(entry, SEGMENT_KEYS, f'segment {name}')
         mirrored, parent_name = side == 'left', entry.get('parent')
-        parent = -1 if parent_name is None else names.index(parent_name.format(side=side))
+        parent = -1 if parent_name is None else names.index(parent_name.replace('{side}', side))
         sign = MIRROR if mirrored else np.ones(3)
         mount = _mount(entry) * (np.outer(MIRROR, MIRROR) if mirrored else 1.0)
         constant, coefficients = np.zeros(3), np.zeros((3, len(length_names)))
@@ -274,7 +278,7 @@ def _build(content: dict[str, Any]) -> Body:
             None if span is None else _named(span, length_names, f'segment {name}: length')
         )
         for dof in entry.get('dofs', []):
-            dof_name = dof[0].format(side=side)
+            dof_name = dof[0].replace('{side}', side)
             if dof_name in fixed_dofs:
                 left_over.discard(dof_name)
                 continue
@@ -288,7 +292,7 @@ def _build(content: dict[str, Any]) -> Body:
     joint_names, joint_segments, joint_basis = [], [], []
     for template, (segment_template, end) in content['joints'].items():
         for joint, side in _sides(template):
-            segment = names.index(segment_template.format(side=side))
+            segment = names.index(segment_template.replace('{side}', side))
             coefficients = np.zeros((3, len(length_names)))
             if end == 'end':
                 coefficients[2, own_length[segment]] = -1.0
@@ -300,7 +304,7 @@ def _build(content: dict[str, Any]) -> Body:
     chains = {}
     for template, members in content.get('chains', {}).items():
         for chain, side in _sides(template):
-            chains[chain] = tuple(names.index(m.format(side=side)) for m in members)
+            chains[chain] = tuple(names.index(m.replace('{side}', side)) for m in members)
 
     columns = list(zip(*dofs, strict=True))
     skeleton = Skeleton(
@@ -369,6 +373,9 @@ def _shape(
     _check_keys(flesh, FLESH_KEYS, 'flesh')
     size = _named(flesh['size'], length_names, 'flesh: size') if 'size' in flesh else length
     radii = tuple(float(x) for x in flesh['radii'])
+    rings = int(flesh.get('rings', 5))
+    if not 1 <= rings <= MOST_RINGS:
+        raise ValueError(f'rings must be 1 to {MOST_RINGS}, saw {rings}')
     if len(radii) not in (2, 3) or not all(r > 0 for r in radii):
         raise ValueError(f'radii must be two or three positive numbers, saw {list(radii)}')
     spans = len(radii) == 2
@@ -389,7 +396,7 @@ def _shape(
         taper=(tx, ty),
         bend=(sign * bx, by),
         extend=(start, end),
-        rings=int(flesh.get('rings', 5)),
+        rings=rings,
         size=size,
     )
 
@@ -412,7 +419,7 @@ def length_covariance(
         ValueError: a spread that is not finite, or negative.
     """
     typical, own = (np.asarray(x, dtype=np.float64) for x in (lengths, proportions))
-    if not (np.isfinite(stature) and stature >= 0):
+    if not 0.0 <= stature < FARTHEST:
         raise ValueError(f'stature_spread must be a number of at least 0, saw {stature}')
     if not (np.isfinite(own).all() and (own >= 0).all()):
         raise ValueError(f'spreads of lengths must be numbers of at least 0, saw {own.tolist()}')

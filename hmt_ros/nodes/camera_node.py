@@ -39,6 +39,7 @@ from hmt_ros.sessions.focal_length import USUAL_FOV, usual_camera
 from msg_tools import RosbagsMessages
 from msg_tools.files.display_matrix import STORED, display_matrix, is_mirrored
 from msg_tools.files.error_line import error_line
+from msg_tools.files.video_file import open_video
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import SECOND_NS
@@ -92,10 +93,9 @@ class Video:
         self._source, self._loop, self._speed = source, loop, speed
         if self.is_file and not Path(source).is_file():
             raise ValueError(f'{source}: no such file; wanted a video, or /dev/video0')
-        self._capture = cv2.VideoCapture(source if self.is_file else int(number))
+        self._capture = open_video(Path(source)) if self.is_file else cv2.VideoCapture(int(number))
         if not self._capture.isOpened():
-            kind = 'a video that OpenCV reads' if self.is_file else 'a webcam that nobody uses'
-            raise ValueError(f'{source} can not be opened; wanted {kind}')
+            raise ValueError(f'{source} can not be opened; wanted a webcam that nobody uses')
         if self.is_file and is_mirrored(display_matrix(Path(source)) or STORED):
             # OpenCV would turn it by 180 degrees.
             raise ValueError(

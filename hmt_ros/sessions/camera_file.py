@@ -14,11 +14,12 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-
-import cv2
+from xml.etree import ElementTree as ET
 
 from hmt_ros.body import Camera
 from msg_tools.files.bounded_file import read_bytes
+from msg_tools.files.error_line import error_line
+from msg_tools.files.plain_json import load_plain_json
 from msg_tools.files.plain_yaml import load_plain_yaml
 from msg_tools.messages.camera_info import camera_from_info
 
@@ -56,7 +57,11 @@ _WIDTH, _HEIGHT = (
 )
 _SIZE = ('size', 'resolution')
 _FISHEYE = ('fisheye', 'fisheye_model')
-_OPENCV = ('%YAML', '<?xml', '{')
+_TAG_OF_OPENCV = re.compile(r'(?<=[:-] )!{1,2}<?opencv-[\w-]+>?')
+# No camera has a matrix or a distortion of so many characters.
+_LONG_LIST = re.compile(r'\[[^][]{2000,}\]')
+_MOST_NUMBERS = 100  # of a matrix, or of the coefficients of a lens
+_MOST_POINTS = 200  # in a line; the time that keys of many parts take in TOML is quadratic
 
 Tell = Callable[[str], object]
 
@@ -112,31 +117,51 @@ def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: Non
             )
         entries = _entries(named.get(name, next(iter(calibrations.values()))), model, size)
         return camera_from_info(SimpleNamespace(**entries), size, lambda x: tell(f'{path}: {x}'))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f'{path}: {error}') from error
+    except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
+        raise ValueError(f'{path}: {error_line(error)}') from error
 
 
 def _content(path: Path, text: str) -> tuple[Any, str]:
     """The entries of a file, and the model of the distortion where they name none."""
     if path.suffix.lower() == '.toml':
+        if any(line.count('.') > _MOST_POINTS for line in text.splitlines()):
+            raise ValueError(f'a line with more than {_MOST_POINTS} points')
         return tomllib.loads(text), 'pinhole'
-    if not text.lstrip().startswith(_OPENCV):
-        # An echoed topic has a line of --- behind each message: the first counts.
-        first = re.split('^---', text.strip().removeprefix('---'), flags=re.MULTILINE)[0]
-        return load_plain_yaml(first), ''
+    start = text.lstrip()
+    if start.startswith('<?xml'):
+        return _of_xml(start), 'pinhole'
+    # Points of a calibration pattern, or the poses of hundreds of images: no camera needs them.
+    text = _LONG_LIST.sub('"a long list"', start)
+    of_opencv = start.startswith(('%YAML', '{'))
+    if of_opencv:
+        text = text.replace("\\'", "'")
+    if start.startswith('{'):
+        text = re.sub(r'^\s*//.*$', '', text, flags=re.MULTILINE)
+        return load_plain_json(re.sub(r'(?<=[\s\[,])-?\.(Nan|Inf)\b', 'NaN', text)), 'pinhole'
+    if of_opencv:
+        text = _TAG_OF_OPENCV.sub('', text.partition('\n')[2])
+    # An echoed topic has a line of --- behind each message: the first counts.
+    first = re.split('^---', text.strip().removeprefix('---'), flags=re.MULTILINE)[0]
+    return load_plain_yaml(first), 'pinhole' if of_opencv else ''
+
+
+def _of_xml(text: str) -> Any:
+    """The entries of an XML file of OpenCV; numbers stay texts."""
+    if '<!DOCTYPE' in text or '<!ENTITY' in text:
+        raise ValueError('XML with a DOCTYPE, wanted a file of OpenCV')
     try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        return _of_opencv(storage.root()), 'pinhole'
-    except (cv2.error, SystemError) as error:
-        raise ValueError('not a file of OpenCV (FileStorage)') from error
+        return _of_element(ET.fromstring(text))
+    except ET.ParseError as error:
+        raise ValueError(f'not XML ({error})') from error
 
 
-def _of_opencv(node: Any) -> Any:
-    if node.isMap():
-        return {name: _of_opencv(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
-    if node.isSeq():
-        return [_of_opencv(node.at(i)) for i in range(node.size())]
-    return node.string() if node.isString() else node.real()
+def _of_element(element: ET.Element) -> Any:
+    if len(element):
+        entries = [_of_element(child) for child in element]
+        named = dict(zip([child.tag for child in element], entries, strict=True))
+        return entries if '_' in named else named
+    words = [word.strip('"') for word in (element.text or '').split()]
+    return words[0] if len(words) == 1 else words
 
 
 def _calibrations(content: Any, name: str = '') -> dict[str, dict[Any, Any]]:
@@ -165,7 +190,7 @@ def _entries(content: dict[Any, Any], model: str, size: tuple[int, int]) -> dict
     if len(sides) != 2 or not all(math.isfinite(x) for x in sides):
         raise ValueError(f'size is {sides}, wanted width and height of the images')
     lens = str(content.get('camera_model') or 'pinhole')
-    if _first(content, _FISHEYE):
+    if _first(content, _FISHEYE) not in (None, 0, '0'):
         model = 'fisheye'
     elif lens.lower() != 'pinhole':
         model = lens
@@ -196,9 +221,13 @@ def _numbers(value: Any) -> list[float]:
     if isinstance(value, dict):
         value = value.get('data')
     rows = value if isinstance(value, list) else [value]
+    values = [x for row in rows for x in (row if isinstance(row, list) else [row])]
     try:
         # YAML takes 1e-05, without a point, for text.
-        return [float(x) for row in rows for x in (row if isinstance(row, list) else [row])]
-    except (TypeError, ValueError) as error:
-        text = 'not a calibration: its sizes, matrix and coefficients must be numbers'
-        raise ValueError(f'{text} ({error})') from error
+        if len(values) <= _MOST_NUMBERS and not any(isinstance(x, bool) for x in values):
+            return [float(x) for x in values]
+        seen = f'{len(values)} values'
+    except (TypeError, ValueError, OverflowError) as error:
+        seen = error_line(error)
+    text = 'not a calibration: its sizes, matrix and coefficients must be numbers'
+    raise ValueError(f'{text} ({seen[:100]})')

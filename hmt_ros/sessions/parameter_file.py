@@ -15,7 +15,7 @@ from hmt_ros.sessions.declared_parameters import (
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 PARAMETERS_KEY = 'ros__parameters'
-LARGEST_FILE = 1_000_000  # bytes
+LARGEST_FILE = 250_000  # bytes
 
 
 def yaml_scalar(value: Value) -> str:

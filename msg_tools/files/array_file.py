@@ -8,11 +8,11 @@ read by `plain_pickle`.
 from __future__ import annotations
 
 import math
+import os
 import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,21 @@ import numpy as np
 from numpy.lib import format as array_format
 from numpy.typing import NDArray
 
+from msg_tools.files.bounded_file import open_regular
+from msg_tools.files.budget import Budget
 from msg_tools.files.error_line import error_line
 from msg_tools.files.plain_pickle import read_plain_pickle
 
 # Bytes of all arrays of an archive together.
-LARGEST_ARCHIVE = 2**31
+LARGEST_ARCHIVE = 2**29
 _MOST_ARRAYS = 10_000
+_KINDS = 'biufSU'
+_SMALLEST = 4  # bytes that a number counts at least
+_LONGEST = 10**6  # side of an array that has no bytes
+_HEADS = {
+    (1, 0): array_format.read_array_header_1_0,
+    (2, 0): array_format.read_array_header_2_0,
+}
 # Exceptions that damaged archives lead to, besides OSError and ValueError.
 _FAULTS = (
     zipfile.BadZipFile,
@@ -60,50 +69,54 @@ def read_archive(
             line, without the path.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            pickles = _check_sizes(archive, largest)
-            if pickles and not with_objects:
-                raise ValueError(f'the array {next(iter(pickles))} holds Python objects')
-            plain = {
-                name.removesuffix('.npy'): read_plain_pickle(archive.read(name)[start:])
-                for name, start in pickles.items()
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+            budget = Budget(os.fstat(file.fileno()).st_size)
+            members = archive.infolist()
+            total = sum(member.file_size for member in members)
+            if total > largest or len(members) > _MOST_ARRAYS:
+                raise ValueError(
+                    f'its {len(members)} arrays have {total} bytes, wanted at most {_MOST_ARRAYS} '
+                    f'arrays and {largest} bytes'
+                )
+            budget.spend(unpacked=total)
+            return {
+                member.filename.removesuffix('.npy'): _array(
+                    archive, member, largest, budget if with_objects else None
+                )
+                for member in members
             }
-        with np.load(path, allow_pickle=False) as content:
-            return plain | {name: content[name] for name in content.files if name not in plain}
-    except _FAULTS as fault:
+    except (ValueError, *_FAULTS) as fault:
         raise ValueError(error_line(fault)) from fault
 
 
-def _check_sizes(archive: zipfile.ZipFile, largest: int) -> dict[str, int]:
-    """Raises ValueError if arrays are too large; where the pickles of arrays of objects begin."""
-    members = archive.infolist()
-    total = sum(member.file_size for member in members)
-    if total > largest or len(members) > _MOST_ARRAYS:
-        raise ValueError(
-            f'its {len(members)} arrays have {total} bytes, wanted at most {_MOST_ARRAYS} arrays '
-            f'and {largest} bytes'
-        )
-    pickles = {}
-    for name, claimed, there, start in _claims(archive, members):
-        if claimed is None:
-            pickles[name] = start
-        elif claimed > there:
+def _array(
+    archive: zipfile.ZipFile, member: zipfile.ZipInfo, largest: int, objects: Budget | None
+) -> NDArray[Any]:
+    """An array of an archive, whose head is compared with the bytes that are there.
+
+    Args:
+        objects: what an array of objects may unpack to; None: it is refused.
+    """
+    name, there = member.filename, member.file_size
+    with archive.open(member) as file:
+        read_head = _HEADS.get(array_format.read_magic(file))
+        if read_head is None:
+            raise ValueError(f'the array {name} has an unknown version')
+        shape, _, dtype = read_head(file)
+        if dtype.hasobject and objects is None:
+            raise ValueError(f'the array {name} holds Python objects')
+        if dtype.hasobject:
+            held = read_plain_pickle(file.read(), objects)
+            if not isinstance(held, np.ndarray):
+                raise ValueError(f'the array {name} holds a {type(held).__name__}')
+            return held
+        if dtype.kind not in _KINDS:
+            raise ValueError(f'the array {name} holds {str(dtype)[:40]}, wanted numbers or texts')
+        # Numbers of one byte become larger ones.
+        claimed = math.prod(shape) * max(dtype.itemsize, _SMALLEST)
+        if math.prod(shape) * dtype.itemsize > there or claimed > largest:
             raise ValueError(f'the array {name} claims {claimed} bytes, but has {there}')
-    return pickles
-
-
-def _claims(
-    archive: zipfile.ZipFile, members: list[zipfile.ZipInfo]
-) -> Iterator[tuple[str, int | None, int, int]]:
-    """Name, claimed size (None: of objects), size and length of the header of each, bytes."""
-    for member in members:
-        with archive.open(member) as file:
-            version = array_format.read_magic(file)
-            if version == (1, 0):
-                shape, _, dtype = array_format.read_array_header_1_0(file)
-            elif version == (2, 0):
-                shape, _, dtype = array_format.read_array_header_2_0(file)
-            else:
-                raise ValueError(f'the array {member.filename} has the version {version}')
-            claimed = None if dtype.hasobject else math.prod(shape) * dtype.itemsize
-            yield member.filename, claimed, member.file_size, file.tell()
+        if max(shape, default=0) > max(there, _LONGEST):
+            raise ValueError(f'the array {name} has shape {str(shape)[:40]}, but {there} bytes')
+        file.seek(0)
+        return np.asarray(array_format.read_array(file, allow_pickle=False))

@@ -2,32 +2,45 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
-_PIECE = 2**20
+
+@contextmanager
+def open_regular(path: str | Path) -> Iterator[BinaryIO]:
+    """Opens a file for reading, and never waits for who writes into it.
+
+    Raises:
+        OSError: it can not be opened, or is a folder, a pipe or a device, which may have no end.
+    """
+    with open(path, 'rb', opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, 'a pipe or a device, wanted a file')
+        yield file
 
 
 def read_bytes(path: str | Path, largest: int) -> bytes:
-    """The content of a file.
+    """The content of a regular file.
 
     Args:
-        path: of the file; one without a size (a pipe, a device) is read up to the limit.
         largest: bytes that it may have.
 
     Raises:
         ValueError: a file that can not be read, or that is larger; one line, without the path.
     """
-    content = bytearray()
     try:
-        with Path(path).open('rb') as file:
+        with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > largest:
                 raise ValueError(f'{size} bytes, wanted at most {largest}')
-            while piece := file.read(_PIECE):
-                content += piece
-                if len(content) > largest:
-                    raise ValueError(f'more than {largest} bytes')
+            content = file.read(size + 1)
     except OSError as error:
         raise ValueError(f'can not be read ({error.strerror or error})') from error
-    return bytes(content)
+    if len(content) > size:
+        raise ValueError(f'can not be read (it has more than its {size} bytes)')
+    return content

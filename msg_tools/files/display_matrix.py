@@ -5,7 +5,6 @@ OpenCV tells an angle only, which is wrong where the matrix mirrors.
 
 from __future__ import annotations
 
-import mmap
 import struct
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_tools.files.mp4_boxes import boxes_at
+from msg_tools.files.mp4_boxes import boxes_at, mapped
 
 # Images as stored; after a turn to the right by 90 degrees; by 180; by 270.
 STORED = 1, 0, 0, 1
@@ -29,19 +28,16 @@ def display_matrix(path: Path) -> Matrix | None:
 
     The stored pixel (u, v) is shown at (a u + c v, b u + d v), up to a shift and a scale.
     """
-    with path.open('rb') as file:
-        if not path.stat().st_size:
-            return None
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            for start, end in boxes_at(data, 0, len(data), b'moov', b'trak'):
-                handlers = boxes_at(data, start, end, b'mdia', b'hdlr')
-                if b'vide' not in [data[at + 8 : at + 12] for at, _ in handlers]:
-                    continue
-                for at, last in boxes_at(data, start, end, b'tkhd'):
-                    at += _MATRIX_AT[data[at : at + 1] == b'\x01']
-                    if at + 20 <= last:
-                        a, b, _, c, d = struct.unpack_from('>5i', data, at)
-                        return (a, b, c, d) if a * d != b * c else None
+    with mapped(path) as data:
+        for start, end in boxes_at(data, 0, len(data), b'moov', b'trak'):
+            handlers = boxes_at(data, start, end, b'mdia', b'hdlr')
+            if b'vide' not in [data[at + 8 : at + 12] for at, _ in handlers]:
+                continue
+            for at, last in boxes_at(data, start, end, b'tkhd'):
+                at += _MATRIX_AT[data[at : at + 1] == b'\x01']
+                if at + 20 <= last:
+                    a, b, _, c, d = struct.unpack_from('>5i', data, at)
+                    return (a, b, c, d) if a * d != b * c else None
     return None
 
 

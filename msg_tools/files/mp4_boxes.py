@@ -3,11 +3,33 @@
 from __future__ import annotations
 
 import mmap
+import os
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeAlias
 
+from msg_tools.files.bounded_file import open_regular
+
 Data: TypeAlias = 'bytes | mmap.mmap'
+
+_MOST = 300_000  # boxes in a box; videos of hours have two for each image at most
+
+
+@contextmanager
+def mapped(path: Path) -> Iterator[Data]:
+    """The content of a file.
+
+    Raises:
+        OSError: it can not be read, or is no regular file.
+    """
+    with open_regular(path) as file:
+        if not os.fstat(file.fileno()).st_size:
+            yield b''
+            return
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            yield data
 
 
 def boxes(data: Data, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
@@ -15,7 +37,9 @@ def boxes(data: Data, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
 
     Boxes that are damaged, and all behind them, are left out.
     """
-    while start + 8 <= end:
+    for _ in range(_MOST):
+        if start + 8 > end:
+            return
         size, kind = struct.unpack_from('>I4s', data, start)
         head = 8
         if size == 1 and start + 16 <= end:

@@ -1,4 +1,4 @@
-"""Reads YAML that people write by hand: plain data without aliases, of limited depth.
+"""Reads YAML that people write by hand: plain data without aliases, of limited depth and size.
 
 The loader knows no tags of Python. Aliases could expand a short file to more data than memory
 holds; ROS does not accept them in its parameter files either.
@@ -14,22 +14,32 @@ import yaml
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 
+# A parser of pure Python takes 50 us for a node.
+MOST_NODES = 20_000
 _DEEPEST = 50
+_LONGEST_NUMBER = 100  # characters; the time that numbers of base 60 take is quadratic
+# What constructors raise for `!!bool x`, `!!int ""`, or `!!timestamp x`.
+_FAULTS = yaml.YAMLError, ValueError, ArithmeticError, RecursionError, LookupError, AttributeError
 
 
 class _PlainLoader(yaml.SafeLoader):
-    _depth = 0
+    _depth = _nodes = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError(f'line {self._line()}: an alias (*), wanted plain values')
         if self._depth == _DEEPEST:
             raise yaml.YAMLError(f'line {self._line()}: nested deeper than {_DEEPEST} levels')
+        self._nodes += 1
+        if self._nodes > MOST_NODES:
+            raise yaml.YAMLError(f'line {self._line()}: more than {MOST_NODES} values')
         self._depth += 1
-        try:
-            return super().compose_node(parent, index)
-        finally:
-            self._depth -= 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        kind = '' if node is None else node.tag.rpartition(':')[2]
+        if node is not None and kind in ('int', 'float') and len(node.value) > _LONGEST_NUMBER:
+            raise yaml.YAMLError(f'a number of {len(node.value)} characters')
+        return node
 
     def _line(self) -> int:
         event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
@@ -62,5 +72,5 @@ def load_plain_yaml(text: str) -> Any:
     """
     try:
         return yaml.load(text, Loader=_PlainLoader)
-    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+    except _FAULTS as error:
         raise ValueError(error_line(error)) from error

@@ -10,6 +10,8 @@ nothing was measured; `32FC1` counts metres, NaN where nothing was measured.
 
 from __future__ import annotations
 
+import struct
+import zlib
 from io import BytesIO
 from typing import Any
 
@@ -30,17 +32,23 @@ Depth = NDArray[np.float32]
 MAX_PIXELS = 2**26
 
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
-# Where the header of a PNG says how many bits a channel has; the colour type follows, 0 is grey.
-_PNG_DEPTH = 24
+# Where the header of a PNG has its sizes, and how many bits a channel has; the colour type follows,
+# 0 is grey.
+_PNG_SIZES, _PNG_DEPTH = 16, 24
+# Chunks of a PNG that its picture needs: texts, profiles and animations may unpack to anything.
+_PNG_CHUNKS = b'IHDR', b'PLTE', b'tRNS', b'IDAT', b'IEND'
 
 _JPEG_SCAN, _JPEG_END = b'\xff\xda', b'\xff\xd9'
 # A progressive JPEG has a dozen; each costs the decoder a pass over the whole picture.
 MAX_JPEG_SCANS = 100
+_MAX_SCANNED = 16 * MAX_PIXELS  # pixels of all scans
 
 # Limits of compression: JPEG spends at least one bit on each block of 8x8 pixels, deflate one byte
 # on 1032, which in PNG may be 8 pixels each.
 _JPEG_PIXELS_PER_BYTE = 512
 _PNG_PIXELS_PER_BYTE = 8 * 1032
+# Four channels of 16 bits that deflate does not compress; what follows would be inflated, too.
+_PNG_BYTES_PER_PIXEL, _PNG_BYTES = 9, 10_000
 
 
 class ImageError(ValueError):
@@ -211,10 +219,13 @@ def decode_picture(
             so many bytes can hold.
     """
     if content.startswith(b'\xff\xd8\xff'):
-        width, height = _checked_size(content, 'jpeg')
+        width, height = _jpeg_size(content)
         densest = _JPEG_PIXELS_PER_BYTE
     elif content.startswith(_PNG_SIGNATURE):
-        width, height = _checked_size(content, 'png')
+        content = _plain_png(content)
+        width, height = struct.unpack_from('>II', content, _PNG_SIZES)
+        if len(content) > _PNG_BYTES_PER_PIXEL * (width + 1) * (height + 1) + _PNG_BYTES:
+            raise ImageError(f'png of {len(content)} bytes has more data than {width}x{height}')
         densest = _PNG_PIXELS_PER_BYTE
     else:
         raise ImageError(
@@ -256,28 +267,39 @@ def _bytes_of(data: Any) -> Picture:
         raise ImageError(f'image data is a {type(data).__name__}, wanted bytes') from error
 
 
-def _checked_size(content: bytes, form: str) -> tuple[int, int]:
-    """Width and height of a JPEG or PNG file that is whole; a decoder would invent what is not."""
-    what = f'{form} of {len(content)} bytes'
+def _plain_png(content: bytes) -> bytes:
+    """A PNG file that is whole, without the chunks that its picture does not need."""
+    parts, at, kind = [_PNG_SIGNATURE], len(_PNG_SIGNATURE), b''
+    while kind != b'IEND':
+        size = int.from_bytes(content[at : at + 4], 'big')
+        chunk = content[at + 4 : at + 12 + size]  # kind, data and checksum
+        right = chunk[-4:] == zlib.crc32(chunk[:-4]).to_bytes(4, 'big')
+        first = kind or content[12:16] == b'IHDR'
+        if not first or not right or len(chunk) != size + 8:
+            raise ImageError(f'png of {len(content)} bytes breaks off or is damaged')
+        kind, at = chunk[:4], at + 12 + size
+        if kind in _PNG_CHUNKS:
+            parts += size.to_bytes(4, 'big'), chunk
+    return b''.join(parts)
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int]:
+    """Width and height of a JPEG file that is whole; a decoder would invent what is not."""
+    what = f'jpeg of {len(content)} bytes'
     try:
-        with Pillow.open(BytesIO(content), formats=(form,)) as opened:
+        with Pillow.open(BytesIO(content), formats=('jpeg',)) as opened:
             width, height = opened.size
-            if form == 'png':
-                _check_size(width, height)
-                opened.verify()
-    except ImageError:
-        raise
     except Exception as error:
         # The parser meets any bytes here, and does not say what it may raise.
         why = error_line(error).partition(' <')[0]  # an address in memory tells nobody anything
         raise ImageError(f'{what} breaks off or is damaged: {why}') from error
-    if form == 'jpeg':
-        # Within a scan a byte ff is never followed by the number of a marker like these.
-        scans = content.count(_JPEG_SCAN)
-        if scans > MAX_JPEG_SCANS:
-            raise ImageError(f'jpeg has {scans} scans, the limit is {MAX_JPEG_SCANS}')
-        if content.rfind(_JPEG_END) < content.rfind(_JPEG_SCAN):
-            raise ImageError(f'{what} breaks off or is damaged: its end is missing')
+    # Within a scan a byte ff is never followed by the number of a marker like these.
+    scans = content.count(_JPEG_SCAN)
+    most = min(MAX_JPEG_SCANS, _MAX_SCANNED // (width * height + 1))
+    if scans > most:
+        raise ImageError(f'jpeg has {scans} scans, the limit is {most}')
+    if content.rfind(_JPEG_END) < content.rfind(_JPEG_SCAN):
+        raise ImageError(f'{what} breaks off or is damaged: its end is missing')
     return width, height
 
 

@@ -71,6 +71,16 @@ WRONG = {
         lambda c: c['segments'][0].update(flesh={'radii': [-0.1, 0.1, 0.1]}), 'radii'
     ),
     'flesh without a length': (lambda c: c['segments'][0].update(flesh={'radii': [0.1, 0.1]}), ''),
+    'extends a file': (lambda c: c.update(extends='/etc/passwd'), "it extends '/etc/passwd'"),
+    'a name that formats': (
+        lambda c: c['segments'][0].update(name='{side}{side:>1000000000}'),
+        'is not in list',
+    ),
+    'lengths of a planet': (lambda c: c['lengths'].update(x=[1e308, 0.1]), 'below 1000 m'),
+    'rings': (
+        lambda c: next(x for x in c['segments'] if 'flesh' in x)['flesh'].update(rings=10**9),
+        'rings must be 1 to 100, saw 1000000000',
+    ),
     'extends nothing': (lambda c: c.update(extends='human99'), 'human99'),
     'extends itself': (lambda c: c.update(extends='human37', fixed=['nothing']), 'nothing'),
     'axis along the segment': (

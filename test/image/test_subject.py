@@ -148,6 +148,6 @@ def test_files_that_can_not_be_read(body, tmp_path):
         assert str(path) in one_line(caught)
     large = tmp_path / 'large.yaml'
     large.write_bytes(b'#' * (LARGEST_FILE + 1))
-    with pytest.raises(SubjectError, match='1000001 bytes') as caught:
+    with pytest.raises(SubjectError, match='250001 bytes') as caught:
         read_subject(large, body)
     one_line(caught)

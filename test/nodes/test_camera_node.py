@@ -98,7 +98,7 @@ def test_an_unknown_field_of_view_is_told(shown):
     ('arguments', 'code', 'text'),
     [
         (['nowhere.mp4'], 1, 'camera_node: nowhere.mp4: no such file; wanted a video, or /dev/'),
-        (['README.md'], 1, 'camera_node: README.md can not be opened; wanted a video that OpenCV'),
+        (['README.md'], 1, 'camera_node: README.md is not a video that OpenCV can read'),
         (['/dev/video87'], 1, '/dev/video87 can not be opened; wanted a webcam that nobody uses'),
         (['a.mp4', '--fov', '200'], 2, '200 degrees: wanted an angle from 1 to 170'),
         (['a.mp4', '--fov', '60', '--calibration', 'x'], 2, 'not allowed with argument --fov'),

@@ -205,7 +205,7 @@ def test_distortion_that_folds_is_refused(tmp_path):
         ('just words', 'no calibration: none of the names'),
         ('a: [', 'while parsing'),
         ('%YAML:1.0\n---\nnothing: 1\n', 'no calibration: none of the names'),
-        ('{ "damaged', 'not a file of OpenCV'),
+        ('{ "damaged', 'not JSON'),
     ],
 )
 def test_bad_files(text, message, tmp_path):
@@ -216,3 +216,64 @@ def test_bad_files(text, message, tmp_path):
     assert '\n' not in str(caught.value)
     with pytest.raises(ValueError, match='can not be read'):
         read_camera(tmp_path / 'missing.yaml', SIZE)
+
+
+def test_stereo_files_of_opencv(tmp_path):
+    """Matrices of integers and floats, several cameras, and numbers that are none, elsewhere."""
+    for suffix in ('yaml', 'xml', 'json'):
+        path = tmp_path / f'stereo.{suffix}'
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        storage.writeComment('of { two: [ cameras', False)
+        storage.write('calibration_time', "Fri 27 Nov 'noon' # [1]: 10:00")
+        storage.write('errors', np.array([[np.nan, -np.inf, 1e-9]]))
+        storage.write('image_points', np.arange(4000.0).reshape(2000, 2))
+        for i, kind in enumerate((np.int32, np.float32)):
+            storage.startWriteStruct(f'cam{i}', cv2.FileNode_MAP)
+            storage.write('M1', np.array([[500, 0, 320], [0, 510 + i, 239], [0, 0, 1]], kind))
+            storage.write('D1', np.array([[-0.25, 1e-7, 0.0, 0.0, 0.0]], np.float64))
+            storage.write('fisheye_model', 0)
+            storage.endWriteStruct()
+        storage.release()
+        with pytest.raises(ValueError, match='cam0, cam1: name one'):
+            read_camera(path, SIZE)
+        camera = read_camera(tmp_path / f'stereo.{suffix}:cam1', SIZE)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500, 511, 320, 239)
+        assert camera.distortion == (-0.25, 1e-7, 0.0, 0.0, 0.0)
+        assert camera.distortion_model == 'plumb_bob'
+
+
+HEAD = '%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n'
+ENTITIES = '<!DOCTYPE a [<!ENTITY b "x"><!ENTITY c "&b;&b;">]>'
+NUMBERS = 'must be numbers'
+HOSTILE = {
+    'deep.yaml': ('%YAML:1.0\n---\na: ' + '[' * 50_000, 'nested deeper than 50 levels'),
+    'deep.xml': ('<?xml version="1.0"?>' + '<a>' * 50_000 + '</a>' * 50_000, 'recursion'),
+    'deep.json': ('{"a": ' + '[' * 50_000, 'not JSON .nested too deep.'),
+    'deep.toml': ('a = ' + '[' * 50_000, 'recursion'),
+    'parts.toml': ('a' + '.a' * 50_000 + ' = 1', 'a line with more than 200 points'),
+    'entities.xml': (f'<?xml version="1.0"?>{ENTITIES}<a>&c;</a>', 'XML with a DOCTYPE'),
+    'huge.yaml': (HEAD.replace('3', '100000') + '   data: [ 1. ]\n', 'K has 1 values, wanted 9'),
+    'type.yaml': (HEAD.replace(': d', ': "1000000000d"') + '   data: [ 1. ]\n', 'K has 1 values'),
+    'digits.yaml': (f'k: [{"9" * 1500}, 0, 1]', 'a number of 1500 characters'),
+    'digits.json': (f'{{"K": [{"9" * 1000}, 0, 1]}}', NUMBERS),
+    'digits.toml': (f'K = [0x{"9" * 9000}, 0, 1]', NUMBERS),
+    'overflow.toml': (f'K = [0x{"f" * 900}]', NUMBERS),
+    'long.yaml': (ROS.replace('-0.2,', '-0.2, ' * 100_000), NUMBERS),
+    'long.toml': ('distortions = [' + '1,\n' * 1000 + ']\nK = [1, 2, 3, 4]', NUMBERS),
+    'bool.yaml': (ROS.replace('[500, 0', '[500, true'), NUMBERS),
+    'text.yaml': (ROS.replace('[500, 0', '[500, x'), NUMBERS),
+    'date.toml': ('K = [2020-01-01, 2, 3, 4]', NUMBERS),
+    'size.yaml': (ROS.replace('image_width: 640', f'image_width: {10**30}'), 'another shape|focal'),
+    'roi.yaml': (ECHO.replace('x_offset: 0', 'x_offset: .inf'), 'infinity'),
+    'binning.yaml': (ECHO.replace('binning_x: 0', f'binning_x: {10**60}'), 'leaves 0x'),
+    'data.xml': ('<?xml version="1.0"?><a><K><data><x/></data></K></a>', NUMBERS),
+    'damaged.xml': ('<?xml version="1.0"?><a', 'not XML'),
+}
+
+
+@pytest.mark.parametrize('name', HOSTILE)
+def test_well_formed_hostile_files(name, tmp_path):
+    text, message = HOSTILE[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        read_camera(write(tmp_path / name, text), SIZE)
+    assert len(str(caught.value).splitlines()) == 1

@@ -86,7 +86,7 @@ def test_files_without_sections(tmp_path):
         ('- 1\n- 2\n', 'wanted parameters by name, saw list'),
         ('/**:\n  ros__parameters: 3\n', 'wanted parameters by name, saw 3'),
         ('/**:\n  ros__parameters: {}\nother: 3\n', "section 'other' has no ros__parameters"),
-        ('#' * 1_000_001, '1000001 bytes, wanted at most 1000000'),
+        ('#' * 250_001, '250001 bytes, wanted at most 250000'),
     ],
 )
 def test_files_that_are_none(tmp_path, text, message):

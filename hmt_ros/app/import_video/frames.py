@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from msg_tools.files.display_matrix import (
     is_turned,
     shown,
 )
+from msg_tools.files.video_file import check_size, open_video
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import MAX_PIXELS, ImageError, decode_picture
 
@@ -30,7 +30,6 @@ LARGEST_IMAGE_FILE = 2**28  # bytes
 MOST = 1e9  # frames; a head that announces more is damaged
 FASTEST = 1000.0  # frames per second; a container that claims more is damaged
 _EXIF_WITHIN = 2**16  # bytes at the beginning of a JPEG
-_QUIET = '-8'  # AV_LOG_QUIET of FFmpeg
 _HALF = 127  # grey levels, of masks
 _SQUAREST, _THINNEST = 0.99, 0.1  # sides of pixels, over the longer ones
 # Ubuntu 24.04 ships OpenCV 4.6, which tells the turn of a video in the wrong direction.
@@ -174,13 +173,7 @@ class VideoFile(FrameSource):
 
     def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
         super().__init__(path, first_number=first_number)
-        os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', _QUIET)
-        self._capture = cv2.VideoCapture(str(path))
-        if not self._capture.isOpened():
-            raise ValueError(
-                f'{path} is not a video that OpenCV can read: it is damaged or incomplete, or in a '
-                'format that this OpenCV does not know; convert it to .mp4'
-            )
+        self._capture = open_video(path)
         # Versions of OpenCV differ in whether they turn frames, and in which direction.
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         angle = round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META))
@@ -213,6 +206,7 @@ class VideoFile(FrameSource):
             for number, time_ns, wanted in selection.wanted(self._times()):
                 if not wanted:
                     continue
+                check_size(self._capture, self.path)
                 done, image = self._capture.retrieve()
                 if not done:
                     raise ValueError(f'{self.path}: frame {number} can not be decoded')
@@ -296,7 +290,8 @@ def _upright(content: bytes) -> tuple[Image, bytes | None]:
         image = _decoded(content)
         same = image.shape == as_stored.shape and np.array_equal(image, as_stored)
         return image, content if same else None
-    return _decoded(content), None
+    png = content.startswith(b'\x89PNG')
+    return decode_picture(content) if png else _decoded(content), None
 
 
 def _decoded(content: bytes) -> Image:

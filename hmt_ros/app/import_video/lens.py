@@ -7,12 +7,11 @@ The key stands in the metadata of the movie or of its track (QuickTime File Form
 from __future__ import annotations
 
 import math
-import mmap
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from msg_tools.files.mp4_boxes import boxes
+from msg_tools.files.mp4_boxes import Data, boxes, mapped
 
 KEY = b'com.apple.quicktime.camera.focal_length.35mm_equivalent'
 # Width of a picture on 35 mm film, mm; focal lengths that lenses have, in its terms, mm.
@@ -26,19 +25,16 @@ _TEXT, _FLOATS = 1, {23: '>f', 24: '>d'}
 
 def told_fov(path: Path) -> float | None:
     """The field of view, degrees, along the longer side of the images; None: it is not told."""
-    with path.open('rb') as file:
-        if not path.stat().st_size:
+    with mapped(path) as data:
+        try:
+            focal = next(_focal_lengths(data, 0, len(data)), math.nan)
+        except (ValueError, struct.error, RecursionError):
             return None
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            try:
-                focal = next(_focal_lengths(data, 0, len(data)), math.nan)
-            except (ValueError, struct.error, RecursionError):
-                return None
     low, high = FOCAL_LENGTHS
     return math.degrees(2.0 * math.atan(0.5 * FILM / focal)) if low <= focal <= high else None
 
 
-def _focal_lengths(data: mmap.mmap, start: int, end: int) -> Iterator[float]:
+def _focal_lengths(data: Data, start: int, end: int) -> Iterator[float]:
     """Values of the key in the boxes of a part of a file."""
     for kind, first, last in boxes(data, start, end):
         if kind in (b'moov', b'trak'):
@@ -50,7 +46,8 @@ def _focal_lengths(data: mmap.mmap, start: int, end: int) -> Iterator[float]:
             first, last = inner.get(b'keys', (0, 0))
             names = [data[a:b] for _, a, b in boxes(data, first + 8, last)]
             for number, a, b in boxes(data, *inner.get(b'ilst', (0, 0))):
-                if names[int.from_bytes(number, 'big') - 1 :][:1] == [KEY]:
+                at = int.from_bytes(number, 'big')
+                if names[at - 1 : at] == [KEY]:
                     yield from (_number(data[c:d]) for _, c, d in boxes(data, a, b))
 
 

@@ -32,6 +32,7 @@ from msg_tools import BagError
 from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES
 from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
 from msg_tools.files.new_folder import locked, new_file
+from msg_tools.files.plain_json import read_plain_json
 
 # Options that change the new bag, besides the parameters.
 _DECIDING = (
@@ -50,6 +51,7 @@ DONE, BEFORE, FAILED = 'done', 'done before', 'failed'
 
 # The scheduler that uses the cores of this machine.
 LOCAL = 'local'
+_LARGEST_RECORD = 2**24  # bytes
 _PATIENCE = 10.0  # s, until a scheduler answers
 
 
@@ -283,8 +285,8 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 def _read_record(path: Path) -> dict[str, Any]:
     """A record; empty if the file is missing or not one."""
-    with suppress(OSError, ValueError):
-        content = json.loads(path.read_text('utf-8'))
+    with suppress(ValueError):
+        content = read_plain_json(path, _LARGEST_RECORD)
         if isinstance(content, dict):
             return content
     return {}

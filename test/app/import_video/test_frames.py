@@ -1,4 +1,6 @@
 import struct
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -206,3 +208,37 @@ def test_bad_sources(tmp_path, folder):
     (folder / 'img_3.png').write_bytes(b'no image')
     with pytest.raises(ValueError, match=r'img_3\.png: not an image that OpenCV can read'):
         read(folder, fps=1.0)
+
+
+BOMBS = {
+    # Run lengths: a few bytes for 900 million pixels.
+    'a.bmp': struct.pack('<2sIHHI', b'BM', 0, 0, 0, 1078)
+    + struct.pack('<IiiHHIIiiII', 40, 30000, 30000, 1, 8, 1, 0, 0, 0, 0, 0)
+    + bytes(1024)
+    + b'\0\1',
+    'a.ppm': b'P6 30000 30000 255\n',
+    'a.webp': b'RIFF\x1a\0\0\0WEBPVP8L\x0d\0\0\0\x2f\xff\xff\xff\x0f' + bytes(9),
+}
+
+
+@pytest.mark.parametrize('name', BOMBS)
+def test_sizes_of_images_are_checked_before_memory_is_made(name, tmp_path):
+    """OpenCV reads its limit when it is loaded: in a process that begins with the package."""
+    path = tmp_path / name
+    path.write_bytes(BOMBS[name])
+    program = f"""\
+from pathlib import Path
+import resource
+from hmt_ros.app.import_video.frames import ImageFolder, Selection
+resource.setrlimit(resource.RLIMIT_AS, (3 * 2**30, 3 * 2**30))
+try:
+    next(ImageFolder(Path({str(tmp_path)!r}), 25.0).frames(Selection()))
+except ValueError as error:
+    print(error, end='')
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert f'{path}: ' in done.stdout
+    assert '\n' not in done.stdout
+    assert done.stderr == ''

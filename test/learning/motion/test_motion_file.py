@@ -166,6 +166,14 @@ def test_asf_and_amc_by_hand(rod):
     np.testing.assert_allclose(joints[1], [[0, 0, 0], [0, 0, 0], knee, end], atol=1e-12)
 
 
+def test_limbs_whose_joints_are_not_in_order_are_no_limbs(tmp_path):
+    """Names of a person in another order: no way leads from the ankle inwards to the hip."""
+    text = BVH.replace('base', 'left_ankle').replace('arm', 'left_hip')
+    motion = read_motion(write(tmp_path, 'turned.bvh', text))
+    assert {'left_ankle', 'left_hip'} <= {*motion.body.joint_names}
+    assert 'left_leg' not in motion.body.skeleton.chains
+
+
 def sliding(frames):
     """A joint with position channels beside the root's."""
     return (
@@ -207,6 +215,10 @@ def test_root_positions_stand_instead_of_an_offset_or_add_to_it(written, height,
 
 
 BROKEN = {
+    'one line': ('HIERARCHY ROOT a { ' + 'OFFSET 0 0 0 ' * 5001, ':1: 20008 words in a line'),
+    'long name': (BVH.replace('arm', 'a' * 201), ':6: saw JOINT with a name of 201 characters'),
+    'lines': ('\n' * 11_000_000, '11000000 lines in 11000000 bytes are too many'),
+    'numbers': (BVH.replace('Frames: 2', 'Frames: 9999999'), 'wanted 30000000 numbers at most'),
     'empty': ('', r':0: the file ends, wanted HIERARCHY'),
     'something else': ('{"a": 1}', r":1: saw '{\"a\": 1}', wanted HIERARCHY"),
     'no motion': (BVH.split('MOTION')[0], r'the file ends, wanted MOTION'),
@@ -248,7 +260,7 @@ BROKEN = {
     ),
     'two roots': (BVH.replace('JOINT arm', 'ROOT arm'), r':6: saw .* one ROOT'),
     'no root': (BVH.replace('ROOT base', 'JOINT base'), r":2: saw 'JOINT base'"),
-    'no name': (BVH.replace('JOINT arm', 'JOINT'), r':6: saw JOINT without a name'),
+    'no name': (BVH.replace('JOINT arm', 'JOINT'), r':6: saw JOINT with a name of 0 characters'),
     'a name twice': (BVH.replace('JOINT arm', 'JOINT base'), r":6: a second joint 'base'"),
     'a joint in a tip': (
         BVH.replace('OFFSET 0 0 0.5', 'OFFSET 0 0 0.5\nJOINT more\n{'), r':13: .* End Site'

@@ -1,7 +1,9 @@
 """Archives of arrays: data alone, of a bounded size."""
 
 import io
+import os
 import random
+import struct
 import zipfile
 from pathlib import Path
 
@@ -68,6 +70,53 @@ def test_claims_are_compared_with_what_is_there(tmp_path):
         read_archive(path)
 
 
+HEADS = {
+    'parentheses': ("'<f8'", '(' * 4000 + ')' * 4000, 'Cannot parse header'),
+    'signs': ("'<f8'", '(' + '-' * 9000 + '1,)', 'MemoryError|recursion|Cannot parse'),
+    'sums': ("'<f8'", '(' + '1+' * 4500 + '1,)', 'recursion|Cannot parse'),
+    'spaces': ("'<f8'", '(1,)' + ' ' * 60_000, 'Header info length'),
+    'fields': (str([(f'a{i}', 'u1') for i in range(500)]), '(0,)', 'wanted numbers or'),
+    'inner array': ("('<f8', (1000000, 1000000))", '(0,)', 'invalid shape|wanted numbers'),
+    'time': ("'<M8[ns]'", '(0,)', r'holds datetime64\[ns\], wanted numbers or texts'),
+    'complex': ("'<c16'", '(0,)', 'holds complex128, wanted numbers'),
+    'product': ("'<f8'", '(4294967296, 4294967296)', 'claims 147573952589676412928 bytes'),
+    'negative': ("'<f8'", '(-1, -5)', 'dimension|EOF'),
+    'empty': ("'<f8'", '(0, 1000000000000000000)', 'has shape .0, 1000000000000000000., but'),
+    'digits': ("'<f8'", f'({"9" * 4000}, 0)', 'has shape .9999'),
+    'long texts': ("'<U1000000000'", '(0,)', 'not a valid dtype|claims'),
+}
+
+
+@pytest.mark.parametrize('name', HEADS)
+def test_hostile_heads_are_one_line(name, tmp_path):
+    descr, shape, message = HEADS[name]
+    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}\n"
+    path = archive_of(tmp_path / 'a.npz', header_of(text), b'')
+    with pytest.raises(ValueError, match=message) as caught:
+        read_archive(path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_what_unfolds_is_in_proportion_to_the_file(tmp_path):
+    """An archive of zeros, many names for one array, and bytes that become larger numbers."""
+    path = tmp_path / 'bomb.npz'
+    np.savez_compressed(path, zeros=np.zeros(20_000_000))
+    with pytest.raises(ValueError, match='it unpacks to more than'):
+        read_archive(path)
+    np.savez_compressed(path, zeros=np.zeros(1_000_000))
+    whole = path.read_bytes()
+    start, end = whole.index(b'PK\x01\x02'), whole.index(b'PK\x05\x06')
+    names = whole[start:end] * 2000
+    last = struct.pack('<HHHHIIH', 0, 0, 2000, 2000, len(names), start, 0)
+    path.write_bytes(whole[:start] + names + b'PK\x05\x06' + last)
+    with pytest.raises(ValueError, match='its 2000 arrays have 16000256000 bytes'):
+        read_archive(path)
+    np.savez_compressed(path, bytes=np.zeros(10_000_000, np.int8))
+    with pytest.raises(ValueError, match='claims 40000000 bytes'):
+        read_archive(path, largest=20_000_000)
+    assert read_archive(path)['bytes'].shape == (10_000_000,)
+
+
 @pytest.mark.parametrize('content', [b'', b'PK', b'not an archive at all'])
 def test_other_files(content, tmp_path):
     path = tmp_path / 'a.npz'
@@ -77,6 +126,9 @@ def test_other_files(content, tmp_path):
     assert '\n' not in str(caught.value)
     with pytest.raises(FileNotFoundError):
         read_archive(tmp_path / 'none.npz')
+    os.mkfifo(tmp_path / 'pipe.npz')
+    with pytest.raises(OSError, match='a pipe or a device, wanted a file'):
+        read_archive(tmp_path / 'pipe.npz')
 
 
 def test_damaged_archives_are_read_or_refused(tmp_path):

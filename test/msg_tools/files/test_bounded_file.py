@@ -1,5 +1,7 @@
 """Files up to an agreed size."""
 
+import os
+
 import pytest
 
 from msg_tools.files.bounded_file import read_bytes
@@ -14,9 +16,13 @@ def test_content_up_to_the_limit(tmp_path):
     assert str(path) not in str(caught.value)
 
 
-def test_what_has_no_size_ends_at_the_limit():
-    with pytest.raises(ValueError, match='more than 1000 bytes'):
-        read_bytes('/dev/zero', 1000)
+def test_pipes_and_devices_are_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / 'pipe')  # nobody writes into it: opened as usual, it would wait for ever
+    for path in (tmp_path / 'pipe', '/dev/zero', '/dev/null'):
+        with pytest.raises(ValueError, match='a pipe or a device, wanted a file'):
+            read_bytes(path, 1000)
+    with pytest.raises(ValueError, match='more than its 0 bytes'):
+        read_bytes('/proc/self/environ', 1000)
 
 
 def test_what_can_not_be_read(tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from msg_tools.files.array_file import read_archive
+from msg_tools.files.budget import Budget
 from msg_tools.files.plain_pickle import read_plain_pickle
 
 DATA = {
@@ -63,7 +64,7 @@ def test_nothing_is_called(tmp_path):
 
 def test_other_data_is_refused():
     for bad, message in (
-        ({(1, 2): 3}, 'keys that are neither texts nor numbers'),
+        ({(1, 2): 3}, 'keys that are neither texts nor small numbers'),
         ({1, 2}, 'the opcode EMPTY_SET'),
         (1j, "'builtins complex'"),
         (np.datetime64('2020'), 'wanted plain data'),
@@ -92,3 +93,34 @@ def test_a_list_within_itself_ends():
     held.append(held)
     found = read_plain_pickle(pickle.dumps(held))
     assert found[0] is found
+
+
+def test_memory_and_time_are_bounded():
+    """Loops of opcodes that copy what the memo holds, keys that are hashed alike, sides."""
+    text, times = b'x' * 1_000_000, 200
+    encode = b'\x8c\x07_codecs\x8c\x06encode\x93\x94X' + len(text).to_bytes(4, 'little') + text
+    loop = b'\x80\x04' + encode + b'\x94\x8c\x06latin1\x94](' + b'h\x00h\x01h\x02\x86R' * times
+    with pytest.raises(ValueError, match='it unpacks to more than'):
+        read_plain_pickle(loop + b'e.', Budget(0))
+    many = pickle.dumps([np.frombuffer(text, 'u1')] * 2 + [np.frombuffer(text, 'u1')] * 2, 5)
+    assert len(read_plain_pickle(many, Budget(0))) == 4
+    with pytest.raises(ValueError, match='neither texts nor small numbers'):
+        read_plain_pickle(pickle.dumps({k * (2**61 - 1): 0 for k in range(1, 9)}))
+    sides = pickle.dumps(np.zeros(4), 4).replace(
+        b'K\x04\x85', b'\x8a\x09' + b'\x7f' * 9 + b'\x85', 1
+    )
+    with pytest.raises(ValueError, match='sides are no numbers'):
+        read_plain_pickle(sides)
+
+
+def test_lists_that_hold_themselves_or_each_other_are_not_followed(tmp_path):
+    loop, tower = [], [1.0] * 10
+    loop.append(loop)
+    for _ in range(50):
+        tower = [tower] * 10
+    for bad in (loop, tower):
+        assert isinstance(read_plain_pickle(pickle.dumps(bad)), list)
+        held = np.empty((), object)
+        held[()] = bad
+        np.savez(tmp_path / 'a.npz', a=held)
+        assert read_archive(tmp_path / 'a.npz', with_objects=True)['a'].shape == ()

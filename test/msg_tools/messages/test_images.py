@@ -240,13 +240,54 @@ def test_defects_of_compressed_images():
         (compressed(huge), r'is damaged: Image size .* exceeds limit'),
         (compressed(large), rf'of {len(large)} bytes can not have a size of 4096x4096'),
         (compressed(with_size(png, 8192, 8200), 'png'), r'8192x8200, the limit is'),
-        (compressed(with_size(png, 0, 0), 'png'), r'is damaged: cannot identify image file$'),
+        (compressed(with_size(png, 0, 0), 'png'), r'has size 0x0, wanted at least one pixel'),
         (compressed(with_size(png, 8000, 8000), 'png'), r'can not have a size of 8000x8000'),
-        (compressed(png[:40] + b'?' + png[41:], 'png'), r'breaks off or is damaged: '),
+        (
+            compressed(png[:33] + chunk(b'IDAT', zlib.compress(bytes(10**8), 9)) + png[33:], 'png'),
+            'has more data than 44x30',
+        ),
+        (compressed(png[:40] + b'?' + png[41:], 'png'), r'breaks off or is damaged$'),
         (compressed(png[:33] + b'\x7f' + png[34:], 'png'), r'breaks off or is damaged'),
     ):
         with pytest.raises(ImageError, match=error):
             decode_image(message)
+
+
+def chunk(kind, content):
+    return (
+        struct.pack('>I', len(content))
+        + kind
+        + content
+        + struct.pack('>I', zlib.crc32(kind + content))
+    )
+
+
+@pytest.mark.parametrize('place', [33, -12])
+def test_chunks_of_a_png_that_its_picture_does_not_need_are_never_unpacked(place):
+    """Texts and profiles of 8 MB each, which the decoder would keep, and frames of an animation."""
+    png = encoded('.png', BGR)
+    text = chunk(b'zTXt', b'a\0\0' + zlib.compress(bytes(7_900_000), 9)) * 20
+    profile = chunk(b'iCCP', b'a\0\0' + zlib.compress(bytes(7_900_000), 9))
+    frames = chunk(b'acTL', struct.pack('>II', 1000, 0)) + chunk(b'fdAT', bytes(8)) * 1000
+    for more in (text, profile, frames):
+        content = png[:place] + more + png[place:]
+        np.testing.assert_array_equal(decode_image(compressed(content, 'png')), BGR)
+    for bad in (png[:-12], png[:8] + text + png[8:], png[:8], png[:33] + chunk(b'IEND', b'')):
+        with pytest.raises(ImageError, match='is damaged'):
+            decode_image(compressed(bad, 'png'))
+
+
+def test_many_scans_of_a_large_jpeg_are_refused():
+    """Each costs a pass over all pixels: 16 of these are as many as a hundred of small ones."""
+    done, file = cv2.imencode(
+        '.jpg', np.zeros((8000, 8000), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    )
+    assert done
+    plain = file.tobytes()
+    assert decode_image(compressed(plain)).shape == (8000, 8000, 3)
+    last = plain[plain.rfind(b'\xff\xda') : -2]
+    with pytest.raises(ImageError, match=r'jpeg has \d\d scans, the limit is 16'):
+        decode_image(compressed(plain[:-2] + last * 15 + plain[-2:]))
 
 
 # Encoding

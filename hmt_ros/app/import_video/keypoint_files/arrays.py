@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, person
+from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, image_size_of, person
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools.files.array_file import read_archive
+from msg_tools.files.budget import Budget
 
 _MOST_CLIPS = 10_000
 _LARGEST = 2**28  # bytes; an archive of an hour has 10**8
+_RECORDS = 10  # that a person counts for
 # Names of the orders of points in the metadata of VideoPose3D.
 _LAYOUTS = {'coco': 'coco17', 'h36m': 'h36m17'}
 
@@ -26,14 +29,18 @@ def read_arrays(path: Path) -> FoundPersons:
         ValueError: no archive, no keypoints in it, or arrays that do not fit each other.
     """
     content = read_archive(path, _LARGEST, with_objects=True)
+    budget = Budget(path.stat().st_size)
     if 'positions_2d' in content:
-        return _positions(path, content)
+        return _positions(path, content, budget)
     if 'pixels' not in content:
         raise ValueError('no array pixels; wanted pixels and landmark_names, or positions_2d')
     given = content.get('landmark_names')
     rows, n = (*content['pixels'].shape, 0, 0)[:2]
     n = n if given is None else given.size
-    names = None if given is None else tuple(str(x) for x in given.flat)
+    names = None if given is None else tuple(given.flat)
+    if names is not None and not all(isinstance(x, str) for x in names):
+        raise ValueError('landmark_names holds other things than texts')
+    budget.spend(records=_RECORDS * rows)
     shapes = {
         'pixels': (rows, n, 2),
         'visibility': (rows, n),
@@ -61,17 +68,20 @@ def read_arrays(path: Path) -> FoundPersons:
     return found
 
 
-def _positions(path: Path, content: dict[str, NDArray[Any]]) -> FoundPersons:
+def _positions(path: Path, content: dict[str, NDArray[Any]], budget: Budget) -> FoundPersons:
     """The clips of VideoPose3D: positions_2d[SUBJECT][ACTION][CAMERA] is (T, n, 2) px.
 
     Each clip is a person whose name is that of the clip.
     """
     about = _object(content.get('metadata'))
-    clips = dict(_clips(_object(content['positions_2d'])))
+    clips = dict(islice(_clips(_object(content['positions_2d'])), _MOST_CLIPS))
+    # One array may stand for many clips.
+    budget.spend(records=_RECORDS * sum(map(len, clips.values())))
     if not clips:
         raise ValueError('positions_2d has no arrays; wanted {SUBJECT: {ACTION: [(T, n, 2)]}}')
     rows, n = (max(x.shape[i] for x in clips.values()) for i in range(2))
-    scheme = schemes().get(_LAYOUTS.get(str(about.get('layout_name')), ''))
+    layout = about.get('layout_name')
+    scheme = schemes().get(_LAYOUTS.get(layout, '') if isinstance(layout, str) else '')
     names = scheme.names if scheme is not None and len(scheme.names) == n else None
     found = FoundPersons(
         path, rows=rows, unnamed=n if names is None else 0, size=_size(about), clips=len(clips)
@@ -93,9 +103,9 @@ def _clips(subjects: dict[Any, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
     """Names of clips and their arrays (T, n, 2 or 3)."""
     for subject, actions in subjects.items():
         named = actions.items() if isinstance(actions, dict) else [('', actions)]
-        for (action, cameras), _ in zip(named, range(_MOST_CLIPS), strict=False):
+        for action, cameras in named:
             several = isinstance(cameras, (list, tuple)) or np.ndim(cameras) == 1
-            for i, points in enumerate(cameras[:_MOST_CLIPS] if several else [cameras]):
+            for i, points in enumerate(cameras if several else [cameras]):
                 name = f'{str(subject)[:40]}/{str(action)[:40]}/{i}'
                 numbers = isinstance(points, np.ndarray) and points.dtype.kind in 'fiu'
                 if not (numbers and points.size and points.ndim == 3 and points.shape[2] in (2, 3)):
@@ -108,5 +118,4 @@ def _size(about: dict[Any, Any]) -> tuple[int, int] | None:
     videos = about.get('video_metadata')
     one = [*videos.values()] if isinstance(videos, dict) else []
     known = len(one) == 1 and isinstance(one[0], dict)
-    width, height = (one[0].get(x) if known else None for x in 'wh')
-    return (width, height) if isinstance(width, int) and isinstance(height, int) else None
+    return image_size_of(one[0].get('w'), one[0].get('h')) if known else None

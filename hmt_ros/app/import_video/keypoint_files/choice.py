@@ -20,6 +20,8 @@ _FASTEST = 0.5
 _AROUND = 0.15
 # A track ends when nobody was there for so many frames.
 _PATIENCE = 30
+# Pairs of a person and a track that are compared in a clip, and more for each person in it.
+_FREE_PAIRS, _PAIRS = 20_000, 100
 _LISTED = 8  # names in an error
 
 
@@ -169,11 +171,18 @@ def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dic
 
     Args:
         unit: difference of keys from frame to frame.
+
+    Raises:
+        ValueError: there are so many persons at once that their tracks can not be told apart.
     """
     tracks: list[dict[int, Person]] = []
     going: list[tuple[int, Person, dict[int, Person]]] = []
+    left = _FREE_PAIRS
     for key, persons in likely.items():
         going = [x for x in going if key - x[0] <= _PATIENCE * unit]
+        left += len(persons) * (_PAIRS - len(going))
+        if left < 0:
+            raise ValueError(f'too many persons at once to follow each: {len(going)} tracks')
         pairs = sorted(
             (x.track != last.track, x.distance(last), i, j)
             for j, (before, last, _) in enumerate(going)

@@ -167,7 +167,7 @@ def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
     """Names points in the order in which they are a person."""
     persons = _likely(found)
     names = persons[0].keypoints.names
-    alike = [x.keypoints for x in persons if len(x.keypoints.names) == len(names)]
+    alike = [x.keypoints for x in persons if x.keypoints.names == names]
     pixels = np.stack([np.where(x.confidences[:, None] < _SURE, np.nan, x.pixels) for x in alike])
     orders = unnamed_orders().get(found.unnamed, ())
     if scheme != AUTO:

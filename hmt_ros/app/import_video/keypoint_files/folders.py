@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hmt_ros.app.import_video.frames import FrameSource, natural_order
-from hmt_ros.app.import_video.keypoint_files.json_layouts import frames_in, person_in, read_json
+from hmt_ros.app.import_video.keypoint_files.json_layouts import frames_in, person_in
 from hmt_ros.app.import_video.keypoint_files.persons import (
     MOST_FRAMES,
     FoundPersons,
@@ -18,8 +18,9 @@ from hmt_ros.app.import_video.keypoint_files.persons import (
 )
 from hmt_ros.image.keypoint_schemes import unnamed_orders
 from msg_tools.files.bounded_file import read_bytes
+from msg_tools.files.plain_json import read_plain_json
 
-LARGEST_FILE = 2**24  # bytes
+LARGEST_FILE, LARGEST_LABELS = 2**24, 2**20  # bytes, of a frame
 _BOX = 5  # class, centre and size of a box come before the keypoints
 # Names of the frames of a video, which Ultralytics counts from 1.
 _OF_VIDEO = re.compile(r'.*_[1-9]\d*')
@@ -51,7 +52,7 @@ def read_folder(path: Path, source: FrameSource) -> FoundPersons:
             if kind == '.txt':
                 _add_labels(found, file, number)
                 continue
-            for _, entries in frames_in(read_json(file), number):
+            for _, entries in frames_in(read_plain_json(file, LARGEST_FILE), number):
                 for entry in entries:
                     found.add(number, person_in(found, entry, 'a person'))
         except ValueError as error:
@@ -61,7 +62,8 @@ def read_folder(path: Path, source: FrameSource) -> FoundPersons:
 
 def _add_labels(found: FoundPersons, file: Path, number: int) -> None:
     """Adds the lines of Ultralytics: class, box, keypoints as fractions, confidence, track."""
-    for i, line in enumerate(read_bytes(file, LARGEST_FILE).decode('utf-8', 'replace').split('\n')):
+    text = read_bytes(file, LARGEST_LABELS).decode('utf-8', 'replace')
+    for i, line in enumerate(text.split('\n')):
         try:
             values = np.array(line.split(), dtype=np.float64)
         except ValueError as error:

@@ -5,7 +5,6 @@ Their layouts differ in how frames hold persons, and in the names of what a pers
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,14 @@ from hmt_ros.app.import_video.frames import FrameSource
 from hmt_ros.app.import_video.keypoint_files.persons import (
     FoundPersons,
     Person,
+    image_size_of,
     numbers_of,
     orders_of,
     person,
 )
 from hmt_ros.image.keypoint_schemes import recognised
 from hmt_ros.inference.arrays import Array
-from msg_tools.files.bounded_file import read_bytes
-from msg_tools.files.error_line import error_line
+from msg_tools.files.plain_json import load_plain_json
 
 LARGEST_FILE = 2**27  # bytes
 # Names of what a person or a frame has, in all layouts.
@@ -35,19 +34,6 @@ _FRAME = ('image_id', 'frame_id', 'frame', 'image_name', 'file_name')
 _PERSONS = ('people', 'bodies', 'instances')
 
 Labelled = tuple[Any, list[Any]]
-
-
-def read_json(content: bytes | str | Path) -> Any:
-    """The content of a file, or of a text, of JSON.
-
-    Raises:
-        ValueError: no JSON, or too much.
-    """
-    text = read_bytes(content, LARGEST_FILE) if isinstance(content, Path) else content
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f'not JSON ({error_line(error)})') from error
 
 
 def add_json(found: FoundPersons, content: Any, source: FrameSource) -> None:
@@ -94,20 +80,20 @@ def _get(entry: Any, names: Sequence[str], default: Any = None) -> Any:
 
 def _annotations(found: FoundPersons, content: dict[str, Any]) -> tuple[Any, list[Labelled]]:
     """Names and frames of COCO annotations."""
-    labels: dict[Any, str] = {}
+    labels: dict[str, str | int] = {}
     for image in _list(content, 'images'):
-        if not isinstance(image.get('id'), (int, str)):
-            raise ValueError('an image has no id')
-        labels[image['id']] = str(image.get('file_name') or image['id'])
-        if isinstance(image.get('width'), int) and isinstance(image.get('height'), int):
-            found.size = image['width'], image['height']
+        name = image.get('file_name') or image.get('id')
+        if not (isinstance(image.get('id'), (int, str)) and isinstance(name, (int, str))):
+            raise ValueError('an image has no id, or a file_name that is no text')
+        labels[str(image['id'])] = name
+        found.size = image_size_of(image.get('width'), image.get('height')) or found.size
     categories = _get(content, ('categories',))
     named = [_get(x, ('keypoints',)) for x in categories] if isinstance(categories, list) else []
     names = next((tuple(map(str, x)) for x in named if isinstance(x, list)), None)
     frames: list[Labelled] = []
     for entry in _list(content, 'annotations'):
         label = entry.get('image_id')
-        known = labels.get(label, label) if isinstance(label, (int, str)) else None
+        known = labels.get(str(label), label) if isinstance(label, (int, str)) else None
         frames.append((known, [entry]))
     return names, frames
 
@@ -125,7 +111,7 @@ def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
         yield from _frames_of_object(content, label)
     elif isinstance(content, list):
         for i, entry in enumerate(content):
-            entry = read_json(entry) if isinstance(entry, str) else entry
+            entry = load_plain_json(entry) if isinstance(entry, str) else entry
             own = _get(entry, _FRAME, label)
             if isinstance(entry, list):
                 yield i, entry
@@ -210,7 +196,7 @@ def person_in(
         names,
         values[:, :2],
         confidences,
-        track='' if track in (None, -1, []) else str(track),
+        track=str(track) if isinstance(track, (int, float, str)) and track != -1 else '',
         score=float(told) if isinstance(told, (int, float)) and abs(told) < 1e9 else 1.0,
     )
 

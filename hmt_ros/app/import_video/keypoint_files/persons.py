@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmt_ros.app.command_line import LARGEST
 from hmt_ros.app.import_video.frames import Frame, FrameSource
 from hmt_ros.image.keypoint_schemes import landmark_called, schemes, unnamed_orders
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -22,6 +23,7 @@ _MATCHING_NS = 10_000_000  # between the time of a row and that of its frame
 MOST_FRAMES = 10_000_000
 # A person whose score is a smaller part of the best of the clip is none.
 _LIKELY = 0.2
+_SUREST = 1e9
 _SIDES = {'l': 'left', 'r': 'right', 'left': 'left', 'right': 'right'}
 _SAME = {'mid_hip': 'hip', 'c_hip': 'hip', 'head_top': 'head', 'upper_neck': 'neck'}
 
@@ -40,21 +42,27 @@ class Person:
     track: str = ''
     score: float = 1.0
 
-    @property
+    @cached_property
     def box(self) -> Array:
         """(2, 2) least and greatest column and row of the keypoints that were seen."""
         seen = self.keypoints.pixels[self.keypoints.seen]
         return np.stack([seen.min(0), seen.max(0)])
 
-    @property
+    @cached_property
     def size(self) -> float:
         """Diagonal of the box, px."""
         return float(np.linalg.norm(self.box[1] - self.box[0]))
 
     def distance(self, other: Person) -> float:
         """Mean distance of the keypoints that both have, px; without any, of the boxes."""
-        both = self.keypoints.seen & other.keypoints.seen
-        apart = self.keypoints.pixels[both] - other.keypoints.pixels[both]
+        names, theirs = self.keypoints.names, other.keypoints
+        pixels, seen = theirs.pixels, theirs.seen
+        if names != theirs.names:  # rows of a table, of different keypoints
+            place = {name: i for i, name in enumerate(theirs.names)}
+            order = np.array([place.get(name, -1) for name in names])
+            pixels, seen = pixels[order], seen[order] & (order >= 0)
+        both = self.keypoints.seen & seen
+        apart = self.keypoints.pixels[both] - pixels[both]
         if not both.any():
             apart = (self.box.mean(0) - other.box.mean(0))[None]
         return float(np.linalg.norm(apart, axis=1).mean())
@@ -86,7 +94,7 @@ def person(
     if names is None:
         names = schemes()[orders_of(len(places))[0]].names
         places, sure = places[: len(names)], sure[: len(names)]
-    sure = np.maximum(np.nan_to_num(sure, nan=0.0), 0.0)
+    sure = np.clip(np.nan_to_num(sure, nan=0.0), 0.0, _SUREST)
     unseen = ~np.isfinite(places).all(1) | (places == 0.0).all(1) | (sure == 0.0)
     if unseen.all():
         return None
@@ -114,6 +122,12 @@ def orders_of(count: int) -> tuple[str, ...]:
     raise ValueError(
         f'{count} keypoints without names; wanted {text}, or names: a .csv with NAME_u, NAME_v'
     )
+
+
+def image_size_of(width: Any, height: Any) -> tuple[int, int] | None:
+    """Width and height that a file gives its images, px; None: no sides that images have."""
+    known = all(isinstance(side, int) and 0 < side <= LARGEST for side in (width, height))
+    return (width, height) if known else None
 
 
 def landmark_name(name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hmt_ros.app.import_video.keypoint_files.arrays import read_arrays
 from hmt_ros.app.import_video.keypoint_files.choice import Choice, chosen_person
 from hmt_ros.app.import_video.keypoint_files.clip_check import check_clip, check_steps
 from hmt_ros.app.import_video.keypoint_files.folders import read_folder
-from hmt_ros.app.import_video.keypoint_files.json_layouts import add_json, read_json
+from hmt_ros.app.import_video.keypoint_files.json_layouts import LARGEST_FILE, add_json
 from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons
 from hmt_ros.app.import_video.keypoint_files.tables import read_table
 from hmt_ros.app.progress import Tell
@@ -20,6 +21,7 @@ from hmt_ros.body.skeleton import other_side
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.files.error_line import error_line
+from msg_tools.files.plain_json import read_plain_json
 
 _FARTHEST = 1e5  # px; no image is so large
 _LONGEST = 240  # characters of an error
@@ -59,7 +61,7 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
             raise ValueError('no such file')
         elif kind == '.json':
             found = FoundPersons(path)
-            add_json(found, read_json(path), source)
+            add_json(found, read_plain_json(path, LARGEST_FILE), source)
         elif kind == '.npz':
             found = read_arrays(path)
         elif kind in ('.csv', '.trc'):
@@ -74,7 +76,7 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
             raise ValueError(f'a keypoint lies {farthest:g} px away, wanted places in an image')
         for names in {x.keypoints.names for x in found.persons()}:
             if len({*names}) < len(names):
-                twice = next(x for x in names if names.count(x) > 1)
+                twice = next(x for x, other in pairwise(sorted(names)) if x == other)
                 raise ValueError(f'two keypoints are called {twice}')
     except (ValueError, RecursionError) as error:
         text = ''.join(x if x.isprintable() else '?' for x in error_line(error))
@@ -106,7 +108,7 @@ def keypoints_of_person(
         chosen = chosen_person(found, reading.person, first, rate)
         check_steps([chosen[key] for key in sorted(chosen)])
     except ValueError as error:
-        raise ValueError(f'{found.path}: {error}') from error
+        raise ValueError(f'{found.path}: {error_line(error)}') from error
     for text in told:
         tell(text)
     return {

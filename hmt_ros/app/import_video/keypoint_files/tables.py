@@ -15,10 +15,13 @@ from hmt_ros.app.import_video.frames import FrameSource
 from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, landmark_name, person
 from hmt_ros.image.keypoint_schemes import landmark_called
 from msg_tools.files.bounded_file import read_bytes
+from msg_tools.files.budget import Budget
 from msg_tools.files.error_line import error_line
+from msg_tools.files.plain_json import LARGEST
 from msg_tools.messages.headers import SECOND_NS
 
 LARGEST_FILE = 2**26  # bytes
+_CELL = 64  # bytes
 FRAME, TIME, STAMP = 'frame', 'time_s', 'stamp_ns'
 # Times from the first on are Unix times, and later ones than the second not in seconds.
 _UNIX, _LATEST = 1e8, 1e11  # s
@@ -42,8 +45,13 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
         text = read_bytes(path, LARGEST_FILE).decode('utf-8-sig')
     except UnicodeDecodeError as error:
         raise ValueError('not a table: the file is not text in UTF-8') from error
-    markers = path.suffix.lower() == '.trc'
-    lines = csv.reader(io.StringIO(text), strict=not markers, delimiter='\t' if markers else ',')
+    markers, budget = path.suffix.lower() == '.trc', Budget(len(text))
+    separator = '\t' if markers else ','
+    # Python takes as much for a cell and its place in a list, and for a line twice that.
+    needed = 2 * len(text) + _CELL * (text.count(separator) + 2 * text.count('\n'))
+    if needed > LARGEST:
+        raise ValueError(f'a table whose cells take {needed} bytes, wanted at most {LARGEST}')
+    lines = csv.reader(io.StringIO(text), strict=not markers, delimiter=separator)
     rows: dict[tuple[str, str], dict[str, tuple[float, float, float]]] = defaultdict(dict)
     try:
         table = [[x.strip() for x in line] for line in lines]
@@ -52,10 +60,10 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
     if markers:
         when, cells = TIME, _of_markers(table)
     elif any(x[:1] == ['coords'] for x in table[:4]):
-        when, cells = FRAME, _of_deeplabcut(table)
+        when, cells = FRAME, _of_deeplabcut(table, budget)
     else:
         when = next((x for x in (FRAME, TIME, STAMP) if table and x in table[0]), '')
-        cells = _of_rows(table, when)
+        cells = _of_rows(table, when, budget)
     for number, label, who, name, (u, v, sure) in cells:
         about = rows[label, who]
         if name in about:
@@ -73,16 +81,18 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
     return found
 
 
-def _of_rows(table: list[list[str]], when: str) -> Iterator[Cells]:
+def _of_rows(table: list[list[str]], when: str, budget: Budget) -> Iterator[Cells]:
     """A row for each person in a frame (NAME_u, NAME_v, ...), or for each keypoint (name, u, v)."""
     columns = table[0] if table else []
     if not when:
         raise ValueError(f'wanted a column frame, time_s or stamp_ns, saw {columns[:8]}')
     wide = [x.removesuffix('_u') for x in columns if x.endswith('_u')]
-    lacking = [f'{x}_v' for x in wide if f'{x}_v' not in columns]
+    known = {*columns}
+    budget.spend(records=len(wide) * len(table))
+    lacking = [f'{x}_v' for x in wide if f'{x}_v' not in known]
     if lacking:
         raise ValueError(f'no column {lacking[0]}')
-    if not wide and not {'name', 'u', 'v'} <= {*columns}:
+    if not wide and not {'name', 'u', 'v'} <= known:
         raise ValueError(f'wanted columns NAME_u and NAME_v, or name, u and v, saw {columns[:8]}')
     names = {name: landmark_name(name) for name in wide}
     for number, line in enumerate(table[1:], 2):
@@ -94,12 +104,12 @@ def _of_rows(table: list[list[str]], when: str) -> Iterator[Cells]:
         for name in wide or [row['name']]:
             kind = f'{name}_' if wide else ''
             u, v, sure = (row.get(f'{kind}{x}', '') for x in ('u', 'v', 'confidence'))
-            sure = sure if f'{kind}confidence' in columns else '1'
+            sure = sure if f'{kind}confidence' in known else '1'
             who = row.get('person', '')
             yield number, row[when], who, names.get(name) or landmark_name(name), (u, v, sure)
 
 
-def _of_deeplabcut(table: list[list[str]]) -> Iterator[Cells]:
+def _of_deeplabcut(table: list[list[str]], budget: Budget) -> Iterator[Cells]:
     """Rows below a head of scorer, individuals (of several animals), bodyparts and coords."""
     depth = next(i for i, x in enumerate(table) if x[:1] == ['coords'])
     heads = {x[0]: x for x in table[: depth + 1] if x}
@@ -109,6 +119,7 @@ def _of_deeplabcut(table: list[list[str]]) -> Iterator[Cells]:
     names = _landmarks(parts[1:])
     first = next((i for i, x in enumerate(coordinates) if x == 'x'), 0)
     places = [i for i in range(len(parts)) if coordinates[i : i + 2] == ['x', 'y']]
+    budget.spend(records=len(coordinates) * len(table))
     for number, row in enumerate(table[depth + 1 :], depth + 2):
         cells = row + [''] * (len(coordinates) - len(row))
         for i in places:
