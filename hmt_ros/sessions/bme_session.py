@@ -69,6 +69,7 @@ from hmt_ros.sessions.camera_session import (
 )
 from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK_INPUT, PREDICTION, ImageInput
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input, known_lifter
+from hmt_ros.sessions.named_file import named_file
 from hmt_ros.sessions.session import (
     NeededInput,
     PublishedTopic,
@@ -473,10 +474,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
 def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
     """The model for the person, and the relative deviation of the size of people from it."""
-    try:
+    with named_file('model_file', parameters.model_file, 'model of poses'):
         predictor = load_predictor(parameters.model_file or SHIPPED)
-    except OSError as error:
-        raise ValueError(error_line(error)) from error
     if parameters.propagation == BY_EXPERTS and predictor.dynamics is None:
         raise ValueError(
             f"propagation 'experts' needs a model that was trained with --dynamics, which "

@@ -39,6 +39,7 @@ from hmt_ros.sessions.image_inputs import (
     ImageInput,
     ImageInputs,
 )
+from hmt_ros.sessions.named_file import named_file
 from hmt_ros.sessions.session import NeededInput, Session, SessionState, State
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from msg_tools.files.bounded_file import read_bytes
@@ -413,9 +414,10 @@ def read_picture(file: str) -> Image:
     Raises:
         ValueError: there is none in the file, or one that is too large.
     """
-    try:
-        return decode_picture(read_bytes(file, _LARGEST_PICTURE_FILE))
-    except ImageError as error:
-        raise ValueError(f'{file}: not a picture ({error})') from error
-    except ValueError as error:
-        raise ValueError(f'{file}: {error}') from error
+    with named_file('background_file', file, 'PNG or JPEG image'):
+        try:
+            return decode_picture(read_bytes(file, _LARGEST_PICTURE_FILE))
+        except ImageError as error:
+            raise ValueError(f'{file}: not a picture ({error})') from error
+        except ValueError as error:
+            raise ValueError(f'{file}: {error}') from error

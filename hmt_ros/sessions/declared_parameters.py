@@ -42,6 +42,8 @@ FRACTION = (0.0, 1.0)
 
 TRANSPORTS = ('raw', 'compressed')
 LONGEST_TIMEOUT = 60.0  # s
+# Characters of a text, and entries of a list, that a parameter may have.
+LONGEST_TEXT, LONGEST_LIST = 4096, 100
 # Value of `source` for messages of this package.
 OWN_KEYPOINTS = 'keypoints'
 
@@ -91,11 +93,15 @@ class NodeParameters:
             the oldest are dropped.
         autostart: If true, the node configures and activates itself; if false, it waits for its
             lifecycle services.
+        file_folders: Folders, separated by ':', in which files must lie that a parameter names
+            while the node runs; empty: the share folder of the package, the home of the user, and
+            the working folder. What is named at launch may lie anywhere.
     """
 
     reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
     queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
     autostart: bool = parameter_field(True, AT_LAUNCH)
+    file_folders: str = parameter_field('', AT_LAUNCH)
 
 
 @dataclass(frozen=True)
@@ -200,6 +206,10 @@ class DeclaredParameter:
             value = float(value)
         if type(value) is not wanted:
             raise ParameterError(f'{self.name} must be a {_NAMES[wanted]}, saw {value!r}')
+        if wanted is str and len(value) > LONGEST_TEXT:
+            raise ParameterError(
+                f'{self.name} has {len(value)} characters, the limit is {LONGEST_TEXT}'
+            )
         if self.limits is not None and not self.limits[0] <= value <= self.limits[1]:
             low, high = self.limits
             raise ParameterError(
@@ -210,6 +220,10 @@ class DeclaredParameter:
     def _numbers(self, value: Any) -> tuple[float, ...]:
         """A list of numbers; to ROS an empty list is no value at all."""
         numbers = () if value is None else value
+        if hasattr(numbers, '__len__') and len(numbers) > LONGEST_LIST:
+            raise ParameterError(
+                f'{self.name} has {len(numbers)} entries, the limit is {LONGEST_LIST}'
+            )
         # ROS has bytes, whole numbers and texts in lists, too.
         if not isinstance(numbers, list | tuple | array) or not all(
             type(number) in (int, float) for number in numbers

@@ -34,6 +34,7 @@ from hmt_ros.sessions.image_inputs import (
     ImageInput,
 )
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input
+from hmt_ros.sessions.named_file import public_line
 from hmt_ros.sessions.session import PublishedTopic, SessionState
 from hmt_ros.sessions.track import Seen, Shared, Track
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
@@ -153,7 +154,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             try:
                 start = prepare_start(self.parameters)
             except ValueError as error:
-                text = f'{error}; {self.ESTIMATE} starts as the time before'
+                text = f'{public_line(error)}; {self.ESTIMATE} starts as the time before'
                 self._log.fault('start', text)
                 start = self.start
         self.start = start
