@@ -74,6 +74,8 @@ AnySession = TypeVar('AnySession', bound=Session[Any, Any])
 Parameters = TypeVar('Parameters', bound=NodeParameters)
 # Periods of the diagnostics between two lines on the console that tell of the same status.
 QUIET_PERIODS = 10
+# Time for which the diagnostics tell of a clock that went back, s.
+ALARM = 5.0
 # Parameters that one request may set; each takes a part of a millisecond.
 MOST_PARAMETERS = 256
 
@@ -144,6 +146,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         # On topics that the node both publishes and subscribes to.
         self._own = OwnMessages()
         self._failure = ''
+        # What a step back of the clock has led to, and when that was told first.
+        self._jump = '', 0.0
         # Errors of the node itself.
         self._errors, self._last_error = 0, ''
         self._told_at = self._untold = 0
@@ -525,6 +529,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return DiagnosticStatus.ERROR, self._failure
         if state is None or label != 'active':
             return DiagnosticStatus.OK, label
+        if state.time_jump != self._jump[0]:
+            self._jump = state.time_jump, time.monotonic()
+        if state.time_jump and time.monotonic() - self._jump[1] < ALARM:
+            return DiagnosticStatus.ERROR, state.time_jump
         trouble = (
             state.trouble()
             or self._events.deaf_topic(self._connected.values())

@@ -87,8 +87,9 @@ class NodeParameters:
     """Parameters that all nodes have.
 
     Attributes:
-        reset_on_time_jump: If true, a message that is older than the one before restarts the
-            estimate; if false, it is skipped. The default is the value of use_sim_time.
+        reset_on_time_jump: If true, two messages in a row that are older than the one before
+            restart the estimate; if false, it takes three that are at least a second older, and
+            others are skipped. The default is the value of use_sim_time.
         queue_size: Maximum number of messages that wait to be estimated from; when the node is late
             the oldest are dropped.
         autostart: If true, the node configures and activates itself; if false, it waits for its

@@ -121,7 +121,7 @@ class ChosenPerson:
         if not seen:
             return None
         last = self._last
-        if last is None or stamp_ns - self._stamp > longest_absence * SECOND_NS:
+        if last is None or abs(stamp_ns - self._stamp) > longest_absence * SECOND_NS:
             chosen = max(seen, key=_size)
             self._size = 0.0
         else:

@@ -161,6 +161,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         """Publishes the poses that are still open; the next mixture begins a new window."""
         stamp = self._newest or 0
         self._end_window()
+        self._orders.clear()
         return stamp
 
     def restart(self) -> None:
@@ -174,7 +175,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self.kept = KeptMixtures(self._of, ())
         super().restart()
 
-    def _jump_back(self, stamp: int) -> None:
+    def _jump_back(self, first: int, last: int) -> None:
         self._end_window()
         self._first_identity = 1
 
@@ -195,8 +196,6 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
                 'say counts more than once',
             )
-        if not self._is_next(stamp, self._newest):
-            return
         self._begin_track(of)
         evidence = _levelled(evidence, of.body)
         evidence = self._without_turns(evidence, of.body)
@@ -261,8 +260,6 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _take_nobody(self, stamp: int, existence: float) -> None:
         """Ends the window: the person is no longer in view."""
         of, smooths = self._of, self._window is not None
-        if not self._is_next(stamp, self._newest):
-            return
         self._end_window()
         self._nobody = True
         if of is not None and smooths:

@@ -192,8 +192,8 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         elif False in outcomes:
             self._log.counts['skipped'] += 1
 
-    def _jump_back(self, stamp: int) -> None:
-        super()._jump_back(stamp)
+    def _jump_back(self, first: int, last: int) -> None:
+        super()._jump_back(first, last)
         # Where time begins again, so do the numbers of the tracks.
         self._keypoints.chosen.forget()
         self._begin()

@@ -257,8 +257,9 @@ def test_track_counts_no_more_after_time_has_jumped(session, somebody, stub_pred
     looked_at(stub_predictor, one, somebody, [5])
     one.take(TRACK, track(likelihoods, 5))
     assert looked_at(stub_predictor, one, somebody, [6]) == 0
-    assert one.take(IMAGE, somebody.image(1)).faults == ()
-    assert looked_at(stub_predictor, one, somebody, [2]) == 1
+    assert one.take(IMAGE, somebody.image(1)).published == ()
+    assert len(one.take(IMAGE, somebody.image(2)).published) == 2
+    assert len(stub_predictor.asked) == 3
     # What can not be used is told of as usual.
     one.take(TRACK, track(likelihoods, 2))
     one.parameters = replace(one.parameters, reset_on_time_jump=False)
