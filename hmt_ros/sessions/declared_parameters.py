@@ -16,6 +16,7 @@ import textwrap
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any, ClassVar, TypeVar
 
 from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, Scheme, schemes
@@ -292,6 +293,7 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
     return replace(settings, **changes)  # type: ignore[type-var]
 
 
+@cache
 def described_fields(cls: type) -> dict[str, str]:
     """The section 'Attributes:' of the docstrings of a class and its bases: one line by name."""
     result: dict[str, str] = {}
