@@ -144,21 +144,10 @@ def file_folders(given: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(filter(None, named)))
 
 
-def next_step(node: Node, error: str, checked: Iterable[str]) -> str:
-    """Advice after a configuration that failed.
-
-    Args:
-        error: why.
-        checked: names of parameters that may be the cause.
-    """
-    values = {name: node.get_parameter(name).value for name in checked}
-    wrong = [name for name, value in values.items() if value and str(value) in error]
-    advice = 'mend that'
-    if wrong:
-        kind = 'file' if wrong[0].endswith('_file') else 'value'
-        advice = f'set {wrong[0]} to a {kind} that can be used'
+def next_step(node: Node) -> str:
+    """Advice after a configuration that failed."""
     change = f'ros2 lifecycle set {node.get_fully_qualified_name()}'
-    return f'{advice}, then: {change} configure; {change} activate'
+    return f'mend that, then: {change} configure; {change} activate'
 
 
 def files_for_others(arguments: Iterable[str], node: str) -> list[str]:

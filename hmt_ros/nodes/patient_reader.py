@@ -6,9 +6,10 @@ its result.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, wait
+from threading import Thread
 from typing import Any
 
 # Longest time that a node waits for a reader, s, and largest share of its time that it waits: many
@@ -21,9 +22,8 @@ class PatientReader:
     """Reads for one who asks at a time; all methods are for one thread."""
 
     def __init__(self) -> None:
-        self._thread: threading.Thread | None = None
-        self._of: Any = None
-        self._error: Exception | None = None
+        # What is asked for, and its result.
+        self._asked: tuple[Any, Future[None]] | None = None
         # Time that the node may wait, s, and when that was known.
         self._left, self._since = LONGEST_WAIT, time.monotonic()
 
@@ -31,7 +31,7 @@ class PatientReader:
         """Reads files.
 
         Args:
-            of: what is asked for; equal to that of a question before which it repeats.
+            of: what is asked for; equal to that of a question that is asked again.
             action: reads them.
             meanwhile: called while others wait.
 
@@ -39,30 +39,29 @@ class PatientReader:
             ValueError: others are being read, or these are not read yet; one line.
             Exception: of the action.
         """
-        if self._thread is None or (self._of != of and not self._thread.is_alive()):
-            self._of = of
-            self._thread = threading.Thread(
-                target=self._do, args=(action,), name='read files', daemon=True
-            )
-            self._thread.start()
-        elif self._of != of:
+        if self._asked is None or (self._asked[0] != of and self._asked[1].done()):
+            self._asked = of, Future()
+            # Not of a pool: the process would wait for it at its end.
+            Thread(target=_do, args=(action, self._asked[1]), name='read', daemon=True).start()
+        asked, result = self._asked
+        if asked != of:
             raise ValueError('other files are still being read: ask again later')
         began = time.monotonic()
-        left = min(self._left + SHARE * (began - self._since), LONGEST_WAIT)
-        while self._thread.is_alive() and (rest := began + left - time.monotonic()) > 0.0:
-            self._thread.join(min(rest, _GLANCE))
+        end = began + min(self._left + SHARE * (began - self._since), LONGEST_WAIT)
+        while not result.done() and (rest := end - time.monotonic()) > 0.0:
+            wait([result], min(rest, _GLANCE))
             meanwhile()
-        self._left, self._since = max(began + left - time.monotonic(), 0.0), began
-        if self._thread.is_alive():
+        self._left, self._since = max(end - time.monotonic(), 0.0), began
+        if not result.done():
             raise ValueError('the files are still being read: ask again later')
-        self._thread, error = None, self._error
-        if error is not None:
-            raise error
+        self._asked = None
+        result.result()
 
-    def _do(self, action: Callable[[], Any]) -> None:
-        self._error = None
-        try:
-            action()
-        except Exception as error:  # noqa: BLE001
-            # Raised where the result is asked for.
-            self._error = error
+
+def _do(action: Callable[[], Any], result: Future[None]) -> None:
+    try:
+        action()
+        result.set_result(None)
+    except Exception as error:  # noqa: BLE001
+        # Raised where the result is asked for.
+        result.set_exception(error)

@@ -249,8 +249,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         try:
             session = self._new_session(self._settings, self._publish, self._is_wanted)
         except ValueError as error:
-            text = public_line(error)
-            self._failure = f'{text}; {next_step(self, text, self.SESSION.CHECKED)}'
+            self._failure = f'{public_line(error)}; {next_step(self)}'
             self.get_logger().error(self._failure)
             self._diagnose()
             return TransitionCallbackReturn.FAILURE
@@ -456,8 +455,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     def _tell_error(self, error: Exception) -> str:
         self._errors += 1
         self._last_error = f'{type(error).__name__}: {error_line(error)}'
-        text = f'{self._last_error}; with --log-level debug the log has the place'
-        self.get_logger().error(text)
+        self.get_logger().error(f'{self._last_error}; --log-level debug shows where')
         self.get_logger().debug(''.join(traceback.format_exception(error)))
         return self._last_error
 

@@ -43,8 +43,7 @@ FRACTION = (0.0, 1.0)
 
 TRANSPORTS = ('raw', 'compressed')
 LONGEST_TIMEOUT = 60.0  # s
-# Characters of a text, and entries of a list, that a parameter may have.
-LONGEST_TEXT, LONGEST_LIST = 4096, 100
+LONGEST_VALUE = 4096  # characters of a text, or entries of a list
 # Value of `source` for messages of this package.
 OWN_KEYPOINTS = 'keypoints'
 
@@ -202,16 +201,16 @@ class DeclaredParameter:
             ParameterError: another type, or beyond the limits.
         """
         wanted: Any = type(self.default)
+        if hasattr(value, '__len__') and len(value) > LONGEST_VALUE:
+            raise ParameterError(
+                f'{self.name} has the length {len(value)}, the limit is {LONGEST_VALUE}'
+            )
         if wanted is tuple:
             return self._numbers(value)
         if wanted is float and type(value) is int:
             value = float(value)
         if type(value) is not wanted:
             raise ParameterError(f'{self.name} must be a {_NAMES[wanted]}, saw {value!r}')
-        if wanted is str and len(value) > LONGEST_TEXT:
-            raise ParameterError(
-                f'{self.name} has {len(value)} characters, the limit is {LONGEST_TEXT}'
-            )
         if self.limits is not None and not self.limits[0] <= value <= self.limits[1]:
             low, high = self.limits
             raise ParameterError(
@@ -222,10 +221,6 @@ class DeclaredParameter:
     def _numbers(self, value: Any) -> tuple[float, ...]:
         """A list of numbers; to ROS an empty list is no value at all."""
         numbers = () if value is None else value
-        if hasattr(numbers, '__len__') and len(numbers) > LONGEST_LIST:
-            raise ParameterError(
-                f'{self.name} has {len(numbers)} entries, the limit is {LONGEST_LIST}'
-            )
         # ROS has bytes, whole numbers and texts in lists, too.
         if not isinstance(numbers, list | tuple | array) or not all(
             type(number) in (int, float) for number in numbers

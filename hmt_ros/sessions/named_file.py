@@ -16,22 +16,13 @@ from hmt_ros.body import model_names
 from hmt_ros.experts import lifter, pose_predictor
 from msg_tools.files.error_line import error_line, one_line
 
-
-def _no_names() -> Collection[str]:
-    return ('',)
-
-
-def _predictors() -> Collection[str]:
-    return ['', *(path.stem for path in pose_predictor.FOLDER.glob('*.npz'))]
-
-
-# Parameters that may name a file, and the values of each that name none.
+# Parameters that may name a file, and the names in each that are no files.
 FILES: Mapping[str, Callable[[], Collection[str]]] = {
-    'subject_file': _no_names,
-    'background_file': _no_names,
-    'body_model': lambda: ['', *model_names()],
-    'lifter': lambda: ('', lifter.SHIPPED),
-    'model_file': _predictors,
+    'subject_file': tuple,
+    'background_file': tuple,
+    'body_model': model_names,
+    'lifter': lambda: [lifter.SHIPPED],
+    'model_file': lambda: [path.stem for path in pose_predictor.FOLDER.glob('*.npz')],
 }
 
 
@@ -78,7 +69,8 @@ def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
     Raises:
         ValueError: it lies elsewhere, whether or not it exists, or is no regular file.
     """
-    if path in FILES[parameter]():
+    names = ['', *FILES[parameter]()]
+    if path in names:
         return
     real = Path(os.path.realpath(path))
     if not any(real.is_relative_to(os.path.realpath(folder)) for folder in folders):
@@ -89,8 +81,7 @@ def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
     try:
         regular = stat.S_ISREG(real.stat().st_mode)
     except OSError:
-        names = ', '.join(filter(None, FILES[parameter]()))
-        hint = f', and no name; there are {names}' if names else ''
+        hint = f', and no name; there are {", ".join(names[1:])}' if names[1:] else ''
         raise ValueError(f'{parameter}: {path}: no such file{hint}') from None
     if not regular:
         raise ValueError(f'{parameter}: {path}: not a regular file')

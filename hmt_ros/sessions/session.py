@@ -260,7 +260,7 @@ class Session(ABC, Generic[Parameters, State]):
         """Counts an error of the session itself, and restarts the estimate."""
         self._log.fault('node itself', text)
         self.restart()
-        # The traceback is in the log of the node already.
+        # The error is in the log of the node already.
         return replace(self._log.handled(source, 0), warnings=())
 
     def count_dropped(self, messages: int) -> None:
@@ -346,7 +346,9 @@ class Session(ABC, Generic[Parameters, State]):
         """Uses the messages of a source whose turn has come."""
         for stray, _ in turn.stray:
             text = f'{self.UNIT} of {stray} ns is left out: its stamp is far from those of others'
-            self._log.skip('stray stamp', text)
+            self._log.counts['skipped'] += 1
+            # Not a fault of the message that shows it.
+            self._log.note('stray stamp', text)
         for one in turn.use:
             skipped = self._log.counts['skipped']
             self._take(source, one.message, one.stamp)

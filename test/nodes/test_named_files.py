@@ -7,6 +7,7 @@ import os
 import threading
 import time
 import zipfile
+from concurrent.futures import wait as wait_for
 from types import SimpleNamespace
 
 import numpy as np
@@ -99,7 +100,7 @@ def test_no_content_of_a_file_of_the_launch_is_told(node_of, name, tmp_path):
     assert not one.change_state('configure')
     (text,) = one.warnings()
     assert f'{parameter}: {file}: not a ' in text
-    assert f'set {parameter} to a' in text
+    assert '; mend that, then: ros2 lifecycle set' in text
     level, message, _ = one.diagnosis()
     assert (level, message) == (2, text)
     assert not [token for token in TOKENS if token in one.logged]
@@ -190,6 +191,6 @@ def test_a_slow_reader_is_not_waited_for():
     assert spent < 2 * patient_reader.LONGEST_WAIT
     assert threading.active_count() < 20
     free.set()
-    reader._thread.join()
+    wait_for([reader._asked[1]])
     assert ask('a')[0] == 'nothing'
     reader.read('b', SimpleNamespace, lambda: None)
