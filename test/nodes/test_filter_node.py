@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_ros.nodes import session_node
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools.messages.cdr import serialise
 from test.nodes.conftest import PATIENCE, only_line
@@ -507,3 +508,21 @@ def test_robots_are_told_that_no_image_is_answered(world, small_camera):
     one.executor.spin_once(timeout_sec=0.1)
     assert len(told) <= count + 1
     assert one.change_state('activate')
+
+
+@pytest.mark.parametrize('resets', [False, True])
+def test_a_clock_that_goes_back_is_an_error_for_a_while(
+    running, small_camera, stub_tracker, resets, monkeypatch
+):
+    assert running.set(reset_on_time_jump=resets) == (True, '')
+    running.send('camera_info', small_camera.info())
+    for index in (6000, 6001):
+        assert faults(running.send('image', small_camera.image(index))) == []
+    for index in range(4):
+        assert faults(running.send('image', small_camera.image(index))) == []
+    assert len(stub_tracker.made) == 2
+    level, text, _ = running.diagnosis()
+    assert (level, text[:30]) == (2, 'the clock went back by 600 s: ')
+    assert any('the clock went back by 600 s' in warning for warning in running.warnings())
+    monkeypatch.setattr(session_node, 'ALARM', 0.0)
+    assert not running.diagnosis()[1].startswith('the clock')

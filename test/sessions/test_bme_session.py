@@ -424,3 +424,13 @@ def test_keypoints_that_can_not_be_used_are_told_and_count_as_none(both, outputs
         BmeParameters(predict_from='all')
     with pytest.raises(ValueError, match="'both' needs a lifter"):
         BmeParameters(predict_from='both', lifter='')
+
+
+def test_a_stray_track_counts_for_no_image(session, somebody, stub_predictor, likelihoods):
+    one = session(tracked_interval=100.0)
+    one.take(CAMERA_INFO, somebody.info())
+    looked_at(stub_predictor, one, somebody, [0])
+    one.take(TRACK, track(likelihoods, 36_000))
+    assert looked_at(stub_predictor, one, somebody, [1]) == 1
+    one.take(TRACK, track(likelihoods, 1))
+    assert looked_at(stub_predictor, one, somebody, [2]) == 0
