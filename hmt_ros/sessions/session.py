@@ -207,10 +207,11 @@ class Session(ABC, Generic[Parameters, State]):
         """
         try:
             stamp = self._stamp_of(source, message)
-            if not 0 <= stamp < _LATEST_NS:
-                raise MessageError(f'stamp is {stamp} ns, wanted one from 1970 to 2038')
         except MessageError as error:
             return self.refuse(source, str(error), more=more)
+        if not 0 <= stamp < _LATEST_NS:
+            text = f'stamp is {stamp} ns, wanted one from 1970 to 2038'
+            return self.refuse(source, text, min(stamp, 0), more=more)
         self._log.begin()
         if self._is_counted(source):
             self._log.counts['received'] += 1
@@ -241,13 +242,13 @@ class Session(ABC, Generic[Parameters, State]):
         """Uses the messages that wait; returns the stamp of the newest message, ns, or 0."""
         return 0
 
-    def refuse(self, source: str, text: str, *, more: bool = False) -> Handled:
+    def refuse(self, source: str, text: str, stamp: int = 0, *, more: bool = False) -> Handled:
         """Counts a message that could not be read; `more` as for `take`."""
         self._log.begin()
         self._log.fault('message', f'message of {source} can not be read: {text}')
         if not more:
             self._use_what_has_come()
-        return self._handled(source, 0)
+        return self._handled(source, stamp)
 
     def drop(self, stamp_ns: int) -> Handled:
         """Reports a message to be estimated from that was dropped before it came here."""
