@@ -246,7 +246,7 @@ def declared_parameters(settings: Any) -> list[DeclaredParameter]:
             owner, name = (
                 (getattr(settings, field.name), inner) if inner else (settings, field.name)
             )
-            text = described_fields(type(owner)).get(name, '')
+            text = described_fields(owner.__class__).get(name, '')
             path = (field.name, inner) if inner else (field.name,)
             effect = field.metadata[_EFFECT]
             found.append(DeclaredParameter(name, getattr(owner, name), text, limits, effect, path))
