@@ -27,7 +27,6 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, camera_info_fault
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.session import (
-    AGREEING,
     NeededInput,
     PublishedTopic,
     Session,
@@ -216,7 +215,7 @@ class HriSession(Session[HriParameters, HriState]):
 
     def _take_camera_info(self, message: Any, stamp: int) -> None:
         # One stray stamp does not end all bodies.
-        if self._clock.put(Stamped(stamp, None), AGREEING).use:
+        if self._clock.put(Stamped(stamp, None), expected=False).use:
             self._now = self._clock.newest = stamp
         try:
             self._camera, self._frame = camera_from_info(message), str(message.header.frame_id)

@@ -33,8 +33,6 @@ from msg_tools.messages.images import decode_image
 SUBSCRIBERS = 'subscribers of '
 FINISH = 'finish'  # source of the report of `finish`, at the end of the stream
 TIME_JUMP = 'time jumps back'  # kind of fault
-# Messages in a row that make another time true, without and with `reset_on_time_jump`.
-AGREEING, AGREEING_IF_EXPECTED = 3, 2
 _MOST_STREAMS = 1000  # whose order is known
 _LATEST_NS = 2**31 * SECOND_NS  # first stamp that no message can hold
 
@@ -322,10 +320,7 @@ class Session(ABC, Generic[Parameters, State]):
         if len(self._orders) > _MOST_STREAMS:
             del self._orders[next(iter(self._orders))]
         newest = order.newest
-        if self.parameters.reset_on_time_jump:
-            turn = order.put(one, AGREEING_IF_EXPECTED, least_back=0)
-        else:
-            turn = order.put(one, AGREEING)
+        turn = order.put(one, expected=self.parameters.reset_on_time_jump)
         text = f'{self.UNIT} of {one.stamp} ns comes after one of {newest} ns'
         if turn.back:
             # Of other streams, too.

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 from msg_tools.messages.headers import SECOND_NS
 
-# Least step back that is one of the clock, ns: a shorter one is soon caught up with.
-_BACK_NS = SECOND_NS
+# Messages in a row that make another time true, and least step back that may be one of the clock,
+# ns: a shorter one is soon caught up with. The same where such steps are expected.
+AGREEING, EXPECTED = (3, SECOND_NS), (2, 0)
 # Least step ahead that others must confirm, ns, and in intervals of the stream.
 _AHEAD_NS, _INTERVALS = 5 * SECOND_NS, 5
 
@@ -53,14 +54,14 @@ class StampOrder:
         self._interval: int | None = None
         self._aside: tuple[Stamped, ...] = ()
 
-    def put(self, one: Stamped, agreeing: int, least_back: int = _BACK_NS) -> Turn:
+    def put(self, one: Stamped, *, expected: bool) -> Turn:
         """Takes the next message.
 
         Args:
-            agreeing: number of messages in a row that make another time true.
-            least_back: least step back that may be one of the clock, ns.
+            expected: whether the clock of the messages may go back, as where a bag is played again.
         """
         newest, aside = self.newest, self._aside
+        agreeing, least_back = EXPECTED if expected else AGREEING
         if newest is None or newest < one.stamp <= newest + self._longest():
             self._aside = ()
             return self._used((one,), stray=aside)

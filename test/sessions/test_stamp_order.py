@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.image_inputs import KEYPOINTS
-from hmt_ros.sessions.session import AGREEING
 from hmt_ros.sessions.stamp_order import Stamped, StampOrder
 from msg_tools.messages.headers import SECOND_NS, stamp_in, time_ns
 from msg_tools.messages.message_error import MessageError
@@ -21,11 +20,11 @@ HOUR = 3600 * SECOND_NS
 STEP = SECOND_NS // 10
 
 
-def used(order, stamps, agreeing=AGREEING, **options):
+def used(order, stamps, *, expected=False):
     """The stamps that are used of some, and those that are stray."""
     result, strays = [], []
     for stamp in stamps:
-        turn = order.put(Stamped(stamp, None), agreeing, **options)
+        turn = order.put(Stamped(stamp, None), expected=expected)
         result += [one.stamp for one in turn.use]
         strays += [one.stamp for one in turn.stray]
         if turn.use:
@@ -49,14 +48,14 @@ def test_a_stray_stamp_is_left_out(place, far, step):
 
 
 @pytest.mark.parametrize('far', [HOUR, 20 * SECOND_NS, -600 * SECOND_NS])
-@pytest.mark.parametrize('agreeing', [2, 3])
-def test_another_time_is_followed_once_some_agree(far, agreeing):
+@pytest.mark.parametrize(('expected', 'agreeing'), [(True, 2), (False, 3)])
+def test_another_time_is_followed_once_some_agree(far, expected, agreeing):
     order, before = StampOrder(), [HOUR + k * STEP for k in range(5)]
     after = [HOUR + far + k * STEP for k in range(6)]
-    assert used(order, before, agreeing) == (before, [])
+    assert used(order, before, expected=expected) == (before, [])
     for k in range(agreeing - 1):
-        assert used(order, after[k : k + 1], agreeing) == ([], [])
-    turn = order.put(Stamped(after[agreeing - 1], None), agreeing)
+        assert used(order, after[k : k + 1], expected=expected) == ([], [])
+    turn = order.put(Stamped(after[agreeing - 1], None), expected=expected)
     assert [one.stamp for one in turn.use] == after[:agreeing]
     assert turn.back == max(before[-1] - after[0], 0)
 
