@@ -15,7 +15,7 @@ from msg_tools.messages.headers import SECOND_NS
 # ns: a shorter one is soon caught up with. The same where such steps are expected.
 AGREEING, EXPECTED = (3, SECOND_NS), (2, 0)
 # Least step ahead that others must confirm, ns, and in intervals of the stream.
-_AHEAD_NS, _INTERVALS = 5 * SECOND_NS, 5
+_AHEAD_NS, _INTERVALS = SECOND_NS, 5
 
 
 class Stamped(NamedTuple):

@@ -387,7 +387,7 @@ def test_silhouettes_count_where_keypoints_show_nobody(both, outputs, somebody, 
     one.take(IMAGE, somebody.image(2))
     one.take('keypoints', keypoints(2))
     one.take(IMAGE, somebody.image(3))
-    one.take(IMAGE, somebody.image(20))
+    one.take(IMAGE, somebody.image(12))
     assert len(predictions(outputs)) == 4
     assert len(stub_predictor.asked) == 3
 
