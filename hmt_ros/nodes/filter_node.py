@@ -42,8 +42,9 @@ class FilterNode(TrackingNode):
     def _on_forecast_pose(
         self, request: ForecastPose.Request, response: ForecastPose.Response
     ) -> Any:
-        stamp = time_ns(request.stamp)
-        return self._answer(response, 'mixture', lambda session: session.forecast(stamp))
+        return self._answer(
+            response, 'mixture', lambda session: session.forecast(time_ns(request.stamp))
+        )
 
 
 def main(args: list[str] | None = None) -> int:

@@ -6,11 +6,18 @@ import difflib
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Set
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -90,6 +97,22 @@ def with_empty_lists(parameters: Iterable[Parameter], names: Set[str]) -> list[P
     ]
 
 
+def refuse(response: Any, asked: int, reason: str) -> None:
+    """Fills the answer to a request that can not be served.
+
+    Args:
+        asked: number of parameters that were to be set.
+    """
+    refused = SetParametersResult(successful=False, reason=reason)
+    if hasattr(response, 'results'):
+        response.results = [*response.results, *[refused] * (asked - len(response.results))]
+    elif isinstance(getattr(response, 'result', None), SetParametersResult):
+        response.result = refused
+    for field, value in (('success', False), ('message', reason)):
+        if hasattr(response, field):
+            setattr(response, field, value)
+
+
 def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
     """Warnings of names that a node was given and does not have.
 
@@ -105,20 +128,26 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
     return texts
 
 
-def next_step(node: Node, error: ValueError, checked: Iterable[str]) -> str:
-    """Advice after a configuration that failed.
+def file_folders(given: str) -> tuple[str, ...]:
+    """The folders in which files may lie that parameters name while a node runs.
 
     Args:
-        checked: names of parameters that may be the cause.
+        given: the parameter of this name.
     """
-    values = {name: node.get_parameter(name).value for name in checked}
-    wrong = [name for name, value in values.items() if value and str(value) in str(error)]
-    advice = 'mend that'
-    if wrong:
-        kind = 'file' if wrong[0].endswith('_file') else 'value'
-        advice = f'set {wrong[0]} to a {kind} that can be used'
+    usual = []
+    for find in (partial(get_package_share_directory, 'hmt_ros'), Path.home, Path.cwd):
+        # Any of them may be missing.
+        with suppress(PackageNotFoundError, RuntimeError, OSError):
+            usual.append(str(find()))
+    # A service without a home, or one that works in the root, must not open all files.
+    named = given.split(':') if given else [folder for folder in usual if folder != '/']
+    return tuple(dict.fromkeys(filter(None, named)))
+
+
+def next_step(node: Node) -> str:
+    """Advice after a configuration that failed."""
     change = f'ros2 lifecycle set {node.get_fully_qualified_name()}'
-    return f'{advice}, then: {change} configure; {change} activate'
+    return f'mend that, then: {change} configure; {change} activate'
 
 
 def files_for_others(arguments: Iterable[str], node: str) -> list[str]:

@@ -19,6 +19,7 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -41,10 +42,13 @@ from hmt_ros.nodes.estimating_thread import (
 from hmt_ros.nodes.node_parameters import (
     QOS_OVERRIDES,
     declare,
+    file_folders,
     next_step,
+    refuse,
     unknown_parameters,
 )
 from hmt_ros.nodes.own_messages import OwnMessages
+from hmt_ros.nodes.patient_reader import PatientReader
 from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.nodes.subscribed_topic import (
     ANSWERS,
@@ -60,15 +64,20 @@ from hmt_ros.sessions.declared_parameters import (
     with_values,
 )
 from hmt_ros.sessions.handled import HANDLED, Handled, Output, handled_message
+from hmt_ros.sessions.named_file import FILES, check_place, public_line
 from hmt_ros.sessions.session import SUBSCRIBERS, Session, SessionState
 from msg_tools import RosbagsMessages
-from msg_tools.files.error_line import error_line
+from msg_tools.files.error_line import error_line, one_line
 from msg_tools.messages.cdr import serialise
 
 AnySession = TypeVar('AnySession', bound=Session[Any, Any])
 Parameters = TypeVar('Parameters', bound=NodeParameters)
 # Periods of the diagnostics between two lines on the console that tell of the same status.
 QUIET_PERIODS = 10
+# Time for which the diagnostics tell of a clock that went back, s.
+ALARM = 5.0
+# Parameters that one request may set; each takes a part of a millisecond.
+MOST_PARAMETERS = 256
 
 
 class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
@@ -107,10 +116,15 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             # A bag that is played again.
             defaults = replace(defaults, reset_on_time_jump=True)
         self._settings: Parameters = declare(self, defaults)
+        # What was given at launch may name any file.
+        self._at_launch = self._settings
+        self._folders = file_folders(self._settings.file_folders)
+        self._reader = PatientReader()
         self._names = values_of(defaults).keys()
         self._warn_of_unknown(qos=False)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self._refuse_impossible_transitions()
+        for service in self.services:
+            service.callback = partial(self._serve, service.callback)
         self.preparing = False
         self._session: AnySession | None = None
         self._estimator: Estimator | None = None
@@ -132,6 +146,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         # On topics that the node both publishes and subscribes to.
         self._own = OwnMessages()
         self._failure = ''
+        # What a step back of the clock has led to, and when that was told first.
+        self._jump = '', 0.0
         # Errors of the node itself.
         self._errors, self._last_error = 0, ''
         self._told_at = self._untold = 0
@@ -233,7 +249,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         try:
             session = self._new_session(self._settings, self._publish, self._is_wanted)
         except ValueError as error:
-            self._failure = f'{error_line(error)}; {next_step(self, error, self.SESSION.CHECKED)}'
+            self._failure = f'{public_line(error)}; {next_step(self)}'
             self.get_logger().error(self._failure)
             self._diagnose()
             return TransitionCallbackReturn.FAILURE
@@ -249,7 +265,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self._outputs[topic] = self._new_publisher(topic, *published_with(published))
         self._handled = self._new_publisher('~/handled', HANDLED, ANSWERS)
         self._offered = [
-            self.create_service(kind, name, callback)
+            self.create_service(kind, name, partial(self._serve, callback))
             for kind, name, callback in self._offered_services()
         ]
         return super().on_configure(state)
@@ -360,21 +376,22 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._offered.clear()
         self._session = None
 
-    def _refuse_impossible_transitions(self) -> None:
-        """A request for a transition that the state does not have must not end the node."""
-        service = self._service_change_state
-        change = service.callback
-
-        def answer(request: Any, response: Any) -> Any:
-            try:
-                return change(request, response)
-            except RuntimeError as error:
-                wanted = request.transition.label or request.transition.id
-                self.get_logger().warn(f'transition {wanted} is not possible: {error_line(error)}')
-                response.success = False
-                return response
-
-        service.callback = answer
+    def _serve(self, callback: Callable[..., Any], request: Any, response: Any) -> Any:
+        """Answers a request, whatever it holds; one that can not be served is refused."""
+        asked = getattr(request, 'parameters', ())
+        try:
+            if len(asked) > MOST_PARAMETERS:
+                raise ValueError(f'{len(asked)} parameters, the limit is {MOST_PARAMETERS}')
+            response = callback(request, response)
+        except Exception as error:  # noqa: BLE001
+            what, text = 'a request is refused', public_line(error)
+            if (transition := getattr(request, 'transition', None)) is not None:
+                what = f'transition {one_line(transition.label) or transition.id} is not possible'
+            self.get_logger().warn(f'{what}: {text}', throttle_duration_sec=1.0)
+            refuse(response, len(asked), text)
+        for result in getattr(response, 'results', ()):
+            result.reason = one_line(result.reason)
+        return response
 
     # Parameters.
 
@@ -395,15 +412,35 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         try:
             settings = with_values(self._settings, changed)
             if any(name in changed for name in self.SESSION.CHECKED):
-                self._new_session(settings, lambda output: None)
-        except ValueError as error:
-            return SetParametersResult(successful=False, reason=error_line(error))
+                self._reader.read(settings, partial(self._check, settings), self._receive)
+        except Exception as error:  # noqa: BLE001
+            # Whatever a peer sends, it gets a reason.
+            return SetParametersResult(successful=False, reason=public_line(error))
         self._settings = settings
         if self._session is not None:
             self._session.parameters = settings
         if self._estimator is not None:
             self._estimator.take_limit()
         return SetParametersResult(successful=True)
+
+    def _check(self, settings: Parameters) -> None:
+        """Reads the files that other parameters would name.
+
+        Raises:
+            ValueError: one that can not be used, or that must not be named while the node runs.
+        """
+        launched, values = values_of(self._at_launch), values_of(settings)
+        for name in FILES:
+            if values.get(name, '') != launched.get(name, ''):
+                check_place(name, values[name], self._folders)
+        self._new_session(settings, lambda output: None)
+
+    def _receive(self) -> None:
+        """Receives messages while the executor's thread is kept waiting."""
+        for one in (x for node in self._nodes for x in [*node._connected.values()]):
+            with one.handle:
+                while (found := one.handle.take_message(one.msg_type, one.raw)) is not None:
+                    one.callback(found[0])
 
     # Called by the thread that estimates.
 
@@ -490,6 +527,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return DiagnosticStatus.ERROR, self._failure
         if state is None or label != 'active':
             return DiagnosticStatus.OK, label
+        if state.time_jump != self._jump[0]:
+            self._jump = state.time_jump, time.monotonic()
+        if state.time_jump and time.monotonic() - self._jump[1] < ALARM:
+            return DiagnosticStatus.ERROR, state.time_jump
         trouble = (
             state.trouble()
             or self._events.deaf_topic(self._connected.values())

@@ -39,8 +39,10 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
         self, request: SmoothWindow.Request, response: SmoothWindow.Response
     ) -> Any:
         # Mixtures that come meanwhile wait, in the middleware or in the queue.
-        span = time_ns(request.from_time), time_ns(request.to_time)
-        return self._answer(response, 'trajectories', lambda session: session.smooth_span(*span))
+        def smooth(session: SmootherSession) -> Any:
+            return session.smooth_span(time_ns(request.from_time), time_ns(request.to_time))
+
+        return self._answer(response, 'trajectories', smooth)
 
 
 def main(args: list[str] | None = None) -> int:

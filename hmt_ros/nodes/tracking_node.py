@@ -23,10 +23,10 @@ from hmt_ros.nodes.subscribed_topic import (
     input_topics,
     types_of_others,
 )
+from hmt_ros.sessions.named_file import public_line
 from hmt_ros.sessions.track_start import TrackStart
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
-from msg_tools.files.error_line import error_line
 
 # Period of the watchdog, s.
 _GLANCE = 0.05
@@ -89,7 +89,7 @@ class TrackingNode(SessionNode[Any, Any]):
         try:
             start = self._start_asked_for(request)
         except ValueError as error:
-            response.success, response.message = False, error_line(error)
+            response.success, response.message = False, public_line(error)
             self.get_logger().warn(f'~/reset is refused: {response.message}')
             return response
         estimator.restart(lambda: session.restart(start))

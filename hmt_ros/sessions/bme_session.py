@@ -69,10 +69,10 @@ from hmt_ros.sessions.camera_session import (
 )
 from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK_INPUT, PREDICTION, ImageInput
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input, known_lifter
+from hmt_ros.sessions.named_file import named_file
 from hmt_ros.sessions.session import (
     NeededInput,
     PublishedTopic,
-    frame_id_of,
 )
 from hmt_ros.sessions.warm_up import film
 from msg_tools.files.error_line import error_line
@@ -203,8 +203,13 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         own = NeededInput(tuple(self.rows[0].types))
         return [own, *(x for x in needed if x.sources == (CAMERA_INFO,))]
 
-    def _jump_back(self, stamp: int) -> None:
-        super()._jump_back(stamp)
+    def _is_counted(self, source: str) -> bool:
+        if self._cue != FROM_KEYPOINTS:
+            return super()._is_counted(source)
+        return source in self.rows[0].types
+
+    def _jump_back(self, first: int, last: int) -> None:
+        super()._jump_back(first, last)
         self._keypoints.chosen.forget()
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
@@ -220,16 +225,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._take_keypoints(row, message, stamp)
         elif source != TRACK:
             super()._take(source, message, stamp)
-        elif self._tracked is None or stamp > self._tracked:
+        elif self._tracked is None or not 0 <= self._tracked - stamp <= _SURE_NS:
             tracked = message.state == TrackState.TRACKING and len(message.components)
             self._tracked = stamp if tracked else None
 
     def _take_keypoints(self, row: ImageInput, message: Any, stamp: int) -> None:
         """Predicts from keypoints and those of the last second, without an image."""
-        self._log.counts['received'] += 1
-        self._frame_id = frame_id_of(message)
-        if not self._is_next(stamp, self._newest):
-            return
         camera = self._camera
         if camera is None:
             self._log.skip(
@@ -287,7 +288,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         interval = self.parameters.tracked_interval * SECOND_NS
         if self._looked is None or self._tracked is None:
             return False
-        return stamp < self._looked + interval and stamp - self._tracked <= _SURE_NS
+        return stamp < self._looked + interval and abs(stamp - self._tracked) <= _SURE_NS
 
     def _leave_to_track(self, stamp: int, frame_id: str) -> None:
         self._log.counts['left'] += 1
@@ -473,10 +474,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
 def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
     """The model for the person, and the relative deviation of the size of people from it."""
-    try:
+    with named_file('model_file', parameters.model_file, 'model of poses'):
         predictor = load_predictor(parameters.model_file or SHIPPED)
-    except OSError as error:
-        raise ValueError(error_line(error)) from error
     if parameters.propagation == BY_EXPERTS and predictor.dynamics is None:
         raise ValueError(
             f"propagation 'experts' needs a model that was trained with --dynamics, which "

@@ -70,8 +70,7 @@ class CameraFrames:
 
     def is_settled(self, camera_frame: str, stamp_ns: int, timeout_ns: float) -> bool:
         """Whether an image need not wait: its transforms are there, or those of a later time."""
-        newest = self._transforms.newest_ns
-        if newest is not None and newest - stamp_ns > timeout_ns:
+        if self._transforms.has_later(stamp_ns, timeout_ns):
             return True
         try:
             for name in filter(None, (self.gravity_frame, self.fixed_frame)):

@@ -39,7 +39,9 @@ from hmt_ros.sessions.image_inputs import (
     ImageInput,
     ImageInputs,
 )
+from hmt_ros.sessions.named_file import named_file
 from hmt_ros.sessions.session import NeededInput, Session, SessionState, State
+from hmt_ros.sessions.stamp_order import Turn
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, UncalibratedError, camera_from_info
@@ -57,6 +59,8 @@ CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 # Images that may wait for other inputs: half a second of a usual camera.
 MOST_INCOMPLETE = 16
 _LARGEST_PICTURE_FILE = 2**28  # bytes
+# Least time by which a later input may be later, to end the wait of an image, s.
+_LATER = 1.0
 # Frames that are remembered; a camera has one.
 _MOST_FRAMES = 8
 
@@ -179,8 +183,9 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _missing(self, stamp: int) -> ImageInput | None:
         """The first input that an image waits for."""
+        within = max(self.parameters.input_timeout, _LATER) * SECOND_NS
         for row in self._awaited():
-            if not self._inputs[row.name].is_settled(stamp) and not self._is_overdue(stamp):
+            if not self._inputs[row.name].is_settled(stamp, within) and not self._is_overdue(stamp):
                 return row
         return None
 
@@ -198,14 +203,19 @@ class CameraSession(Session[CameraParameters, State]):
             self._frame_of(waiting), waiting.stamp_ns, timeout
         )
 
-    def _jump_back(self, stamp: int) -> None:
-        """See `Session`; images that wait are used or dropped, and inputs are forgotten."""
+    def _use(self, source: str, turn: Turn) -> None:
+        super()._use(source, turn)
+        # Those that were put aside did not come while the session was late.
+        self._fresh -= max(len(turn.use) - 1, 0)
+
+    def _jump_back(self, first: int, last: int) -> None:
+        """See `Session`; images that wait are used or dropped, and their inputs are forgotten."""
         self._end()
         self._log.counts['dropped'] += len(self._waiting)
         self._waiting.clear()
         self._newest = None
-        self._inputs.clear()
-        self.frames.forget_after(stamp)
+        self._inputs.keep(first, last)
+        self.frames.forget_after(last)
         self.restart()
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
@@ -284,8 +294,6 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _take_image(self, message: Any, stamp: int) -> None:
         self._see_frame(IMAGE, message)
-        if not self._is_next(stamp, self._newest):
-            return
         try:
             image = self.decode_image(message)
         except ImageError as error:
@@ -413,9 +421,10 @@ def read_picture(file: str) -> Image:
     Raises:
         ValueError: there is none in the file, or one that is too large.
     """
-    try:
-        return decode_picture(read_bytes(file, _LARGEST_PICTURE_FILE))
-    except ImageError as error:
-        raise ValueError(f'{file}: not a picture ({error})') from error
-    except ValueError as error:
-        raise ValueError(f'{file}: {error}') from error
+    with named_file('background_file', file, 'PNG or JPEG image'):
+        try:
+            return decode_picture(read_bytes(file, _LARGEST_PICTURE_FILE))
+        except ImageError as error:
+            raise ValueError(f'{file}: not a picture ({error})') from error
+        except ValueError as error:
+            raise ValueError(f'{file}: {error}') from error

@@ -16,6 +16,7 @@ import textwrap
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any, ClassVar, TypeVar
 
 from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, Scheme, schemes
@@ -42,6 +43,7 @@ FRACTION = (0.0, 1.0)
 
 TRANSPORTS = ('raw', 'compressed')
 LONGEST_TIMEOUT = 60.0  # s
+LONGEST_VALUE = 4096  # characters of a text, or entries of a list
 # Value of `source` for messages of this package.
 OWN_KEYPOINTS = 'keypoints'
 
@@ -85,17 +87,22 @@ class NodeParameters:
     """Parameters that all nodes have.
 
     Attributes:
-        reset_on_time_jump: If true, a message that is older than the one before restarts the
-            estimate; if false, it is skipped. The default is the value of use_sim_time.
+        reset_on_time_jump: If true, two messages in a row that are older than the one before
+            restart the estimate; if false, it takes three that are at least a second older, and
+            others are skipped. The default is the value of use_sim_time.
         queue_size: Maximum number of messages that wait to be estimated from; when the node is late
             the oldest are dropped.
         autostart: If true, the node configures and activates itself; if false, it waits for its
             lifecycle services.
+        file_folders: Folders, separated by ':', in which files must lie that a parameter names
+            while the node runs; empty: the share folder of the package, the home of the user, and
+            the working folder. What is named at launch may lie anywhere.
     """
 
     reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
     queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
     autostart: bool = parameter_field(True, AT_LAUNCH)
+    file_folders: str = parameter_field('', AT_LAUNCH)
 
 
 @dataclass(frozen=True)
@@ -194,6 +201,10 @@ class DeclaredParameter:
             ParameterError: another type, or beyond the limits.
         """
         wanted: Any = type(self.default)
+        if hasattr(value, '__len__') and len(value) > LONGEST_VALUE:
+            raise ParameterError(
+                f'{self.name} has the length {len(value)}, the limit is {LONGEST_VALUE}'
+            )
         if wanted is tuple:
             return self._numbers(value)
         if wanted is float and type(value) is int:
@@ -235,7 +246,7 @@ def declared_parameters(settings: Any) -> list[DeclaredParameter]:
             owner, name = (
                 (getattr(settings, field.name), inner) if inner else (settings, field.name)
             )
-            text = described_fields(type(owner)).get(name, '')
+            text = described_fields(owner.__class__).get(name, '')
             path = (field.name, inner) if inner else (field.name,)
             effect = field.metadata[_EFFECT]
             found.append(DeclaredParameter(name, getattr(owner, name), text, limits, effect, path))
@@ -277,6 +288,7 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
     return replace(settings, **changes)  # type: ignore[type-var]
 
 
+@cache
 def described_fields(cls: type) -> dict[str, str]:
     """The section 'Attributes:' of the docstrings of a class and its bases: one line by name."""
     result: dict[str, str] = {}

@@ -32,6 +32,7 @@ from hmt_ros.sessions.session import (
     Session,
     SessionState,
 )
+from hmt_ros.sessions.stamp_order import Stamped, StampOrder
 from msg_tools import MessageError
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
 from msg_tools.messages.detections import SKELETON_2D
@@ -104,7 +105,6 @@ class _Person:
         tracked: whether the body is neither lost nor silent.
         track: number of its track; 0: it has none.
         bodies: number in the newest identity.
-        newest: stamp of the newest mixture, ns.
         heard: time at which it came, by the stamps of camera_info, ns.
         mode: identity of the mode that is shown; 0: none.
         angles: of the reference model in the image before.
@@ -116,7 +116,6 @@ class _Person:
     tracked: bool = False
     track: int = 0
     bodies: int = 0
-    newest: int | None = None
     heard: int = 0
     mode: int = 0
     angles: dict[str, float] = field(default_factory=dict)
@@ -172,6 +171,7 @@ class HriSession(Session[HriParameters, HriState]):
         self._camera: Camera | None = None
         self._frame = ''
         self._now = 0
+        self._clock = StampOrder()
         self._people: dict[str, _Person] = {}
         self.restart()
 
@@ -188,6 +188,7 @@ class HriSession(Session[HriParameters, HriState]):
         """Tells that nobody is tracked any more."""
         tracked = bool(self._tracked())
         self.restart()
+        self._orders.clear()
         if tracked:
             self._tell_tracked(self._now)
         return self._now
@@ -197,7 +198,6 @@ class HriSession(Session[HriParameters, HriState]):
         # The numbers of their bodies are not given again.
         for person in self._people.values():
             person.end()
-            person.newest = None
         self._images: dict[int, Any] = {}
         super().restart()
 
@@ -214,23 +214,22 @@ class HriSession(Session[HriParameters, HriState]):
             self._take_mixture(source.removeprefix(mixture_source('')), message, stamp)
 
     def _take_camera_info(self, message: Any, stamp: int) -> None:
-        self._now = stamp
+        # One stray stamp does not end all bodies.
+        if self._clock.put(Stamped(stamp, None), expected=False).use:
+            self._now = self._clock.newest = stamp
         try:
             self._camera, self._frame = camera_from_info(message), str(message.header.frame_id)
         except CameraInfoError as error:
             text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
             self._log.fault('camera_info', text)
         longest = LONGEST_SILENCE * SECOND_NS
-        silent = [p for p in self._people.values() if p.identity and stamp - p.heard > longest]
+        silent = [p for p in self._people.values() if p.identity and self._now - p.heard > longest]
         for person in silent:
             person.end()
         if silent:
-            self._tell_tracked(stamp)
+            self._tell_tracked(self._now)
 
     def _take_mixture(self, namespace: str, message: Any, stamp: int) -> None:
-        known = self._people.get(namespace)
-        if not self._is_next(stamp, None if known is None else known.newest):
-            return
         try:
             content = pose_mixture_of(message)
         except MessageError as error:
@@ -239,7 +238,7 @@ class HriSession(Session[HriParameters, HriState]):
         person = self._person_in(namespace)
         if self._camera is None:
             self._now = stamp
-        person.newest, person.heard = stamp, self._now
+        person.heard = self._now
         if content.state is TrackState.NOBODY or not len(content.weights):
             person.end()
         elif content.state is TrackState.LOST:

@@ -158,23 +158,26 @@ class StampedInputs(Generic[T]):
 
     def __init__(self, most: int = REMEMBERED) -> None:
         self._most = most
-        self.clear()
-
-    def clear(self) -> None:
-        """Drops all inputs."""
+        # In the order in which they came.
         self._content: dict[int, T | None] = {}
-        self._newest = -1
+
+    def keep(self, first_ns: int, last_ns: int) -> None:
+        """Drops the inputs of other stamps."""
+        kept = self._content.items()
+        self._content = {stamp: x for stamp, x in kept if first_ns <= stamp <= last_ns}
 
     def put(self, stamp_ns: int, content: T | None) -> None:
         """Keeps an input for its image."""
-        self._newest = max(self._newest, stamp_ns)
         self._content[stamp_ns] = content
         while len(self._content) > self._most:
-            del self._content[min(self._content)]
+            del self._content[next(iter(self._content))]
 
-    def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the input for an image has come, or a later one."""
-        return stamp_ns in self._content or self._newest > stamp_ns
+    def is_settled(self, stamp_ns: int, within_ns: float) -> bool:
+        """Whether the input for an image has come, or one that is later by no more than a time.
+
+        One that is far ahead says nothing of the images until then.
+        """
+        return any(0 <= each - stamp_ns <= within_ns for each in self._content)
 
     def take_all(self, stamp_ns: int) -> dict[int, T | None]:
         """The inputs by stamp, in order, for an image and all that are older; drops them."""
@@ -248,7 +251,7 @@ class ImageInputs:
         )
         return None
 
-    def clear(self) -> None:
-        """Drops all inputs that have come."""
+    def keep(self, first_ns: int, last_ns: int) -> None:
+        """Drops all inputs of other stamps."""
         for waiting in self._waiting.values():
-            waiting.clear()
+            waiting.keep(first_ns, last_ns)

@@ -27,8 +27,8 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, CameraNodeParameters
 from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS_INPUT, SOURCES, ImageInput
+from hmt_ros.sessions.named_file import named_file
 from msg_tools import MessageError
-from msg_tools.files.error_line import error_line
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,
     DetectedPerson,
@@ -59,10 +59,8 @@ def known_lifter(model: str) -> Lifter | None:
     Raises:
         ValueError: there is no such file, or it is no lifter; one line.
     """
-    try:
+    with named_file('lifter', model, 'lifter'):
         return load_lifter(model) if model else None
-    except OSError as error:
-        raise ValueError(f'lifter {model}: {error_line(error)}') from error
 
 
 def keypoints_input(source: str) -> ImageInput:
@@ -123,7 +121,7 @@ class ChosenPerson:
         if not seen:
             return None
         last = self._last
-        if last is None or stamp_ns - self._stamp > longest_absence * SECOND_NS:
+        if last is None or abs(stamp_ns - self._stamp) > longest_absence * SECOND_NS:
             chosen = max(seen, key=_size)
             self._size = 0.0
         else:

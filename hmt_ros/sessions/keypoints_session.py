@@ -3,8 +3,6 @@
 - Every image that can be used gets one keypoints, one keypoints_3d and, with `publish_mask`, one
   mask, all with its stamp and frame. Messages without names, and a mask of zeros, say that nobody
   was seen.
-- An image that is not younger than the one before is skipped, or is the first of a new sequence
-  with `reset_on_time_jump`.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
@@ -101,8 +99,6 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
         super().restart()
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
-        if not self._is_next(stamp, self._newest):
-            return
         try:
             image = self.decode_image(message)
             found = self._detector.detect(image, stamp)

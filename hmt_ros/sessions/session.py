@@ -1,9 +1,10 @@
 """A session stands behind the topics of a node: messages in, messages out, without ROS.
 
 The node and offline replay give their messages to one; the same messages in the same order give the
-same bytes. A message that is not younger than the one before is skipped, or starts the estimate
-anew with `reset_on_time_jump`. Messages that can not be used are skipped. The first fault of each
-kind is logged; all are counted.
+same bytes. Messages that are estimated from are taken in the order of their stamps (`stamp_order`):
+one that is far ahead of those before, or older, waits until others agree with it. Where they agree
+on an older time the estimate starts anew. Messages that can not be used are skipped. The first
+fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
@@ -23,13 +24,17 @@ from scipy.special import entr
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.declared_parameters import NodeParameters
 from hmt_ros.sessions.handled import Handled, HandlingLog, Output
-from msg_tools import RosbagsMessages
-from msg_tools.messages.headers import time_ns
+from hmt_ros.sessions.stamp_order import Stamped, StampOrder, Turn
+from msg_tools import MessageError, RosbagsMessages
+from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image
 
 # Key of the diagnostics, before the name of a topic, for the number of its subscribers.
 SUBSCRIBERS = 'subscribers of '
 FINISH = 'finish'  # source of the report of `finish`, at the end of the stream
+TIME_JUMP = 'time jumps back'  # kind of fault
+_MOST_STREAMS = 1000  # whose order is known
+_LATEST_NS = 2**31 * SECOND_NS  # first stamp that no message can hold
 
 
 class PublishedTopic(NamedTuple):
@@ -70,6 +75,7 @@ class SessionState(ABC):
         last_fault: the newest; '' before the first.
         held_up: input that the last dropped message waited for; '' if only for its turn.
         frame_id: of the newest message that is estimated from; '' before the first.
+        time_jump: what the last step back of the clock has led to; '' before the first.
     """
 
     status: str
@@ -80,6 +86,7 @@ class SessionState(ABC):
     last_fault: str = ''
     held_up: str = ''
     frame_id: str = ''
+    time_jump: str = ''
 
     @abstractmethod
     def summary(self) -> str:
@@ -165,6 +172,9 @@ class Session(ABC, Generic[Parameters, State]):
         self._messages = RosbagsMessages()
         self._log = HandlingLog()
         self._frame_id = ''
+        self._time_jump = ''
+        # Of the messages that are estimated from, by source.
+        self._orders: dict[str, StampOrder] = {}
         self.topic_names: Mapping[str, str] = {}
         self.decode_image: Callable[[Any], Image] = decode_image
         self.publishing = 0.0
@@ -193,12 +203,20 @@ class Session(ABC, Generic[Parameters, State]):
             message: of the type of the source, from `rosbags` or ROS.
             more: whether another message has come already; work that can wait is left until then.
         """
+        try:
+            stamp = self._stamp_of(source, message)
+        except MessageError as error:
+            return self.refuse(source, str(error), more=more)
+        if not 0 <= stamp < _LATEST_NS:
+            text = f'stamp is {stamp} ns, wanted one from 1970 to 2038'
+            return self.refuse(source, text, min(stamp, 0), more=more)
         self._log.begin()
-        stamp = self._stamp_of(source, message)
-        if kind_of(source) == self.COUNTED:
+        if self._is_counted(source):
             self._log.counts['received'] += 1
             self._frame_id = frame_id_of(message)
-        self._take(source, message, stamp)
+            self._use(source, self._turn_of(source, Stamped(stamp, message)))
+        else:
+            self._take(source, message, stamp)
         if not more:
             self._use_what_has_come()
         return self._handled(source, stamp)
@@ -214,19 +232,21 @@ class Session(ABC, Generic[Parameters, State]):
     def finish(self) -> Handled:
         """Uses messages that wait for others which do not come any more."""
         self._log.begin()
+        for source, order in self._orders.items():
+            self._use(source, order.end())
         return self._handled(FINISH, self._end())
 
     def _end(self) -> int:
         """Uses the messages that wait; returns the stamp of the newest message, ns, or 0."""
         return 0
 
-    def refuse(self, source: str, text: str, *, more: bool = False) -> Handled:
+    def refuse(self, source: str, text: str, stamp: int = 0, *, more: bool = False) -> Handled:
         """Counts a message that could not be read; `more` as for `take`."""
         self._log.begin()
         self._log.fault('message', f'message of {source} can not be read: {text}')
         if not more:
             self._use_what_has_come()
-        return self._handled(source, 0)
+        return self._handled(source, stamp)
 
     def drop(self, stamp_ns: int) -> Handled:
         """Reports a message to be estimated from that was dropped before it came here."""
@@ -264,6 +284,10 @@ class Session(ABC, Generic[Parameters, State]):
     def _present_state(self) -> State:
         """The state now."""
 
+    def _is_counted(self, source: str) -> bool:
+        """Whether the messages of a source are estimated from."""
+        return kind_of(source) == self.COUNTED
+
     def _stamp_of(self, source: str, message: Any) -> int:
         """Stamp of a message, ns."""
         return time_ns(message.header.stamp)
@@ -282,6 +306,7 @@ class Session(ABC, Generic[Parameters, State]):
             'last_fault': log.last_fault,
             'held_up': log.held_up,
             'frame_id': self._frame_id,
+            'time_jump': self._time_jump,
         }
 
     def _on_topic(self, source: str) -> str:
@@ -289,29 +314,49 @@ class Session(ABC, Generic[Parameters, State]):
         topic = self.topic_names.get(source)
         return f'{source} on {topic}' if topic else source
 
-    def _is_next(self, stamp: int, newest: int | None) -> bool:
-        """Whether a message is to be used, as it is younger than the newest before; or time jumps.
-
-        Faults are reported here; where time jumps back the estimate starts anew.
-        """
-        if newest is None or stamp > newest:
-            return True
-        text = f'{self.UNIT} of {stamp} ns comes after one of {newest} ns'
-        if stamp == newest:
-            self._log.skip('time stands still', f'{text}, wanted stamps that increase')
-            return False
-        if not self.parameters.reset_on_time_jump:
-            self._log.skip(
-                'time jumps back',
-                f'{text}: skipped; with reset_on_time_jump {self.ESTIMATE} would start anew',
+    def _turn_of(self, source: str, one: Stamped) -> Turn:
+        """What follows from the next message of a source; where time jumps back, a new start."""
+        order = self._orders.setdefault(source, StampOrder())
+        if len(self._orders) > _MOST_STREAMS:
+            del self._orders[next(iter(self._orders))]
+        newest = order.newest
+        turn = order.put(one, expected=self.parameters.reset_on_time_jump)
+        text = f'{self.UNIT} of {one.stamp} ns comes after one of {newest} ns'
+        if turn.back:
+            # Of other streams, too.
+            self._orders = {source: order}
+            self._time_jump = (
+                f'the clock went back by {turn.back / SECOND_NS:.3g} s: {text}, and '
+                f'{len(turn.use)} agree; {self.ESTIMATE} starts anew'
             )
-            return False
-        self._log.note('time jumps back', f'{text}: {self.ESTIMATE} starts anew')
-        self._jump_back(stamp)
-        return True
+            self._log.note(TIME_JUMP, self._time_jump, warn=True)
+            self._jump_back(turn.use[0].stamp, turn.use[-1].stamp)
+        elif turn.late and newest is not None and one.stamp < newest:
+            hint = f'with reset_on_time_jump {self.ESTIMATE} would start anew'
+            self._log.skip(TIME_JUMP, f'{text}: skipped; {hint}')
+        elif turn.late:
+            self._log.skip('time stands still', f'{text}, wanted stamps that increase')
+        return turn
 
-    def _jump_back(self, stamp: int) -> None:
-        """Starts the estimate anew, as time begins again at a stamp."""
+    def _use(self, source: str, turn: Turn) -> None:
+        """Uses the messages of a source whose turn has come."""
+        for stray, _ in turn.stray:
+            text = f'{self.UNIT} of {stray} ns is left out: its stamp is far from those of others'
+            self._log.counts['skipped'] += 1
+            # Not a fault of the message that shows it.
+            self._log.note('stray stamp', text)
+        for one in turn.use:
+            skipped = self._log.counts['skipped']
+            self._take(source, one.message, one.stamp)
+            if self._log.counts['skipped'] == skipped:
+                self._orders[source].newest = one.stamp
+
+    def _jump_back(self, first: int, last: int) -> None:
+        """Starts the estimate anew, as time begins again.
+
+        Args:
+            first, last: stamps of the messages that say so, which are used next, ns.
+        """
         self.restart()
 
     def _publish(self, topic: str, stamp: int, message: Any) -> None:

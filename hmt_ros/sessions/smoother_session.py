@@ -41,6 +41,7 @@ from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.image_evidence import Evidence, KeptMixtures, evidence_of
+from hmt_ros.sessions.named_file import named_file, public_line
 from hmt_ros.sessions.session import Session, SessionState
 from hmt_ros.sessions.smoothed_messages import (
     TOPICS,
@@ -138,8 +139,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     CHECKED = ('body_model',)
 
     def _set_up(self) -> None:
-        if self.parameters.body_model:
-            known_body(self.parameters.body_model)
+        if model := self.parameters.body_model:
+            _chosen_body(model)
         self._of: SmoothedBody | None = None
         self._resolved: tuple[Any, SmoothedBody] | None = None
         self._gaps, self._longest_gap = 0, 0.0
@@ -160,6 +161,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         """Publishes the poses that are still open; the next mixture begins a new window."""
         stamp = self._newest or 0
         self._end_window()
+        self._orders.clear()
         return stamp
 
     def restart(self) -> None:
@@ -173,7 +175,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self.kept = KeptMixtures(self._of, ())
         super().restart()
 
-    def _jump_back(self, stamp: int) -> None:
+    def _jump_back(self, first: int, last: int) -> None:
         self._end_window()
         self._first_identity = 1
 
@@ -194,8 +196,6 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
                 'say counts more than once',
             )
-        if not self._is_next(stamp, self._newest):
-            return
         self._begin_track(of)
         evidence = _levelled(evidence, of.body)
         evidence = self._without_turns(evidence, of.body)
@@ -260,8 +260,6 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _take_nobody(self, stamp: int, existence: float) -> None:
         """Ends the window: the person is no longer in view."""
         of, smooths = self._of, self._window is not None
-        if not self._is_next(stamp, self._newest):
-            return
         self._end_window()
         self._nobody = True
         if of is not None and smooths:
@@ -287,9 +285,9 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         chosen = self.parameters.body_model
         try:
             # A message must not cause files to be read: its body has to ship with the package.
-            model = known_body(chosen) if chosen else known_body(content.body_model, named_body)
+            model = _chosen_body(chosen) if chosen else known_body(content.body_model, named_body)
         except ValueError as error:
-            raise MessageError(str(error), 'body') from error
+            raise MessageError(public_line(error), 'body') from error
         body = body_of(content, model, any_name=bool(chosen))
         of = SmoothedBody(body, content.frame_id, content.track_id)
         self._resolved = about, of
@@ -423,6 +421,12 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
     except OSError as error:
         text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
+
+
+def _chosen_body(model: str) -> Body:
+    """The body that the parameters name."""
+    with named_file('body_model', model, 'body model'):
+        return known_body(model)
 
 
 def _levelled(evidence: Evidence, body: Body) -> Evidence:

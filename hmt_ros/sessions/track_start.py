@@ -14,10 +14,10 @@ from hmt_ros.image.observation import Box
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import read_picture
 from hmt_ros.sessions.keypoint_inputs import known_lifter
+from hmt_ros.sessions.named_file import named_file
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.tracking import Subject, Tracker, read_subject
 from hmt_ros.tracking.ground import KnownGround
-from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
@@ -137,7 +137,8 @@ def prepare_start(
             body = present
         body, initial = body_of(content, body), content.mixture
     elif parameters.subject_file:
-        initial = read_subject(parameters.subject_file, body)
+        with named_file('subject_file', parameters.subject_file, 'subject'):
+            initial = read_subject(parameters.subject_file, body)
     return TrackStart(parameters, body, background, initial, _box_of(region))
 
 
@@ -151,10 +152,8 @@ def _box_of(region: Any) -> Box | None:
 
 
 def _body(model: str) -> Body:
-    try:
+    with named_file('body_model', model, 'body model'):
         body = load_body(model)
-    except OSError as error:
-        raise ValueError(f'body_model {model}: {error_line(error)}') from error
     if not body.shapes:
         raise ValueError(f'body_model {model} has no flesh: wanted one such as human37')
     return body

@@ -34,6 +34,7 @@ from hmt_ros.sessions.image_inputs import (
     ImageInput,
 )
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input
+from hmt_ros.sessions.named_file import public_line
 from hmt_ros.sessions.session import PublishedTopic, SessionState
 from hmt_ros.sessions.track import Seen, Shared, Track
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
@@ -153,7 +154,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             try:
                 start = prepare_start(self.parameters)
             except ValueError as error:
-                text = f'{error}; {self.ESTIMATE} starts as the time before'
+                text = f'{public_line(error)}; {self.ESTIMATE} starts as the time before'
                 self._log.fault('start', text)
                 start = self.start
         self.start = start
@@ -191,8 +192,8 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         elif False in outcomes:
             self._log.counts['skipped'] += 1
 
-    def _jump_back(self, stamp: int) -> None:
-        super()._jump_back(stamp)
+    def _jump_back(self, first: int, last: int) -> None:
+        super()._jump_back(first, last)
         # Where time begins again, so do the numbers of the tracks.
         self._keypoints.chosen.forget()
         self._begin()

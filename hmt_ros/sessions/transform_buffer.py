@@ -83,6 +83,8 @@ class _Frame:
     def __init__(self, static: _Sample | None = None) -> None:
         self.static = static
         self.places: list[tuple[int, _Sample]] = []
+        # A place of quite another time, until the next one says whether that is true.
+        self._aside: tuple[int, _Sample] | None = None
 
     @property
     def parent(self) -> str:
@@ -91,9 +93,13 @@ class _Frame:
         return newest.parent
 
     def put(self, stamp: int, sample: _Sample) -> None:
-        if self.places and stamp < self.places[-1][0] - REMEMBERED * SECOND_NS:
-            # Time has jumped back.
-            self.places.clear()
+        aside, self._aside = self._aside, None
+        if self.places and abs(stamp - self.places[-1][0]) > REMEMBERED * SECOND_NS:
+            if aside is None or not 0 < stamp - aside[0] <= REMEMBERED * SECOND_NS:
+                self._aside = stamp, sample
+                return
+            # Time has jumped.
+            self.places = [aside]
         self.places[self.first(stamp) : self.first(stamp + 1)] = [(stamp, sample)]
         old = self.first(self.places[-1][0] - round(REMEMBERED * SECOND_NS))
         del self.places[: max(old, len(self.places) - MOST_STAMPS)]
@@ -123,15 +129,10 @@ class _Frame:
 
 
 class TransformBuffer:
-    """Remembers transforms and joins them along the tree of frames.
-
-    Attributes:
-        newest_ns: newest stamp on /tf; None before the first.
-    """
+    """Remembers transforms and joins them along the tree of frames."""
 
     def __init__(self) -> None:
         self._frames: dict[str, _Frame] = {}
-        self.newest_ns: int | None = None
 
     def put(self, message: Any, *, static: bool) -> list[str]:
         """Takes a tf2_msgs/TFMessage.
@@ -157,8 +158,18 @@ class TransformBuffer:
         for frame in self._frames.values():
             del frame.places[frame.first(stamp_ns + 1) :]
         self._frames = {name: x for name, x in self._frames.items() if x.static or x.places}
-        stamps = (frame.places[-1][0] for frame in self._frames.values() if frame.places)
-        self.newest_ns = max(stamps, default=None)
+
+    def has_later(self, stamp_ns: int, timeout_ns: float) -> bool:
+        """Whether a frame is known at a time that is later by more than a timeout.
+
+        One that is known later by far says nothing of the others.
+        """
+        longest = timeout_ns + REMEMBERED * SECOND_NS
+        return any(
+            timeout_ns < frame.places[-1][0] - stamp_ns <= longest
+            for frame in self._frames.values()
+            if frame.places
+        )
 
     def frames(self) -> list[str]:
         """Names of all frames, sorted."""
@@ -208,9 +219,7 @@ class TransformBuffer:
             return
         if known is None or known.static is not None:
             known = self._frames[child] = _Frame()
-        stamp = time_ns(stamped.header.stamp)
-        known.put(stamp, sample)
-        self.newest_ns = max(self.newest_ns or stamp, stamp)
+        known.put(time_ns(stamped.header.stamp), sample)
 
     def _to_root(self, frame: str, stamp_ns: int) -> tuple[dict[str, Transform], str]:
         """Transforms from a frame to each frame above it; why there are no more, '' at the root."""

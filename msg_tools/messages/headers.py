@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
+from msg_tools.messages.message_error import MessageError
 from msg_tools.messages.message_types import MessageFactory
 
 SECOND_NS = 1_000_000_000
@@ -21,18 +22,26 @@ def time_message(messages: MessageFactory, stamp_ns: int) -> Any:
 
 
 def time_ns(time: Any) -> int:
-    """Time in ns of a builtin_interfaces/Time, `message.header.stamp` for example."""
-    return int(time.sec) * SECOND_NS + int(time.nanosec)
+    """Time in ns of a builtin_interfaces/Time, `message.header.stamp` for example.
+
+    Raises:
+        MessageError: a second or more of nanoseconds.
+    """
+    nanoseconds = int(time.nanosec)
+    if nanoseconds >= SECOND_NS:
+        text = f'stamp has {nanoseconds} nanoseconds, wanted less than {SECOND_NS}'
+        raise MessageError(text, 'stamp')
+    return int(time.sec) * SECOND_NS + nanoseconds
 
 
 def stamp_in(data: bytes) -> int:
-    """Stamp, ns, of the header that opens a message of CDR bytes; 0 if they are too short."""
+    """Stamp, ns, of the header that opens a message of CDR bytes; 0 if they have none."""
     # Behind the encapsulation, whose second byte tells the order of bytes.
     if len(data) < _STAMP_AT + _STAMP_SIZE:
         return 0
     order = '<' if data[1] & 1 else '>'
     seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, _STAMP_AT)
-    return int(seconds) * SECOND_NS + int(nanoseconds)
+    return int(seconds) * SECOND_NS + int(nanoseconds) if nanoseconds < SECOND_NS else 0
 
 
 def header_message(messages: MessageFactory, stamp_ns: int, frame_id: str) -> Any:

@@ -62,7 +62,7 @@ def test_parameters_are_those_of_the_file(running):
     running.assert_described(BmeParameters())
     running.assert_refused(
         ({'max_hypotheses': 0}, 'out of range'),
-        ({'background_file': 'nowhere.png'}, 'nowhere.png: can not be read'),
+        ({'background_file': 'nowhere.png'}, 'nowhere.png: no such file'),
         ({'image_transport': 'pigeon'}, "saw 'pigeon'"),
         ({'autostart': False}, 'read-only'),
     )

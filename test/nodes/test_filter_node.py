@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_ros.nodes import session_node
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from msg_tools.messages.cdr import serialise
 from test.nodes.conftest import PATIENCE, only_line
@@ -142,12 +143,12 @@ def test_parameters_are_those_of_the_file(running):
         )
 
 
-def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
+def test_wrong_values_are_refused_with_a_reason(running):
     running.assert_refused(
         ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
-        ({'subject_file': str(tmp_path / 'none.yaml')}, 'none.yaml: can not be read'),
-        ({'background_file': str(tmp_path / 'two\nlines')}, 'two lines: can not be read'),
-        ({'body_model': 'nobody'}, "no body 'nobody'"),
+        ({'subject_file': 'none.yaml'}, 'none.yaml: no such file'),
+        ({'background_file': 'two\nlines'}, 'two lines: no such file'),
+        ({'body_model': 'nobody'}, 'nobody: no such file, and no name; there are human32'),
         ({'autostart': False}, 'read-only'),
         ({'max_hypotheses': 8.0}, 'type'),
     )
@@ -267,14 +268,13 @@ def test_lifecycle(world, small_camera):
 
 def test_node_without_its_subject_lives(world, subject_file, small_camera):
     missing = subject_file.with_name('missing.yaml')
-    one = world(subject_file=str(missing))
+    one = world(subject_file=str(missing), file_folders=str(subject_file.parent))
     one.node.start()
     assert one.state == 'unconfigured'
     one.spin_until(lambda: len(one.warnings()) == 1)
     assert one.warnings() == [
-        f'{missing}: can not be read (No such file or directory); set subject_file to a file that '
-        'can be used, then: ros2 lifecycle set /filter_node configure; ros2 lifecycle set '
-        '/filter_node activate'
+        f'subject_file: {missing}: can not be read (No such file or directory); mend that, '
+        'then: ros2 lifecycle set /filter_node configure; ros2 lifecycle set /filter_node activate'
     ]
     assert one.diagnosis()[:2] == (2, one.warnings()[0])
     assert one.set(subject_file=str(subject_file)) == (True, '')
@@ -321,7 +321,9 @@ def test_reset(running, small_camera, stub_tracker, subject_file, body):
     )
     answer = running.call(Reset, 'reset')
     assert not answer.success
-    assert 'human37 has no joint' in answer.message
+    assert answer.message.endswith(
+        f'{subject_file}: not a subject; an offline replay with it says why'
+    )
     running.send('image', small_camera.image(3))
     assert len(stub_tracker.made) == 3
 
@@ -506,3 +508,21 @@ def test_robots_are_told_that_no_image_is_answered(world, small_camera):
     one.executor.spin_once(timeout_sec=0.1)
     assert len(told) <= count + 1
     assert one.change_state('activate')
+
+
+@pytest.mark.parametrize('resets', [False, True])
+def test_a_clock_that_goes_back_is_an_error_for_a_while(
+    running, small_camera, stub_tracker, resets, monkeypatch
+):
+    assert running.set(reset_on_time_jump=resets) == (True, '')
+    running.send('camera_info', small_camera.info())
+    for index in (6000, 6001):
+        assert faults(running.send('image', small_camera.image(index))) == []
+    for index in range(4):
+        assert faults(running.send('image', small_camera.image(index))) == []
+    assert len(stub_tracker.made) == 2
+    level, text, _ = running.diagnosis()
+    assert (level, text[:30]) == (2, 'the clock went back by 600 s: ')
+    assert any('the clock went back by 600 s' in warning for warning in running.warnings())
+    monkeypatch.setattr(session_node, 'ALARM', 0.0)
+    assert not running.diagnosis()[1].startswith('the clock')

@@ -84,7 +84,7 @@ def test_parameters_are_those_of_the_file(running):
     running.assert_refused(
         ({'fixed_lag': -1.0}, 'out of range'),
         ({'method': 'guess'}, "saw 'guess'"),
-        ({'body_model': 'nobody'}, "no body 'nobody'"),
+        ({'body_model': 'nobody'}, 'nobody: no such file, and no name; there are human32'),
         ({'autostart': False}, 'read-only'),
     )
     assert running.set(queue_size=3, max_hypotheses=2) == (True, '')

@@ -257,8 +257,9 @@ def test_track_counts_no_more_after_time_has_jumped(session, somebody, stub_pred
     looked_at(stub_predictor, one, somebody, [5])
     one.take(TRACK, track(likelihoods, 5))
     assert looked_at(stub_predictor, one, somebody, [6]) == 0
-    assert one.take(IMAGE, somebody.image(1)).faults == ()
-    assert looked_at(stub_predictor, one, somebody, [2]) == 1
+    assert one.take(IMAGE, somebody.image(1)).published == ()
+    assert len(one.take(IMAGE, somebody.image(2)).published) == 2
+    assert len(stub_predictor.asked) == 3
     # What can not be used is told of as usual.
     one.take(TRACK, track(likelihoods, 2))
     one.parameters = replace(one.parameters, reset_on_time_jump=False)
@@ -386,7 +387,7 @@ def test_silhouettes_count_where_keypoints_show_nobody(both, outputs, somebody, 
     one.take(IMAGE, somebody.image(2))
     one.take('keypoints', keypoints(2))
     one.take(IMAGE, somebody.image(3))
-    one.take(IMAGE, somebody.image(20))
+    one.take(IMAGE, somebody.image(12))
     assert len(predictions(outputs)) == 4
     assert len(stub_predictor.asked) == 3
 
@@ -423,3 +424,13 @@ def test_keypoints_that_can_not_be_used_are_told_and_count_as_none(both, outputs
         BmeParameters(predict_from='all')
     with pytest.raises(ValueError, match="'both' needs a lifter"):
         BmeParameters(predict_from='both', lifter='')
+
+
+def test_a_stray_track_counts_for_no_image(session, somebody, stub_predictor, likelihoods):
+    one = session(tracked_interval=100.0)
+    one.take(CAMERA_INFO, somebody.info())
+    looked_at(stub_predictor, one, somebody, [0])
+    one.take(TRACK, track(likelihoods, 36_000))
+    assert looked_at(stub_predictor, one, somebody, [1]) == 1
+    one.take(TRACK, track(likelihoods, 1))
+    assert looked_at(stub_predictor, one, somebody, [2]) == 0

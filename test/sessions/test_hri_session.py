@@ -327,3 +327,20 @@ def test_parameters():
         HriParameters(namespaces='/a p1')
     with pytest.raises(ValueError, match=r"mixture_topic must be one of .* saw 'x'"):
         HriParameters(mixture_topic='x')
+
+
+@pytest.mark.parametrize('far', [36_000, -36_000])
+def test_stray_stamps_change_nothing(session, outputs, people, small_camera, far):
+    for strays in (False, True):
+        one = session()
+        one.take(CAMERA_INFO, small_camera.info(0))
+        for index in range(6):
+            if strays and index in (2, 4):
+                one.take(CAMERA_INFO, small_camera.info(index + far))
+                one.take(P1, people(index + far))
+            one.take(CAMERA_INFO, small_camera.info(index))
+            one.take(P1, people(index))
+    half = len(outputs) // 2
+    assert half > 6
+    assert outputs[:half] == outputs[half:]
+    assert one.state.faults['stray stamp'] == 2

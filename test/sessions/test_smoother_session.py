@@ -393,7 +393,7 @@ def test_nobody_in_view_ends_the_window(session, outputs, likelihoods):
     # A second one tells nothing new, and what comes after a while is no gap to bridge.
     handled = one.take(MIXTURE, change(likelihoods.message(5), components=[]))
     assert handled.published == handled.events == ()
-    handled = one.take(MIXTURE, likelihoods.message(30))
+    handled = one.take(MIXTURE, likelihoods.message(14))
     assert handled.faults == handled.warnings == ()
     assert (one.state.status, one.state.window, one.state.gaps) == ('smoothing', 1, 0)
     assert one.state.counts == {'received': 6, 'smoothed': 4}

@@ -1,0 +1,98 @@
+"""Files that parameters name: where they may lie, and what is told of one that can not be used.
+
+Whoever sets a parameter of a node over ROS need not be allowed to read files there. What such a
+reader may know of a file is its place and the kind of the fault, never its content.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from hmt_ros.body import model_names
+from hmt_ros.experts import lifter, pose_predictor
+from msg_tools.files.error_line import error_line, one_line
+
+# Parameters that may name a file, and the names in each that are no files.
+FILES: Mapping[str, Callable[[], Collection[str]]] = {
+    'subject_file': tuple,
+    'background_file': tuple,
+    'body_model': model_names,
+    'lifter': lambda: [lifter.SHIPPED],
+    'model_file': lambda: [path.stem for path in pose_predictor.FOLDER.glob('*.npz')],
+}
+
+
+class NamedFileError(ValueError):
+    """A file that a parameter names and that can not be used.
+
+    Attributes:
+        public: parameter, path and kind of the fault; the text itself may quote the file.
+    """
+
+    def __init__(self, text: str, public: str) -> None:
+        super().__init__(text)
+        self.public = public
+
+
+@contextmanager
+def named_file(parameter: str, path: str, wanted: str) -> Iterator[None]:
+    """Whatever goes wrong while the file of a parameter is read is a `NamedFileError`.
+
+    Args:
+        wanted: kind of the file, in words.
+    """
+    try:
+        yield
+    except Exception as error:
+        # Readers of files from outside may fail in any way.
+        text = error_line(error)
+        if not isinstance(error, ValueError):
+            text = f'{parameter} {path}: {text}'
+        raise NamedFileError(text, f'{parameter}: {path}: {_fault(error, wanted)}') from error
+
+
+def public_line(error: BaseException) -> str:
+    """The text of an error as one line, without anything that a file holds."""
+    return one_line(error.public) if isinstance(error, NamedFileError) else error_line(error)
+
+
+def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
+    """Whether a parameter may name a file.
+
+    Args:
+        folders: in which it must lie, once links are followed.
+
+    Raises:
+        ValueError: it lies elsewhere, whether or not it exists, or is no regular file.
+    """
+    names = ['', *FILES[parameter]()]
+    if path in names:
+        return
+    real = Path(os.path.realpath(path))
+    if not any(real.is_relative_to(os.path.realpath(folder)) for folder in folders):
+        raise ValueError(
+            f'{parameter}: {path} lies in no folder of file_folders, which are '
+            f'{", ".join(folders)}: move it there, or name it at launch'
+        )
+    try:
+        regular = stat.S_ISREG(real.stat().st_mode)
+    except OSError:
+        hint = f', and no name; there are {", ".join(names[1:])}' if names[1:] else ''
+        raise ValueError(f'{parameter}: {path}: no such file{hint}') from None
+    if not regular:
+        raise ValueError(f'{parameter}: {path}: not a regular file')
+
+
+def _fault(error: BaseException | None, wanted: str) -> str:
+    """The kind of a fault, with the line where a text is not YAML."""
+    while error is not None:
+        if (mark := getattr(error, 'problem_mark', None)) is not None:
+            return f'not a {wanted}: line {mark.line + 1} is not YAML'
+        if isinstance(error, OSError):
+            return f'can not be read ({error.strerror or "no such file"})'
+        error = error.__cause__
+    return f'not a {wanted}; an offline replay with it says why'
