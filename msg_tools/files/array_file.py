@@ -1,8 +1,7 @@
 """Reads archives of plain arrays (.npz) from outside, up to an agreed size.
 
 Nothing is unpickled. A compressed archive could expand to any size, and the header of an array
-could claim any size: both are checked before memory is allocated. Arrays of objects are refused, or
-read by `plain_pickle`.
+could claim any size: both are checked before memory is allocated. Arrays of objects are refused.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 from msg_tools.files.bounded_file import open_regular
 from msg_tools.files.budget import Budget
 from msg_tools.files.error_line import error_line
-from msg_tools.files.plain_pickle import read_plain_pickle
 
 # Bytes of all arrays of an archive together.
 LARGEST_ARCHIVE = 2**29
@@ -54,14 +52,11 @@ _FAULTS = (
 )
 
 
-def read_archive(
-    path: str | Path, largest: int = LARGEST_ARCHIVE, *, with_objects: bool = False
-) -> dict[str, NDArray[Any]]:
+def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, NDArray[Any]]:
     """The arrays of an archive by name.
 
     Args:
         largest: bytes that they may have together.
-        with_objects: whether arrays of plain data (`read_plain_pickle`) are read too.
 
     Raises:
         OSError: a file that can not be read.
@@ -70,7 +65,6 @@ def read_archive(
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-            budget = Budget(os.fstat(file.fileno()).st_size)
             members = archive.infolist()
             total = sum(member.file_size for member in members)
             if total > largest or len(members) > _MOST_ARRAYS:
@@ -78,38 +72,25 @@ def read_archive(
                     f'its {len(members)} arrays have {total} bytes, wanted at most {_MOST_ARRAYS} '
                     f'arrays and {largest} bytes'
                 )
-            budget.spend(unpacked=total)
+            Budget(os.fstat(file.fileno()).st_size).spend(unpacked=total)
             return {
-                member.filename.removesuffix('.npy'): _array(
-                    archive, member, largest, budget if with_objects else None
-                )
+                member.filename.removesuffix('.npy'): _array(archive, member, largest)
                 for member in members
             }
     except (ValueError, *_FAULTS) as fault:
         raise ValueError(error_line(fault)) from fault
 
 
-def _array(
-    archive: zipfile.ZipFile, member: zipfile.ZipInfo, largest: int, objects: Budget | None
-) -> NDArray[Any]:
-    """An array of an archive, whose head is compared with the bytes that are there.
-
-    Args:
-        objects: what an array of objects may unpack to; None: it is refused.
-    """
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, largest: int) -> NDArray[Any]:
+    """An array of an archive, whose head is compared with the bytes that are there."""
     name, there = member.filename, member.file_size
     with archive.open(member) as file:
         read_head = _HEADS.get(array_format.read_magic(file))
         if read_head is None:
             raise ValueError(f'the array {name} has an unknown version')
         shape, _, dtype = read_head(file)
-        if dtype.hasobject and objects is None:
-            raise ValueError(f'the array {name} holds Python objects')
         if dtype.hasobject:
-            held = read_plain_pickle(file.read(), objects)
-            if not isinstance(held, np.ndarray):
-                raise ValueError(f'the array {name} holds a {type(held).__name__}')
-            return held
+            raise ValueError(f'the array {name} holds Python objects')
         if dtype.kind not in _KINDS:
             raise ValueError(f'the array {name} holds {str(dtype)[:40]}, wanted numbers or texts')
         # Numbers of one byte become larger ones.

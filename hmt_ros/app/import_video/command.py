@@ -61,7 +61,7 @@ file, counted from --first-stamp. Phones write how they were held: the frames ar
   FOLDER     a file for each frame: JSON of OpenPose, MMPose or Ultralytics, such as
              walk_000000000012_keypoints.json, or labels (.txt) of Ultralytics (save_txt)
   FILE.npz   pixels (T, n, 2), optionally landmark_names (n,), visibility (T, n), detected (T,) and
-             world (T, n, 3), the positions in m; row t is frame t; or positions_2d of VideoPose3D
+             world (T, n, 3), the positions in m; row t is frame t
   FILE.csv   a row for each person: frame, NAME_u, NAME_v, NAME_confidence, ...; or for each
              keypoint: frame, name, u, v, confidence; time_s, in the video or of Unix, or stamp_ns
              may replace frame, and a column person keeps several persons apart; or DeepLabCut

@@ -208,27 +208,18 @@ def test_keypoints_that_differ_from_row_to_row_are_compared_by_name(tmp_path):
     assert outcome(path) == ''
 
 
-def test_arrays_whose_rows_or_clips_cost_more_than_their_bytes(tmp_path):
-    """Frames of one colour compress a thousandfold; one array may stand for thousands of clips."""
+def test_arrays_whose_rows_cost_more_than_their_bytes(tmp_path):
+    """Arrays of one value compress a thousandfold."""
     path = tmp_path / 'walk.npz'
     np.savez_compressed(path, pixels=np.ones((20_000, 17, 2), np.int8))
     assert 'more than' in outcome(path)
     np.savez_compressed(path, pixels=np.ones((1000, 17, 2)))
     assert 'records' not in outcome(path)
-    clip = np.ones((100, 17, 2))
-    clips = {f'S{i}': {f'{j}': [clip] * 50 for j in range(50)} for i in range(50)}
-    np.savez_compressed(path, positions_2d=clips)
-    assert 'records' in outcome(path)
-    tower = ['coco']
-    for _ in range(40):
-        tower = [tower] * 10
-    about = np.array({'layout_name': tower, 'video_metadata': {'a': {'w': tower, 'h': 10**400}}})
-    np.savez_compressed(path, positions_2d={'S': [clip]}, metadata=about)
-    found = read_keypoints(path, FrameSource(tmp_path), START)
-    assert (found.size, found.rows) == (None, 100)
-    names = np.empty(2, object)
-    names[0] = tower
-    np.savez_compressed(path, pixels=np.ones((1, 2, 2)), landmark_names=names)
+    np.savez_compressed(
+        path, pixels=np.ones((1, 2, 2)), landmark_names=np.array([['a'], 1], object)
+    )
+    assert 'Python objects' in outcome(path)
+    np.savez_compressed(path, pixels=np.ones((1, 2, 2)), landmark_names=np.ones(2))
     assert 'other things than texts' in outcome(path)
     np.savez_compressed(path, pixels=np.ones((1_000_000, 0, 2)))
     assert 'records' in outcome(path)

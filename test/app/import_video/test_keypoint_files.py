@@ -316,27 +316,6 @@ def test_labels_of_ultralytics(sure, tail, track, score, tmp_path):
         found_in(folder)
 
 
-def test_arrays_of_videopose3d(tmp_path):
-    clip = np.stack([pixels(17, i) for i in range(4)])
-    about = {
-        'layout_name': 'h36m', 'num_joints': 17, 'keypoints_symmetry': [[4, 5], [1, 2]],
-        'video_metadata': {'walk.mp4': {'w': 64, 'h': 48}},
-    }  # fmt: skip
-    path = tmp_path / 'walk.npz'
-    np.savez_compressed(path, positions_2d={'walk.mp4': {'custom': [clip]}}, metadata=about)
-    (seen,) = found_in(path)
-    assert seen.keypoints.names == schemes()['h36m17'].names
-    assert np.array_equal(seen.keypoints.pixels, pixels(17, 2))
-    found = read_keypoints(path, Numbered(tmp_path), START)
-    assert (found.size, found.rows, found.clips) == ((64, 48), 4, 1)
-    np.savez(path, positions_2d={'S1': {'Walk': [clip, clip + 1]}})
-    assert [x.track for x in found_in(path)] == ['S1/Walk/0', 'S1/Walk/1']
-    for bad in ([[clip.tolist()]], [clip[0]], ['x'], [np.array(['a'])]):
-        np.savez(path, positions_2d={'S1': {'Walk': bad}})
-        with pytest.raises(ValueError, match=r'positions_2d of S1/Walk/0 is no array \(T, n, 2\)'):
-            found_in(path)
-
-
 DEEPLABCUT = """\
 scorer,net,net,net,net,net,net
 individuals,one,one,one,two,two,two

@@ -83,8 +83,6 @@ def test_an_id_that_does_not_exist():
         chosen('id:7', frames)
     with pytest.raises(ValueError, match='there are no ids; or --person at:X,Y or track:1'):
         chosen('id:7', [[at(10.0)]])
-    with pytest.raises(ValueError, match='2 clips, 9, 10; choose one by --person id:NAME'):
-        chosen('nearest', frames, clips=2)
 
 
 @pytest.mark.parametrize(

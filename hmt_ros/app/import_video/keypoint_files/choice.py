@@ -83,8 +83,6 @@ def chosen_person(
         ValueError: nobody is so; the line names those that are there.
     """
     kind, value = choice.kind, choice.value
-    if found.clips > 1 and kind != TRACK:
-        raise ValueError(f'{found.clips} clips, {_names_in(found)}; choose one by --person id:NAME')
     if kind == INDEX:
         there = {k: x[int(value)] for k, x in found.frames.items() if int(value) < len(x)}
         most = max(map(len, found.frames.values()), default=0)

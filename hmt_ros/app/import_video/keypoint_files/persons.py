@@ -155,7 +155,6 @@ class FoundPersons:
         rows: number of frames that the file describes one by one; None: it skips frames.
         size: width and height of the frames that the detector saw, px; None: not known.
         unnamed: number of points of lists without names; 0: points have names.
-        clips: number of clips in the file, each with the name of a person.
         fractions: whether places are fractions of the image, not px.
     """
 
@@ -166,7 +165,6 @@ class FoundPersons:
     size: tuple[int, int] | None = None
     unnamed: int = 0
     fractions: bool = False
-    clips: int = 1
 
     def add(self, key: int, seen: Person | None) -> None:
         """Adds a person to a frame; None: the frame was looked at.
