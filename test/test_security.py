@@ -10,7 +10,7 @@ from hmt_learning.motion import rig
 from hmt_ros.body import model_file
 from hmt_ros.image import subject
 from hmt_ros.sessions import camera_session, parameter_file
-from msg_tools.bags import bag_metadata
+from msg_tools.bags import bag_metadata, storage
 from msg_tools.files import array_file
 from msg_tools.messages import detections, images, keypoints, pose_mixtures
 
@@ -98,7 +98,22 @@ def test_limits_of_bags_are_those_of_the_page():
     page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
     (row,) = (line for line in page.splitlines() if line.startswith('| bag |'))
     stated = [int(text.replace(' ', '')) for text in re.findall(r'\*\*([\d ]+)\*\*', row)]
-    assert stated == [bag_metadata.MAX_BYTES]
+    assert stated == [storage.LARGEST, bag_metadata.MAX_BYTES]
+
+
+def test_each_promise_of_the_page_names_a_test_that_exists():
+    page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
+    promises = page.partition('## Files')[2].partition('\n## Limits')[0]
+    rows = [line for line in promises.splitlines() if line.startswith('| ') and line[2] != 'p']
+    named = [re.fullmatch(r'\| .+\. \| `(test/[\w/]+\.py)::(test_\w+)` \|', row) for row in rows]
+    assert len(named) > 20
+    assert [row for row, match in zip(rows, named, strict=True) if match is None] == []
+    wrong = [
+        match[0]
+        for match in named
+        if f'def {match[2]}(' not in (ROOT / match[1]).read_text('utf-8')
+    ]
+    assert wrong == []
 
 
 @pytest.mark.ros
