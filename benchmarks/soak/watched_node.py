@@ -17,6 +17,9 @@ OURS = '/hmt_ros/'
 PATIENCE = 60.0
 # How long a valid message is waited for that may have been sent too early, s.
 SHORT = 2.0
+# Messages of a topic that wait for this process. While it is late it publishes on without listening:
+# answers beyond these would be lost here, though the node has given them.
+_QUEUE = 1000
 # Messages before memory is compared: kernels are compiled, buffers have grown.
 _WARM = 8
 
@@ -44,6 +47,7 @@ class Watched:
         scene = self.scene
         with ExitStack() as opened:
             self.player = Player(opened)
+            self.player.reliable.depth = _QUEUE
             process = None
             if scene.together:
                 module = f'hmt_ros.nodes.{PERSON}'
