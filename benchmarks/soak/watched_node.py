@@ -17,8 +17,8 @@ OURS = '/hmt_ros/'
 PATIENCE = 60.0
 # How long a valid message is waited for that may have been sent too early, s.
 SHORT = 2.0
-# Messages of a topic that wait for this process. While it is late it publishes on without listening:
-# answers beyond these would be lost here, though the node has given them.
+# Messages of a topic that wait for this process. While it is late it publishes on without
+# listening: answers beyond these would be lost here, though the node has given them.
 _QUEUE = 1000
 # Messages before memory is compared: kernels are compiled, buffers have grown.
 _WARM = 8
