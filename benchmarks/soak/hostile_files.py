@@ -443,13 +443,8 @@ def _arrays() -> Iterator[Hostile]:
     for name, data in _pickles().items():
         content = _npy({**usual, 'descr': '|O', 'shape': ()}, data)
         yield Hostile(f'pickle_{name}.npz', partial(_zip, dict.fromkeys(_WANTED, content)))
-    zeros = _npy({**usual, 'shape': (10_000_000, 6, 2)}, b'')
-
-    def bomb(size: int, count: int = 1) -> bytes:
-        return _zip({f'{x}{i or ""}': zeros for i in range(count) for x in _WANTED[:1]}, size)
-
-    yield Hostile('bomb.npz', lambda: bomb(960_000_000))
-    yield Hostile('bombs.npz', lambda: bomb(200_000_000, 9))
+    yield Hostile('bomb.npz', partial(zeros_archive, 960_000_000))
+    yield Hostile('bombs.npz', partial(zeros_archive, 200_000_000, 9))
     yield Hostile('members.npz', lambda: _zip({f'a{i}': b'' for i in range(60_000)}))
     small = _npy({**usual, 'shape': (1,)}, bytes(8))
     yield Hostile('arrays.npz', lambda: _zip({f'a{i}': small for i in range(9_999)}))
@@ -488,6 +483,12 @@ def _zip(members: Mapping[str, bytes], zeros: int = 0) -> bytes:
                 for _ in range(zeros // 2**20):
                     member.write(bytes(2**20))
     return target.getvalue()
+
+
+def zeros_archive(size: int, count: int = 1) -> bytes:
+    """An archive of arrays of zeros, each of so many bytes when it is unpacked."""
+    head = _npy({'descr': '<f8', 'fortran_order': False, 'shape': (size // 96, 6, 2)}, b'')
+    return _zip({f'pixels{i or ""}': head for i in range(count)}, size)
 
 
 def _lying(data: bytes) -> bytes:

@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.mutations import damaged
+from benchmarks.soak.hostile_operator import files_in_parameters, floods, stray_stamps
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import STEP_NS, scenes, stamped
 from benchmarks.soak.watched_node import PATIENCE, SHORT, Silent, Watched
@@ -304,6 +305,9 @@ CASES: tuple[tuple[str, Case, float], ...] = (
     ('stamps and /clock that jump', jumping_clock, 1.0),
     ('damaged bytes on topics and in services', damaged_bytes, 10.0),
     (f'messages at {OVERLOAD:g} times its rate', overload, 2.5),
+    ('stamps that cannot be, a clock set back', stray_stamps, 1.0),
+    ('floods of calls and messages', floods, 1.0),
+    ('odd files as parameters', files_in_parameters, 1.0),
     ('killed while it computes, started again', killed, 0.02),
 )
 

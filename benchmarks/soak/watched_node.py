@@ -44,6 +44,7 @@ class Watched:
         """Starts it, in a domain of its own; ends the one that ran before."""
         self._opened.close()
         self.index = 0
+        self._setting: Any = None
         scene = self.scene
         with ExitStack() as opened:
             self.player = Player(opened)
@@ -162,6 +163,18 @@ class Watched:
             SetParametersAtomically, 'set_parameters_atomically', parameters=given
         ).result
         return bool(found.successful), str(found.reason)
+
+    def begin_to_set(self, **values: Any) -> Any:
+        """Sends a request to set parameters; its answer comes as a future."""
+        from rcl_interfaces.srv import SetParameters
+        from rclpy.parameter import Parameter
+
+        if self._setting is None:
+            name = f'/{self.node.name}/set_parameters'
+            self._setting = self.player.node.create_client(SetParameters, name)
+            self.node.call(SetParameters, 'set_parameters', parameters=[])
+        given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        return self._setting.call_async(SetParameters.Request(parameters=given))
 
     def get(self, names: list[str]) -> list[Any]:
         """Values of parameters."""
