@@ -13,6 +13,7 @@ has been published. A player that waits for it feeds the node in lock step.
 
 from __future__ import annotations
 
+import gc
 import time
 import traceback
 from abc import abstractmethod
@@ -359,6 +360,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self.destroy_service(service)
         self._offered.clear()
         self._session = None
+        # Sessions and their tracks are in cycles, and hold images: Python would wait for long.
+        gc.collect()
 
     def _refuse_impossible_transitions(self) -> None:
         """A request for a transition that the state does not have must not end the node."""
