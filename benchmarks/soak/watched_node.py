@@ -10,6 +10,7 @@ from typing import Any
 from benchmarks.soak.scenes import PERSON, Scene
 from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
 from hmt_ros.app.replay.player import LiveNodeError, Player
+from hmt_ros.nodes.subscribed_topic import message_class
 from hmt_ros.sessions.handled import Handled
 
 OURS = '/hmt_ros/'
@@ -49,6 +50,10 @@ class Watched:
         with ExitStack() as opened:
             self.player = Player(opened)
             self.player.reliable.depth = _QUEUE
+            for msgtype in (kind for _, kind in scene.inputs.values()):
+                self.player.classes.setdefault(msgtype, message_class(msgtype))
+            for published in scene.session.TOPICS.values():
+                self.player.classes.setdefault(published.msgtype, message_class(published.msgtype))
             process = None
             if scene.together:
                 module = f'hmt_ros.nodes.{PERSON}'
