@@ -37,7 +37,7 @@ from msg_tools import BagWriter
 
 # What a command may need: seconds of the processor, and of the clock where others use it, bytes,
 # characters in a line, and lines: warnings may come before the error.
-SECONDS, WALL_SECONDS, MEMORY, CHARACTERS, LINES = 5.0, 60.0, 1e9, 300, 3
+SECONDS, WALL_SECONDS, MEMORY, CHARACTERS, LINES = 5.0, 40.0, 1e9, 300, 3
 # One run of so many is in an interpreter of its own.
 _ALONE = 20
 _LOOKS = 0.02  # s between two looks at a child
@@ -46,7 +46,7 @@ _BAGS = '.mcap .db3 .zst .zstd folder'
 _TABLES = '.json .npz .csv .trc folder'
 _VIDEOS = '.mp4 .avi .mkv .gif .y4m .m3u8 folder'
 _PICTURES = '.png .jpg .bmp .tif .webp .exr .hdr .pgm .jp2 .gif'
-_REPLAY = 'hmt_ros replay FILE -o OUT --quiet --set max_hypotheses=2 --set candidates=4'
+_REPLAY = 'hmt_ros replay FILE -o OUT --quiet --set max_hypotheses=2 --set threads=1'
 _TRACK = _REPLAY.replace('FILE', 'GOOD/bag')
 _IMPORT = 'hmt_ros import-video GOOD/video.avi -o OUT --quiet'
 _LIFT = 'hmt_ros lift GOOD/keypoints.npz -o OUT --fov 60 --size 640x480 --quiet'

@@ -52,10 +52,13 @@ _DEFINITIONS = {
 }
 _IDL = 'module a_msgs { module msg { %s struct A { %s }; }; };'
 _IDL_DEFINITIONS = {
-    'parentheses': _IDL
-    % ('module A_Constants { const long X = ' + '(' * 28 + '1' + ')' * 28 + '; };', 'long x;'),
-    'parentheses_deep': _IDL
-    % ('module A_Constants { const long X = ' + '(' * 5000 + '1' + ')' * 5000 + '; };', 'long x;'),
+    **{
+        f'parentheses_{depth}': _IDL
+        % (f'module A_Constants {{ const long X = {"(" * depth}1{")" * depth}; }};', 'long x;')
+        for depth in (14, 20, 25, 5000)
+    },
+    'sums': _IDL
+    % (f'module A_Constants {{ const long X = {"1 + (" * 20}1{")" * 20}; }};', 'long x;'),
     'shifts': _IDL
     % ('module A_Constants { const long X = 1' + ' << 99999 * 9' * 20 + '; };', 'long x;'),
     'products': _IDL
@@ -163,7 +166,12 @@ def bags(good: Path) -> Iterator[Hostile]:
     definitions = [(n, 'ros2msg', x) for n, x in _DEFINITIONS.items()]
     definitions += [(n, 'ros2idl', x) for n, x in _IDL_DEFINITIONS.items()]
     for name, encoding, text in definitions:
-        yield from _of_definition(f'{encoding}_{name}', encoding, text, whole)
+        make = partial(_good_records, good, definition=(encoding, text))
+        yield Hostile(f'{encoding}_{name}.mcap', lambda make=make: _mcap(make()))
+        unknown = _schema(1, _UNKNOWN, encoding, text) + _channel(1, 1, '/a')
+        yield Hostile(
+            f'{encoding}_{name}_a.mcap', _mcap(unknown + _message(1, 1, bytes(64)) + whole)
+        )
     for name, qos in YAML_BOMBS.items():
         content = _channel(60000, 0, '/x', qos=qos) + whole
         yield Hostile(f'qos_{name}.mcap', _mcap(content))
@@ -174,9 +182,16 @@ def bags(good: Path) -> Iterator[Hostile]:
 
 
 def _good_records(
-    good: Path, change: Callable[[str, bytes], bytes] = lambda _, data: data
+    good: Path,
+    change: Callable[[str, bytes], bytes] = lambda _, data: data,
+    definition: tuple[str, str] | None = None,
 ) -> bytes:
-    """Schemas, channels and messages of the good bags, as records."""
+    """Schemas, channels and messages of the good bags, as records.
+
+    Args:
+        change: of the bytes of a message, by its type.
+        definition: encoding and text that stand in the place of all, as of a_msgs/msg/A.
+    """
     content, known = [], {}
     for folder in (good / 'bag', good / 'lifted' / 'lifted'):
         with BagReader(folder) as reader:
@@ -186,26 +201,18 @@ def _good_records(
                     assert channel is not None
                     if (number := known.get(channel)) is None:
                         number = known[channel] = 1000 + len(known)
+                        encoding, text = definition or ('ros2msg', channel.definition)
+                        package, _, kind = channel.msgtype.split('/')
+                        text = text.replace('a_msgs', package).replace(
+                            'struct A ', f'struct {kind} '
+                        )
                         content += [
-                            _schema(number, channel.msgtype, 'ros2msg', channel.definition),
+                            _schema(number, channel.msgtype, encoding, text),
                             _channel(number, number, channel.topic),
                         ]
                     data = change(channel.msgtype, stored.data)
                     content.append(_message(number, stored.log_time, data))
     return b''.join(content)
-
-
-def _of_definition(name: str, encoding: str, text: str, whole: bytes) -> Iterator[Hostile]:
-    """A definition of an unknown type, and of one that the commands read."""
-    unknown = _schema(1, _UNKNOWN, encoding, text) + _channel(1, 1, '/a')
-    yield Hostile(f'{name}.mcap', _mcap(unknown + _message(1, 1, bytes(64)) + whole))
-    known = 'hmt_msgs/msg/PoseMixture', 'sensor_msgs/msg/CompressedImage'
-    for number, msgtype in enumerate(known):
-        package, _, kind = msgtype.split('/')
-        changed = text.replace('a_msgs', package).replace('struct A ', f'struct {kind} ')
-        records = _schema(1, msgtype, encoding, changed) + _channel(1, 1, '/a')
-        file = _mcap(records + _message(1, 1, bytes(64)))
-        yield Hostile(f'{name}_{number}.mcap', file)
 
 
 def _of_names(whole: bytes) -> Iterator[Hostile]:
