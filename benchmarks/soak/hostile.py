@@ -132,12 +132,7 @@ def _write_good_files(folder: Path) -> None:
         for number, image in enumerate(images):
             bag.write('camera_info', number, info)
             bag.write('image/compressed', number, image)
-    pictures = [cv2.imdecode(image.data, cv2.IMREAD_COLOR) for image in images]
-    size = pictures[0].shape[1::-1]
-    video = cv2.VideoWriter(str(folder / 'video.avi'), cv2.VideoWriter.fourcc(*'MJPG'), 5.0, size)
-    for picture in pictures:
-        video.write(picture)
-    video.release()
+    write_video(folder / 'video.avi')
     rng = np.random.default_rng(0)
     names = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder', 'left_knee', 'nose')
     pixels = rng.uniform(100.0, 300.0, (3, len(names), 2))
@@ -146,6 +141,17 @@ def _write_good_files(folder: Path) -> None:
     run = _finished(_forked(words, folder, {}), WALL_SECONDS)
     if run.code:
         raise ValueError(f'the keypoints of the soak can not be lifted: {run.said}')
+
+
+def write_video(path: Path) -> None:
+    """Three images of the clip."""
+    _, images = read_messages(CLIP, [COMPRESSED])
+    pictures = [cv2.imdecode(image.data, cv2.IMREAD_COLOR) for image in images[:3]]
+    size = pictures[0].shape[1::-1]
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'MJPG'), 5.0, size)
+    for picture in pictures:
+        video.write(picture)
+    video.release()
 
 
 def _read_all(
