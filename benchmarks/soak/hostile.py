@@ -102,6 +102,8 @@ def hostile(amount: Amount, *, quick: bool = False, given: Path | None = None) -
         good = folder / 'good'
         _write_good_files(good)
         kinds = hostile_files(good) if given is None else {given.name: _given(given)}
+        if quick:
+            kinds = dict(list(kinds.items())[1::4])
         end = time.monotonic() + amount.seconds
         for number, (kind, found) in enumerate(kinds.items()):
             outcome = Outcome(kind, 'well-formed and hostile, read by commands')

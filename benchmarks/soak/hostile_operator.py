@@ -36,6 +36,11 @@ _TOKEN = 'xylophone4711'
 _PASSWORDS = Path('/etc/passwd')
 
 
+def _while(amount: Amount) -> float:
+    """How long something is done, s."""
+    return min(_FLOOD, 0.02 * amount.times, amount.seconds / 4)
+
+
 class _Fed:
     """A node that gets its messages one after the other, while others are done to it.
 
@@ -80,9 +85,9 @@ class _Fed:
                 self.refused += bool(handled.faults)
         self.gap = max(self.gap, now - self._last)
 
-    def usual_gap(self) -> float:
+    def usual_gap(self, seconds: float) -> float:
         """The longest gap of a while in which nothing else is done."""
-        self.until(lambda: False, _FLOOD)
+        self.until(lambda: False, seconds)
         usual = self.gap
         self.begin()
         return usual
@@ -103,11 +108,11 @@ def files_in_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> N
     ]
     usual_values = dict(zip(names, watched.get(names), strict=True))
     fed = _Fed(watched)
-    usual = fed.usual_gap()
+    usual = fed.usual_gap(_while(amount))
     # The working folder and the home are where a node may read by default.
     with TemporaryDirectory(prefix='.hmt_ros.', dir=Path.home()) as folder:
         given = [(name, value) for value in _odd_values(Path(folder)) for name in names]
-        for number in Amount(len(given), amount.seconds).counted():
+        for number in Amount(min(len(given), amount.times), amount.seconds).counted():
             name, value = given[number]
             done, why = _set(fed, name, value, outcome)
             outcome.times += 1
@@ -120,7 +125,7 @@ def files_in_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> N
             if fed.gap > usual + GAP:
                 fed.judge(usual, outcome, f'{name} = {_short(value)}')
                 fed.begin()
-        fed.until(lambda: False, ANSWER)
+        fed.until(lambda: False, _while(amount))
         said = f'{watched.node.output()} {watched.values()}'
         _look_for_content(said, '', 'the log or the diagnostics', outcome)
 
@@ -196,7 +201,7 @@ def _odd_values(folder: Path) -> Iterator[str]:
 def floods(watched: Watched, amount: Amount, outcome: Outcome) -> None:
     """Calls and messages as fast as this process makes them; images go on, and so do calls."""
     fed = _Fed(watched)
-    usual = fed.usual_gap()
+    usual = fed.usual_gap(_while(amount))
     rng = np.random.default_rng(0)
     pending: list[Any] = []
 
@@ -214,7 +219,7 @@ def floods(watched: Watched, amount: Amount, outcome: Outcome) -> None:
     for what, act in (('parameters', calls), ('garbage', garbage), ('inputs', inputs)):
         fed.begin()
         due = time.monotonic()
-        end = due + min(_FLOOD, amount.seconds / 3)
+        end = due + _while(amount)
         while time.monotonic() < end:
             # A thousand a second, and no more at once than this process also listens to.
             if time.monotonic() >= due:
@@ -258,7 +263,7 @@ def stray_stamps(watched: Watched, amount: Amount, outcome: Outcome) -> None:
     sources = [source for source in (*scene.others, counted) if _head(_any_message(scene, source))]
     strays = ((0, 4_294_967_295), (3600, 0), (-3600, 0), (10**8, 0), (-(10**8), 10**9))
     given = [(source, stray) for stray in strays for source in sources]
-    for number in Amount(len(given), amount.seconds / 2).counted():
+    for number in Amount(min(len(given), amount.times), amount.seconds / 2).counted():
         source, (seconds, nanoseconds) = given[number]
         stamp = scene.stamp(watched.index)
         message = _with_stamp(_any_message(scene, source), stamp // 10**9 + seconds, nanoseconds)

@@ -59,6 +59,8 @@ def _watched_memory(outcome: Outcome) -> Iterator[None]:
     yield
     grown = (peak_memory() - before) / 1e6
     outcome.growth_mb = max(grown, outcome.growth_mb or 0.0)
+    gc.collect()
+    outcome.kept_mb = (resident_memory() - before) / 1e6
 
 
 class _Fed:

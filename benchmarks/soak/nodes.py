@@ -417,5 +417,6 @@ def _do(case: Case, watched: Watched, part: Amount, outcome: Outcome) -> None:
     watched.check_alive()
     if watched.node.process.pid == process:
         outcome.growth_mb = max(peak_memory(process) - before, 0.0) / 1e6
+        outcome.kept_mb = (resident_memory(process) - before) / 1e6
     for text in watched.traces()[said:]:
         outcome.fault(text)
