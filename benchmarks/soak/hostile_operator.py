@@ -23,15 +23,16 @@ from benchmarks.soak.hostile_file import CONTROL, DEEP, DIGITS, Hostile
 from benchmarks.soak.hostile_files import zeros_archive
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import STEP_NS, stamped
-from benchmarks.soak.watched_node import Silent, Watched
+from benchmarks.soak.watched_node import Watched
 from hmt_ros.app.replay.player import LiveNodeError
 from hmt_ros.sessions.declared_parameters import declared_parameters
 from hmt_ros.sessions.image_inputs import KEYPOINTS
 
 # Longest time without an answer to a call, and longer than usual without one to an image, s.
 ANSWER, GAP = 1.0, 0.5
-# Time for a call before the node counts as lost, and that floods take, s; characters of a reason.
-_LOST, _FLOOD, _CHARACTERS = 40.0, 2.0, 300
+# Time for a call before the node counts as lost, that floods take, and without an answer in one, s;
+# characters of a reason.
+_LOST, _FLOOD, _FLOOD_GAP, _CHARACTERS = 40.0, 2.0, 2.0, 300
 _TOKEN = 'xylophone4711'
 _PASSWORDS = Path('/etc/passwd')
 
@@ -46,7 +47,6 @@ class _Fed:
 
     Attributes:
         gap: longest time without an answer, s.
-        refused: how many of its messages were refused.
     """
 
     def __init__(self, watched: Watched) -> None:
@@ -57,7 +57,7 @@ class _Fed:
         """Counts anew."""
         self._sent = False
         self._last = time.monotonic()
-        self.gap, self.refused, self.answered = 0.0, 0, 0
+        self.gap = 0.0
 
     def until(self, done: Callable[[], bool], seconds: float) -> bool:
         """Goes on until something is true; whether it is in time."""
@@ -65,10 +65,11 @@ class _Fed:
         while not done():
             if time.monotonic() > end:
                 return False
-            self._step()
+            self.step()
         return True
 
-    def _step(self) -> None:
+    def step(self) -> None:
+        """Gives the next message, and hears what there is."""
         watched, counted = self.watched, self.watched.scene.session.COUNTED
         watched.check_alive()
         if not self._sent:
@@ -81,8 +82,6 @@ class _Fed:
             handled = watched.answer(ANSWER)
             if handled.source == counted:
                 self._sent, self._last = False, now
-                self.answered += 1
-                self.refused += bool(handled.faults)
         self.gap = max(self.gap, now - self._last)
 
     def usual_gap(self, seconds: float) -> float:
@@ -92,9 +91,9 @@ class _Fed:
         self.begin()
         return usual
 
-    def judge(self, usual: float, outcome: Outcome, what: str) -> None:
+    def judge(self, usual: float, outcome: Outcome, what: str, most: float = GAP) -> None:
         """Compares the gap with the usual one."""
-        if self.gap > usual + GAP:
+        if self.gap > usual + most:
             outcome.fault(f'{what}: no image is answered for {self.gap:.1f} s, else {usual:.1f} s')
 
 
@@ -122,9 +121,8 @@ def files_in_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> N
             elif not why or len(why) > _CHARACTERS or not why.isprintable():
                 outcome.fault(f'{name} is refused with {why[:80]!r}, {len(why)} characters')
             _look_for_content(why, value, f'the reason of {name}', outcome)
-            if fed.gap > usual + GAP:
-                fed.judge(usual, outcome, f'{name} = {_short(value)}')
-                fed.begin()
+            fed.judge(usual, outcome, f'{name} = {_short(value)}')
+            fed.gap = 0.0
         fed.until(lambda: False, _while(amount))
         said = f'{watched.node.output()} {watched.values()}'
         _look_for_content(said, '', 'the log or the diagnostics', outcome)
@@ -227,14 +225,10 @@ def floods(watched: Watched, amount: Amount, outcome: Outcome) -> None:
                 due += 1e-3
                 outcome.times += 1
             else:
-                fed.until(lambda: True, 0.0)
-                fed._step()
-        fed.judge(usual, outcome, f'a flood of {what}')
+                fed.step()
+        fed.judge(usual, outcome, f'a flood of {what}', _FLOOD_GAP)
         begin = time.monotonic()
-        try:
-            watched.settle(0.2)
-        except Silent:
-            outcome.fault(f'a flood of {what} is not over')
+        watched.settle(0.2)
         if not fed.until(watched.begin_to_set(queue_size=5).done, max(ANSWER, _LOST)):
             raise LiveNodeError(f'after a flood of {what} no call is answered')
         if (late := time.monotonic() - begin) > ANSWER + 10 * GAP:
