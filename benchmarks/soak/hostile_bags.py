@@ -366,10 +366,7 @@ _MESSAGES_OF = 'CREATE VIEW messages AS '
 _DATABASES: dict[str, Sequence[str]] = {
     'endless': (_TABLES[0], _TOPIC, _MESSAGES_OF + _ENDLESS.format('') + _ROW),
     'view_1e7': (_TABLES[0], _TOPIC, _MESSAGES_OF + _ENDLESS.format(' LIMIT 10000000') + _ROW),
-    'topics_endless': (
-        _TABLES[1],
-        'CREATE VIEW topics AS ' + _ENDLESS.format('') + _TOPIC_ROW,
-    ),
+    'topics_endless': (_TABLES[1], 'CREATE VIEW topics AS ' + _ENDLESS.format('') + _TOPIC_ROW),
     'topics_1e6': (
         _TABLES[1],
         'CREATE VIEW topics AS ' + _ENDLESS.format(' LIMIT 1000000') + _TOPIC_ROW,
