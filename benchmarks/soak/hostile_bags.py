@@ -11,9 +11,9 @@ from pathlib import Path
 
 import lz4.frame
 import zstandard
+from mcap.reader import make_reader
 
 from benchmarks.soak.hostile_file import ALIASES, CONTROL, DEEP, DIGITS, Hostile, alias_bomb, bare
-from msg_tools import BagReader
 
 _MAGIC = b'\x89MCAP0\r\n'
 _BLOCK = 2**17  # content of the largest block of zstd, bytes
@@ -192,26 +192,23 @@ def _good_records(
         change: of the bytes of a message, by its type.
         definition: encoding and text that stand in the place of all, as of a_msgs/msg/A.
     """
-    content, known = [], {}
-    for folder in (good / 'bag', good / 'lifted' / 'lifted'):
-        with BagReader(folder) as reader:
-            for file in reader._files:
-                for stored in file.messages(set(reader.topics)):
-                    channel = stored.channel
-                    assert channel is not None
-                    if (number := known.get(channel)) is None:
-                        number = known[channel] = 1000 + len(known)
-                        encoding, text = definition or ('ros2msg', channel.definition)
-                        package, _, kind = channel.msgtype.split('/')
-                        text = text.replace('a_msgs', package).replace(
-                            'struct A ', f'struct {kind} '
-                        )
-                        content += [
-                            _schema(number, channel.msgtype, encoding, text),
-                            _channel(number, number, channel.topic),
-                        ]
-                    data = change(channel.msgtype, stored.data)
-                    content.append(_message(number, stored.log_time, data))
+    content: list[bytes] = []
+    known: dict[str, int] = {}
+    for path in (*(good / 'bag').glob('*.mcap'), *(good / 'lifted' / 'lifted').glob('*.mcap')):
+        with path.open('rb') as file:
+            for schema, channel, message in make_reader(file).iter_messages():
+                assert schema is not None
+                if (number := known.get(channel.topic)) is None:
+                    number = known[channel.topic] = 1000 + len(known)
+                    encoding, text = definition or (schema.encoding, schema.data.decode())
+                    package, _, kind = schema.name.split('/')
+                    text = text.replace('a_msgs', package).replace('struct A ', f'struct {kind} ')
+                    content += [
+                        _schema(number, schema.name, encoding, text),
+                        _channel(number, number, channel.topic),
+                    ]
+                data = change(schema.name, message.data)
+                content.append(_message(number, message.log_time, data))
     return b''.join(content)
 
 
