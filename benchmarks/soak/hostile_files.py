@@ -750,7 +750,9 @@ def _write_many(path: Path) -> None:
 
 def _outputs() -> Iterator[Hostile]:
     """Places of outputs that lead elsewhere: links to a folder, and to a file, of somebody else."""
-    yield Hostile('link.out', write=lambda path: path.symlink_to('../kept'))
+    # A folder on the way to an output may be a link.
+    over = ('written over',)
+    yield Hostile('link.out', write=lambda path: path.symlink_to('../kept'), routes=over)
     yield Hostile('linked_file.out', write=lambda path: path.symlink_to('../kept/canary'))
     yield Hostile('nowhere.out', write=lambda path: path.symlink_to('../kept/new'))
     yield Hostile('folder.out', write=_write_linked)
