@@ -240,8 +240,11 @@ def stray_stamps(watched: Watched, amount: Amount, outcome: Outcome) -> None:
     """Stamps that cannot be, in messages of every source, and a clock that is set back."""
     scene, counted = watched.scene, watched.scene.session.COUNTED
     keypoints = KEYPOINTS in scene.others
-    watched.set(reset_on_time_jump=False, **({'use_keypoints': True} if keypoints else {}))
+    if keypoints:
+        watched.set(use_keypoints=True)
+    # Its stamps begin anew, too.
     watched.anew()
+    watched.set(reset_on_time_jump=False)
 
     def refused(count: int, shift_ns: int = 0) -> int:
         found = 0
