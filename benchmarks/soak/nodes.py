@@ -14,10 +14,13 @@ import numpy as np
 
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.mutations import damaged
+from benchmarks.soak.hostile import write_video
+from benchmarks.soak.hostile_operator import ANSWER, files_in_parameters, floods, stray_stamps
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import STEP_NS, scenes, stamped
 from benchmarks.soak.watched_node import PATIENCE, SHORT, Silent, Watched
-from hmt_ros.app.replay.player import LiveNodeError
+from hmt_ros.app.replay.live_node import NodeProcess
+from hmt_ros.app.replay.player import LiveNodeError, Player
 from hmt_ros.sessions.declared_parameters import DeclaredParameter, declared_parameters
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.image_inputs import PREDICTION
@@ -304,14 +307,87 @@ CASES: tuple[tuple[str, Case, float], ...] = (
     ('stamps and /clock that jump', jumping_clock, 1.0),
     ('damaged bytes on topics and in services', damaged_bytes, 10.0),
     (f'messages at {OVERLOAD:g} times its rate', overload, 2.5),
+    ('stamps that cannot be, a clock set back', stray_stamps, 1.0),
+    ('floods of calls and messages', floods, 1.0),
+    ('odd files as parameters', files_in_parameters, 1.0),
     ('killed while it computes, started again', killed, 0.02),
 )
+
+
+# Nodes that are fed by no scene, and the words for their command lines. Without what they need, a
+# detector or hri_msgs, they stay unconfigured.
+_ALONE = {
+    'camera_node': ('VIDEO', '--fov', '60', '--ros-args', '-p', 'loop:=true'),
+    'keypoints_node': (),
+    'hri_node': (),
+}
+_USUAL_GAP = 2.0
+
+
+def alone(name: str, amount: Amount) -> Outcome:
+    """A node by itself: strange parameters and requests are answered, images go on, it stays."""
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import Image
+
+    outcome = Outcome(name, 'strange parameters, in a process of its own')
+    rng = np.random.default_rng(0)
+    with ExitStack() as opened:
+        player = Player(opened)
+        video = player.folder / 'video.avi'
+        write_video(video)
+        words = [str(video) if word == 'VIDEO' else word for word in _ALONE[name]]
+        process = NodeProcess(player, opened, name, f'hmt_ros.nodes.{name}', words)
+        arrivals: list[float] = []
+        player.node.create_subscription(
+            Image,
+            '/image_raw',
+            lambda _: arrivals.append(time.monotonic()),
+            qos_profile_sensor_data,
+        )
+        client = player.node.create_client(SetParameters, f'/{name}/set_parameters')
+        process.start()
+
+        def wait(done: Callable[[], bool], seconds: float) -> bool:
+            end = time.monotonic() + seconds
+            while not done() and time.monotonic() < end:
+                player.executor.spin_once(timeout_sec=0.02)
+            return done()
+
+        if not wait(client.service_is_ready, PATIENCE):
+            outcome.fault(f'does not start: {process.output()[-200:]}')
+            return outcome
+        wait(lambda: len(arrivals) > 5, 2 * _USUAL_GAP)
+        before = resident_memory(process.popen.pid)
+        del arrivals[:]
+        for _ in amount.counted():
+            chosen = ('loop', 'rate', 'wait_for', 'detector', 'queue_size', 'x' * 1000)[
+                int(rng.integers(0, 6))
+            ]
+            value = ('/dev/zero', '\x1b[2J', -1, float('nan'), True, ['x'])[int(rng.integers(0, 6))]
+            given = [Parameter(chosen, value=value).to_parameter_msg()]
+            future = client.call_async(SetParameters.Request(parameters=given))
+            outcome.times += 1
+            if not wait(future.done, ANSWER):
+                outcome.fault(f'{chosen[:20]} = {value!r}: no answer after {ANSWER:g} s')
+                continue
+            outcome.refused += not future.result().results[0].successful
+        gap = max(np.diff(arrivals), default=0.0)
+        if gap > _USUAL_GAP:
+            outcome.fault(f'no image for {gap:.1f} s')
+        outcome.growth_mb = (resident_memory(process.popen.pid) - before) / 1e6
+        if 'Traceback' in process.output():
+            outcome.fault(f'said {process.output()[-200:]!r}')
+        if (code := process.stop()) not in (0, None):
+            outcome.fault(f'ended with code {code}')
+    return outcome
 
 
 def nodes(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
     """Every case with every node; a node goes from case to case while it lives."""
     chosen = [scenes()['smoother_node']] if quick else [*scenes().values()]
-    seconds = amount.seconds / (len(chosen) * len(CASES))
+    seconds = amount.seconds / (len(chosen) * len(CASES) + len(_ALONE))
     for scene in chosen:
         with ExitStack() as running:
             watched: Watched | None = None
@@ -328,6 +404,8 @@ def nodes(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
                     running.close()
                     watched = None
                 yield outcome
+    for name in () if quick else _ALONE:
+        yield alone(name, Amount(amount.times, seconds))
 
 
 def _do(case: Case, watched: Watched, part: Amount, outcome: Outcome) -> None:
@@ -339,5 +417,6 @@ def _do(case: Case, watched: Watched, part: Amount, outcome: Outcome) -> None:
     watched.check_alive()
     if watched.node.process.pid == process:
         outcome.growth_mb = max(peak_memory(process) - before, 0.0) / 1e6
+        outcome.kept_mb = (resident_memory(process) - before) / 1e6
     for text in watched.traces()[said:]:
         outcome.fault(text)

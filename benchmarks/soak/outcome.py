@@ -16,6 +16,8 @@ from msg_tools.files.error_line import error_line
 
 # What a case may need of memory beyond what the process had before, MB.
 MOST_GROWTH = 150.0
+# What may stay of it: buffers, and code that is loaded when it is first needed, MB.
+MOST_KEPT = 25.0
 # Faults that are told of a case; the others are counted.
 _TOLD = 5
 
@@ -31,6 +33,7 @@ class Outcome:
         refused: how often the answer was a clean error.
         lost: what had been acknowledged and is not there.
         growth_mb: of the peak of resident memory; None: not measured.
+        kept_mb: growth that is left at the end.
         faults: what went wrong otherwise; empty: alive, or a clean error, every time.
     """
 
@@ -40,6 +43,7 @@ class Outcome:
     refused: int = 0
     lost: int = 0
     growth_mb: float | None = None
+    kept_mb: float = 0.0
     faults: list[str] = field(default_factory=list)
 
     def fault(self, text: str) -> None:
@@ -50,13 +54,15 @@ class Outcome:
     @property
     def met(self) -> bool:
         """Whether nothing was lost and nothing went wrong."""
-        return not self.lost and not self.faults and (self.growth_mb or 0.0) <= MOST_GROWTH
+        return self.told() == 'met'
 
     def told(self) -> str:
         """'met', or what was not."""
         texts = [f'{self.lost} lost'] if self.lost else []
         if (self.growth_mb or 0.0) > MOST_GROWTH:
             texts.append(f'wanted at most {MOST_GROWTH:g} MB')
+        if self.kept_mb > MOST_KEPT:
+            texts.append(f'{self.kept_mb:.0f} MB stay, wanted at most {MOST_KEPT:g} MB')
         texts += self.faults[:_TOLD]
         if len(self.faults) > _TOLD:
             texts.append(f'{len(self.faults) - _TOLD} other faults')

@@ -16,17 +16,20 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.image_inputs import KEYPOINTS, PREDICTION
+from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS, PREDICTION
+from hmt_ros.sessions.people_session import PeopleSession
 from hmt_ros.sessions.session import Session
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
-from hmt_ros.sessions.tracking_parameters import FilterParameters
+from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
+from msg_tools.messages.detections import PEOPLE_2D, DetectedPerson, people_message
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
+from msg_tools.messages.keypoints import keypoints_of
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.messages.states import transforms_message
 
@@ -103,7 +106,7 @@ def stamped(message: Any, stamp_ns: int) -> Any:
 def scenes() -> dict[str, Scene]:
     """One of each node, and the filter in a process with others."""
     person = replace(_filter(), together=('filter_node', 'smoother_node'))
-    return {scene.title: scene for scene in (_filter(), _smoother(), _bme(), person)}
+    return {scene.title: scene for scene in (_filter(), _smoother(), _bme(), _people(), person)}
 
 
 @cache
@@ -159,6 +162,26 @@ def _filter() -> Scene:
             {'subject_file': '', 'use_predictions': True, 'input_timeout': 0.0},
             {'subject_file': '', 'gravity_frame': 'robot', 'input_timeout': 0.0},
         ),
+    )
+
+
+def _people() -> Scene:
+    info, images = _clip()
+    start, frame = time_ns(images[0].header.stamp), str(images[0].header.frame_id)
+    keypoints = keypoints_of(_keypoints(start))
+    people = [DetectedPerson(name, keypoints, None) for name in ('anna', 'p1')]
+    found = people_message(RosbagsMessages(), people, start, frame)
+    return Scene(
+        'people_node',
+        PeopleParameters(image_transport='compressed', input_timeout=0.0, tracker=_SMALL),
+        PeopleSession,
+        {**_CAMERA, DETECTIONS: ('detections', PEOPLE_2D)},
+        (*_CAMERA_TOPICS, '/detections'),
+        ((CAMERA_INFO, info),),
+        images,
+        {CAMERA_INFO: info, DETECTIONS: found},
+        start,
+        ({}, {'image_transport': 'raw', 'reset_on_time_jump': True}, {'max_people': 1}),
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from benchmarks.soak.scenes import PERSON, Scene
 from hmt_ros.app.replay.live_node import LiveNode, NodeProcess
 from hmt_ros.app.replay.player import LiveNodeError, Player
+from hmt_ros.nodes.subscribed_topic import message_class
 from hmt_ros.sessions.handled import Handled
 
 OURS = '/hmt_ros/'
@@ -17,6 +18,9 @@ OURS = '/hmt_ros/'
 PATIENCE = 60.0
 # How long a valid message is waited for that may have been sent too early, s.
 SHORT = 2.0
+# Messages of a topic that wait for this process. While it is late it publishes on without
+# listening: answers beyond these would be lost here, though the node has given them.
+_QUEUE = 1000
 # Messages before memory is compared: kernels are compiled, buffers have grown.
 _WARM = 8
 
@@ -41,9 +45,15 @@ class Watched:
         """Starts it, in a domain of its own; ends the one that ran before."""
         self._opened.close()
         self.index = 0
+        self._setting: Any = None
         scene = self.scene
         with ExitStack() as opened:
             self.player = Player(opened)
+            self.player.reliable.depth = _QUEUE
+            for msgtype in (kind for _, kind in scene.inputs.values()):
+                self.player.classes.setdefault(msgtype, message_class(msgtype))
+            for published in scene.session.TOPICS.values():
+                self.player.classes.setdefault(published.msgtype, message_class(published.msgtype))
             process = None
             if scene.together:
                 module = f'hmt_ros.nodes.{PERSON}'
@@ -158,6 +168,18 @@ class Watched:
             SetParametersAtomically, 'set_parameters_atomically', parameters=given
         ).result
         return bool(found.successful), str(found.reason)
+
+    def begin_to_set(self, **values: Any) -> Any:
+        """Sends a request to set parameters; its answer comes as a future."""
+        from rcl_interfaces.srv import SetParameters
+        from rclpy.parameter import Parameter
+
+        if self._setting is None:
+            name = f'/{self.node.name}/set_parameters'
+            self._setting = self.player.node.create_client(SetParameters, name)
+            self.node.call(SetParameters, 'set_parameters', parameters=[])
+        given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        return self._setting.call_async(SetParameters.Request(parameters=given))
 
     def get(self, names: list[str]) -> list[Any]:
         """Values of parameters."""

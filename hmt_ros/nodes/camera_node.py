@@ -227,7 +227,7 @@ def _show(
     elif video.is_file and not images.get_subscription_count():
         node.get_logger().info(f'{given.video} starts when somebody subscribes to {images.topic}')
         while not images.get_subscription_count() and not stopped.is_set():
-            stopped.wait(_GLANCE)
+            rclpy.spin_once(node, timeout_sec=_GLANCE)
     if video.is_file:
         # The other side may not know yet that it is connected.
         stopped.wait(_CONNECTING)
@@ -242,6 +242,8 @@ def _show(
         infos.publish(serialise(info))
         if images.get_subscription_count():
             images.publish(serialise(image_message(messages, image, stamp, given.frame_id)))
+        # Whoever asks for its parameters waits for an answer.
+        rclpy.spin_once(node, timeout_sec=0.0)
         count += 1
     over = '' if stopped.is_set() or not video.is_file else '; the file is over'
     node.get_logger().info(f'{given.video}: {count} images shown{over}')

@@ -13,6 +13,7 @@ has been published. A player that waits for it feeds the node in lock step.
 
 from __future__ import annotations
 
+import gc
 import time
 import traceback
 from abc import abstractmethod
@@ -375,6 +376,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self.destroy_service(service)
         self._offered.clear()
         self._session = None
+        # Sessions and their tracks are in cycles, and hold images: Python would wait for long.
+        gc.collect()
 
     def _serve(self, callback: Callable[..., Any], request: Any, response: Any) -> Any:
         """Answers a request, whatever it holds; one that can not be served is refused."""

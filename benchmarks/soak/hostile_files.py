@@ -1,0 +1,766 @@
+"""Well-formed hostile files of the other kinds: tables, calibrations, models, images, videos."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.clips import ROOT
+from benchmarks.soak.hostile_bags import YAML_BOMBS, bag_folders, bags, compressed_bags, databases
+from benchmarks.soak.hostile_file import CONTROL, DEEP, DIGITS, Hostile
+from benchmarks.soak.scenes import CLIP
+
+# What stands in the place of a value.
+_VALUES = (
+    '1e999',
+    '-1e999',
+    '.nan',
+    DIGITS,
+    f'-{DIGITS[:5000]}',
+    '1e-320',
+    '[]',
+    '{}',
+    'null',
+    '[[1]]',
+    '"' + 'x' * 100_000 + '"',
+    DEEP,
+    '{[1]: 2}',
+    '{a: b}',
+    '"\\e[2J\\u202e\\n"',
+    '"\\ud800"',
+    '!!binary "/w=="',
+    '!!timestamp 2024-01-01',
+    '0x' + 'f' * 10_000,
+    '1' + ':59' * 5000,
+    '/etc/passwd',
+    '/dev/zero',
+    '../../kept/canary',
+    '.',
+    '1_0_0',
+    'yes',
+    '!!set {a, b}',
+)
+_CALIBRATION = """\
+%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: {rows}
+   cols: {cols}
+   dt: {dt}
+   data: [ {data} ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: {count}
+   dt: d
+   data: [ {distortion} ]
+"""
+_MATRIX = '600., 0., 320., 0., 600., 240., 0., 0., 1.'
+_ENTITIES = '<?xml version="1.0"?>\n<!DOCTYPE a [<!ENTITY a0 "xxxxxxxxxx">' + ''.join(
+    f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 10)
+)
+_XML = '<?xml version="1.0"?>\n<opencv_storage>{}</opencv_storage>\n'
+
+
+def hostile_files(good: Path) -> dict[str, Iterable[Hostile]]:
+    """Files of each kind; what needs more than text is made when it is written.
+
+    Args:
+        good: folder of good files.
+    """
+    return {
+        'MCAP': bags(good),
+        'SQLite': databases(),
+        'zstd': compressed_bags(good),
+        'folders of bags': bag_folders(good),
+        'YAML': _yaml(),
+        'calibrations': _calibrations(),
+        'JSON': _json(),
+        'tables': _tables(),
+        'arrays': _arrays(),
+        'models': _models(),
+        'images': _images(),
+        'videos': _videos(good),
+        'motions': _motions(),
+        'no files': _no_files(),
+        'outputs': _outputs(),
+    }
+
+
+def _yaml() -> Iterator[Hostile]:
+    """Documents, and those that commands read with one strange value each."""
+    documents = {
+        **YAML_BOMBS,
+        'list_flat': '[' + '1, ' * 270_000 + '1]',
+        'list_lists': '[' + '[], ' * 200_000 + '1]',
+        'block_deep': ''.join(f'{" " * i}a:\n' for i in range(1400)),
+        'documents': '---\na: 1\n' * 100_000,
+        'scalar': 'a: ' + 'x' * 1_000_000,
+        'comment': '#' * 1_000_000 + '\na: 1',
+        'keys': ''.join(f'k{i}: 1\n' for i in range(80_000)),
+        'doubled': 'a: 1\n' * 100_000,
+        'unhashable': '? [1]\n: 2\n? {a: 1}\n: 3\n',
+        'keys_strange': f'{DIGITS[:5000]}: 1\nnull: 2\n1.5: 3\n"\\e[2J\\n": 4\n~: 5\n',
+        'omap': '!!omap [a: 1]\n',
+        'sexagesimal': 'a: 1' + ':59' * 200_000,
+        'anchors': ''.join(f'k{i}: &a{i} 1\n' for i in range(50_000)),
+        'directive': '%YAML 9.9\n%TAG ! tag:x,2000:\n---\na: !x 1\n',
+        'quotes': 'a: "' + '\\n' * 300_000 + '"\n',
+        'flow_unclosed': '[' * 500_000,
+        'question': '? ' * 5000 + 'a',
+        'indicator': 'a: |\n' + ' x\n' * 300_000,
+        'empty': '',
+        'nothing': '---\n...\n',
+        'text': 'just text',
+        'bytes': '\ufeff\x85\u2028a: 1',
+    }
+    for name, text in documents.items():
+        yield Hostile(f'{name}.yaml', text)
+    sources = {
+        'subject': CLIP / 'subject.yaml',
+        'config': ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml',
+        'body': ROOT / 'hmt_ros' / 'body' / 'models' / 'human37.yaml',
+    }
+    rng = np.random.default_rng(0)
+    for name, path in sources.items():
+        lines = path.read_text('utf-8').split('\n')
+        places = [i for i, x in enumerate(lines) if ': ' in x and x.lstrip()[0] != '#']
+        for number, value in enumerate(_VALUES):
+            for at in rng.choice(places, 2, replace=False):
+                changed = list(lines)
+                changed[at] = f'{changed[at].partition(":")[0]}: {value}'
+                yield Hostile(f'{name}_{number}_{at}.yaml', '\n'.join(changed))
+    segments = '\n'.join(
+        f'  - {{name: s{i}, parent: s{i - 1}, length: thigh, dofs: [[a{i}, x, -9, 9, 0, 9]]}}'
+        for i in range(20_000)
+    )
+    yield Hostile(
+        'body_segments.yaml', f'name: x\nlengths: {{thigh: [1, 1]}}\nsegments:\n{segments}'
+    )
+    dofs = ', '.join(f'[a{i}, x, -9, 9, 0, 9]' for i in range(20_000))
+    yield Hostile('body_dofs.yaml', f'name: x\nsegments:\n  - {{name: a, dofs: [{dofs}]}}\n')
+
+
+def _calibrations() -> Iterator[Hostile]:
+    usual = {
+        'rows': '3',
+        'cols': '3',
+        'dt': 'd',
+        'data': _MATRIX,
+        'count': '5',
+        'distortion': '0., 0., 0., 0., 0.',
+    }
+    changes: dict[str, dict[str, str]] = {
+        'rows': {'rows': '1000000000', 'cols': '1000000000'},
+        'negative': {'rows': '-3', 'cols': '-3'},
+        'digits': {'rows': DIGITS[:10_000]},
+        'dt': {'dt': '"100000000d"'},
+        'dt_strange': {'dt': '"3(2i"'},
+        'dt_long': {'dt': 'd' * 10_000},
+        'dt_many': {'dt': '"' + '9d' * 1000 + '"'},
+        'data_short': {'data': '1.'},
+        'data_text': {'data': '"x", [], {}'},
+        'data_nan': {'data': '.Nan, .Inf, -.Inf, 0, 0, 0, 0, 0, 0'},
+        'data_digits': {'data': f'{DIGITS[:10_000]}, {_MATRIX}'},
+        'data_deep': {'data': DEEP[:4000] + ']' * 4000},
+        'coefficients': {'count': '100000', 'distortion': '0., ' * 99_999 + '0.'},
+        'coefficients_huge': {'distortion': '1e300, 1e300, 1e300, 1e300, 1e300'},
+        'focal': {'data': '1e-300, 0., 1e300, 0., -1., 0., 0., 0., 0.'},
+    }
+    for name, change in changes.items():
+        text = _CALIBRATION.format(**(usual | change))
+        yield Hostile(f'opencv_{name}.yaml', text)
+        yield Hostile(f'opencv_{name}.xml', text)
+        found = usual | change
+        matrix = ''.join(f'<{k}>{found[k].replace(",", " ")}</{k}>' for k in ('rows', 'cols', 'dt'))
+        inside = f'<K type_id="opencv-matrix">{matrix}<data>{found["data"]}</data></K>'
+        yield Hostile(f'opencv_xml_{name}.xml', _XML.format(inside))
+        listed = {k: found[k] for k in ('rows', 'cols', 'dt')}
+        document = {'camera_matrix': {'type_id': 'opencv-matrix', **listed, 'data': [1.0]}}
+        yield Hostile(f'opencv_json_{name}.json', json.dumps(document))
+    for depth in (30, 1000, 20_000):
+        yield Hostile(f'deep_{depth}.xml', f'%YAML:1.0\n---\na: {"[" * depth}{"]" * depth}\n')
+        yield Hostile(
+            f'deep_maps_{depth}.xml', f'%YAML:1.0\n---\na: {"{a: " * depth}1{"}" * depth}\n'
+        )
+        yield Hostile(f'deep_xml_{depth}.xml', _XML.format('<a>' * depth + '</a>' * depth))
+        nested = '{"a": ' * depth + '1' + '}' * depth
+        yield Hostile(f'deep_{depth}.json', nested)
+        yield Hostile(f'deep_lists_{depth}.json', '{"K": ' + '[' * depth + ']' * depth + '}')
+        block = ''.join(f'{" " * i}a:\n' for i in range(min(depth, 1300)))
+        yield Hostile(f'deep_block_{depth}.xml', f'%YAML:1.0\n---\n{block}')
+        yield Hostile(f'deep_{depth}.toml', f'a = {"[" * depth}{"]" * depth}\n')
+        yield Hostile(f'deep_tables_{depth}.toml', f'a = {"{a = " * depth}1{"}" * depth}\n')
+        yield Hostile(f'deep_keys_{depth}.toml', f'{".".join("a" * depth)} = 1\n')
+        yield Hostile(f'deep_heads_{depth}.toml', f'[{".".join("a" * depth)}]\nmatrix = 1\n')
+    data = f'<data>{_MATRIX}</data>'
+    yield Hostile('entities.xml', f'{_ENTITIES}]>\n<opencv_storage><K>&a9;</K></opencv_storage>')
+    external = '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
+    yield Hostile(
+        'external.xml',
+        f'<?xml version="1.0"?>{external}<opencv_storage><K>&x;</K></opencv_storage>',
+    )
+    yield Hostile('types.xml', _XML.format(f'<K type_id="opencv-sparse-matrix">{data}</K>'))
+    yield Hostile('graph.xml', _XML.format('<K type_id="opencv-graph"><flags>1</flags></K>'))
+    yield Hostile(
+        'base64.xml', _XML.format('<K type_id="binary">$base64$' + 'A' * 900_000 + '</K>')
+    )
+    yield Hostile('base64.yaml', '%YAML:1.0\n---\nK: !!binary |\n  $base64$' + 'A' * 900_000 + '\n')
+    yield Hostile('keys.xml', _XML.format(''.join(f'<a{i}>1</a{i}>' for i in range(50_000))))
+    ros = 'image_width: 640\nimage_height: 480\ncamera_matrix: {rows: 3, cols: 3, data: [%s]}\n'
+    yield Hostile('ros_digits.yaml', ros % DIGITS[:10_000])
+    yield Hostile('ros_long.yaml', ros % ('0, ' * 200_000))
+    plain = f'k: [{_MATRIX}]\nd: [{"0., " * 100_000}0.]\nwidth: 640\nheight: 480\n'
+    yield Hostile('ros_coefficients.yaml', plain)
+    for value in _VALUES:
+        name = f'{len(value)}_{zlib.crc32(value.encode()):x}'
+        yield Hostile(f'ros_{name}.yaml', f'k: [{_MATRIX}]\nd: {value}\nwidth: {value}\n')
+        yield Hostile(f'model_{name}.yaml', f'k: [{_MATRIX}]\nd: [0.]\ndistortion_model: {value}\n')
+        yield Hostile(f'toml_{name}.toml', f'[cam]\nmatrix = {value}\nname = "{CONTROL[1:4]}"\n')
+    yield Hostile('digits.toml', f'[cam]\nmatrix = [[{DIGITS[:100_000]}, 0, 1]]\n')
+    yield Hostile('cameras.toml', ''.join(f'[cam{i}]\nmatrix = [[1]]\n' for i in range(30_000)))
+    yield Hostile(
+        'cameras_control.toml', ''.join(f'["\\u001b[2J{i}"]\nmatrix = [[1]]\n' for i in range(99))
+    )
+    yield Hostile('names.yaml', ''.join(f'"{i}\\e[2J\\n":\n  K: [1]\n' for i in range(20_000)))
+
+
+def _json() -> Iterator[Hostile]:
+    person = [float(x) for i in range(17) for x in (100 + i, 100 + 2 * i, 0.9)]
+    annotation = {'image_id': 0, 'keypoints': person, 'score': 1.0, 'category_id': 1}
+    strange: tuple[Any, ...] = (
+        None,
+        True,
+        [1],
+        {'a': 1},
+        'x',
+        1e308,
+        -1,
+        2**63,
+        10**4000,
+        [[[]]],
+        '\x1b[2J\n',
+        '\ud800',
+        float('nan'),
+        float('inf'),
+        'x' * 100_000,
+        [10**400] * 51,
+        10**12,
+    )
+    for number, value in enumerate(strange):
+        for key in annotation:
+            found = [annotation, {**annotation, key: value}]
+            yield Hostile(f'results_{key}_{number}.json', partial(_dumped, found))
+        document = {
+            'images': [{'id': value, 'file_name': value}],
+            'annotations': [{**annotation, 'image_id': value}],
+            'categories': [{'id': 1, 'keypoints': value}],
+        }
+        yield Hostile(f'coco_{number}.json', partial(_dumped, document))
+        for key in document:
+            usual = {'images': [{'id': 0, 'file_name': 'x_0.png'}], 'annotations': [annotation]}
+            yield Hostile(f'coco_{key}_{number}.json', partial(_dumped, {**usual, key: value}))
+        people = {'people': [{'pose_keypoints_2d': value, 'person_id': value}], 'version': value}
+        yield Hostile(f'openpose_{number}.json', partial(_dumped, people))
+        mmpose = {
+            'meta_info': value,
+            'instance_info': [
+                {
+                    'frame_id': value,
+                    'instances': [
+                        {'keypoints': [[1, 2]] * 17, 'keypoint_scores': value, 'bbox': value}
+                    ],
+                }
+            ],
+        }
+        yield Hostile(f'mmpose_{number}.json', partial(_dumped, mmpose))
+        boxes = [[{'name': value, 'box': value, 'keypoints': {'x': value, 'y': value}}]]
+        yield Hostile(f'ultralytics_{number}.json', partial(_dumped, boxes))
+    far = [{**annotation, 'image_id': i * 10**9} for i in range(3)]
+    names = [{**annotation, 'image_id': f'{"x" * 9000}{i}'} for i in range(2000)]
+    yield Hostile('frames_far.json', partial(_dumped, far))
+    yield Hostile('frames_names.json', partial(_dumped, names))
+    yield Hostile('persons.json', lambda: _dumped([annotation] * 20_000))
+    yield Hostile('deep.json', DEEP)
+    yield Hostile('deep_maps.json', '{"a":' * 100_000 + '1' + '}' * 100_000)
+    yield Hostile('empty_lists.json', '[' + '[],' * 1_000_000 + '[]]')
+    yield Hostile('empty_maps.json', '[' + '{},' * 1_000_000 + '{}]')
+    yield Hostile('numbers.json', '[' + '1,' * 3_000_000 + '1]')
+    yield Hostile('digits.json', f'[{DIGITS}]')
+    yield Hostile('exponent.json', '[1e999999999, 1' + '0' * 100_000 + '.0]')
+    yield Hostile('keys.json', '{' + ','.join(f'"{i}":1' for i in range(300_000)) + '}')
+    yield Hostile('doubled.json', '{' + '"a":1,' * 300_000 + '"a":1}')
+    yield Hostile('text.json', '"' + '\\u001b' * 300_000 + '"')
+
+
+def _dumped(document: Any) -> str:
+    return json.dumps(document) if _short(document) else json.dumps(str(document)[:100])
+
+
+def _short(document: Any) -> bool:
+    """Python itself does not write an integer of so many digits."""
+    try:
+        json.dumps(document)
+    except ValueError:
+        return False
+    return True
+
+
+def _tables() -> Iterator[Hostile]:
+    head = 'frame,left_hip_u,left_hip_v,left_hip_confidence,nose_u,nose_v,nose_confidence\n'
+    rows = '0,1,2,1,3,4,1\n1,1,2,1,3,4,1\n'
+    for number, value in enumerate(
+        (
+            '1000000000',
+            str(2**63),
+            DIGITS,
+            '-1',
+            'nan',
+            '1e308',
+            '1e999',
+            '\x1b[2J',
+            '"a\nb"',
+            '0x1',
+            '\u0663',
+            '1_0',
+            'x' * 200_000,
+        )
+    ):
+        yield Hostile(f'frame_{number}.csv', f'{head}{rows}{value},1,2,1,3,4,1\n')
+        yield Hostile(f'value_{number}.csv', f'{head}{rows}2,{value},2,1,3,4,{value}\n')
+        yield Hostile(f'name_{number}.csv', f'frame,{value}_u,{value}_v\n0,1,2\n')
+        yield Hostile(f'time_{number}.csv', f'time_s,a_u,a_v\n{value},1,2\n')
+        yield Hostile(f'stamp_{number}.csv', f'stamp_ns,person,a_u,a_v\n{value},{value},1,2\n')
+        yield Hostile(f'long_{number}.csv', f'frame,name,u,v,confidence\n{value},{value},1,2,1\n')
+        yield Hostile(f'people_{number}.csv', f'file,subject\n{value},{value}\nx,y\n')
+        trc = (
+            'PathFileType\t4\t(X/Y/Z)\tx.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\t'
+            f'OrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n{value}\t{value}\t{value}\t{value}\tm\t'
+            f'{value}\t1\t{value}\nFrame#\tTime\tLHip\t\t\n\t\tX1\tY1\tZ1\n\n1\t{value}\t1\t2\t0\n'
+        )
+        yield Hostile(f'{number}.trc', trc)
+    columns = ','.join(f'k{i}_u,k{i}_v' for i in range(50_000))
+    yield Hostile('columns.csv', f'frame,{columns}\n0{",1" * 100_000}\n')
+    yield Hostile('rows.csv', lambda: head + '1,1,2,1,3,4,1\n' * 300_000)
+    yield Hostile(
+        'frames.csv', lambda: head + ''.join(f'{i}000,1,2,1,3,4,1\n' for i in range(99_999))
+    )
+    yield Hostile(
+        'persons.csv',
+        lambda: 'frame,person,a_u,a_v\n' + ''.join(f'0,p{i},1,2\n' for i in range(99_999)),
+    )
+    yield Hostile(
+        'names.csv', lambda: 'frame,name,u,v\n' + ''.join(f'0,n{i},1,2\n' for i in range(99_999))
+    )
+    yield Hostile('quote.csv', head + '"' + 'x' * 1_000_000)
+    yield Hostile('quotes.csv', head + '""' * 500_000)
+    yield Hostile('nul.csv', head + '\0' * 1000)
+    yield Hostile('lines.csv', '\n' * 1_000_000)
+    yield Hostile('commas.csv', ',' * 1_000_000)
+    yield Hostile('tabs.trc', '\t' * 1_000_000 + '\n' * 9)
+    yield Hostile(
+        'deeplabcut.csv',
+        'scorer,a,a,a\nbodyparts,nose,nose,nose\ncoords,x,y,likelihood\n'
+        + f'{DIGITS[:20]},1,2,1\n',
+    )
+
+
+def _npy(head: str | Mapping[str, Any], content: bytes = b'abc', version: int = 1) -> bytes:
+    text = (head if isinstance(head, str) else repr(dict(head))).encode() + b'\n'
+    length = struct.pack(
+        '<H' if version == 1 else '<I', len(text) % (2**16 if version == 1 else 2**32)
+    )
+    return b'\x93NUMPY' + bytes([version, 0]) + length + text + content
+
+
+class _Call:
+    """What a pickle calls when it is read."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.system, ('touch ../kept/pwned',)
+
+
+def _pickles() -> dict[str, bytes]:
+    nested: Any = ()
+    for _ in range(30):
+        nested = (nested, nested)
+    doubled = b'\x80\x04)' + b'q\x00h\x00\x86' * 60 + b'.'
+    return {
+        'call': pickle.dumps(_Call()),
+        'doubled': pickle.dumps(nested),
+        'memo': doubled,
+        'deep': b'\x80\x04' + b']' * 100_000 + b'a' * 99_999 + b'.',
+        'bytes': b'\x80\x04\x8e' + struct.pack('<Q', 2**40) + b'x.',
+        'long': b'\x80\x04\x8b' + struct.pack('<i', 2**31 - 1) + b'\x01.',
+        'put': b'\x80\x04Nr\xff\xff\xff\x7f.',
+        'import': b"\x80\x04cos\nsystem\n(S'touch ../kept/pwned'\ntR.",
+        'numpy': b'\x80\x04cnumpy\nzeros\n(I1000000000000\ntR.',
+        'bytearray': b'\x80\x05\x96' + struct.pack('<Q', 2**40) + b'x.',
+        'marks': b'\x80\x04' + b'(' * 500_000 + b'.',
+        'repeat': b'\x80\x04cnumpy\nndarray\n(I1000000000000\ntR.',
+    }
+
+
+def _arrays() -> Iterator[Hostile]:
+    """Archives of arrays under the names that commands look for."""
+    usual = {'descr': '<f8', 'fortran_order': False, 'shape': (3, 6, 2)}
+    heads: dict[str, str | dict[str, Any]] = {
+        'shape': {**usual, 'shape': (2**40, 2)},
+        'shape_zero': {**usual, 'shape': (2**62, 0, 2)},
+        'shape_overflow': {**usual, 'shape': (2**33, 2**33, 2)},
+        'shape_negative': {**usual, 'shape': (-3, 6, -2)},
+        'shape_dimensions': {**usual, 'shape': (1,) * 200},
+        'shape_digits': str({**usual, 'shape': 'X'}).replace("'X'", f'({DIGITS[:9000]},)'),
+        'text': {**usual, 'descr': '<U1000000000'},
+        'void': {**usual, 'descr': '|V2147483647'},
+        'void_zero': {**usual, 'descr': '|V0', 'shape': (2**40,)},
+        'text_zero': {**usual, 'descr': '<U0', 'shape': (2**40,)},
+        'fields': {**usual, 'descr': [(f'f{i}', '<f8') for i in range(3000)]},
+        'subarray': {**usual, 'descr': [('x', '<f8', (2**30, 2**30))]},
+        'objects': {**usual, 'descr': '|O'},
+        'dates': {**usual, 'descr': '<M8[as]'},
+        'code': '__import__("os").system("touch ../kept/pwned")',
+        'deep': '(' * 5000 + ')' * 5000,
+        'deep_minus': "{'descr': '<f8', 'fortran_order': False, 'shape': (" + '-' * 9000 + '1,)}',
+        'long': {**usual, 'x' * 60_000: 1},
+    }
+    for name, head in heads.items():
+        for version in (1, 2):
+            content = _npy(head, bytes(288), version)
+            yield Hostile(f'{name}_{version}.npz', partial(_zip, dict.fromkeys(_WANTED, content)))
+    for name, data in _pickles().items():
+        content = _npy({**usual, 'descr': '|O', 'shape': ()}, data)
+        yield Hostile(f'pickle_{name}.npz', partial(_zip, dict.fromkeys(_WANTED, content)))
+    yield Hostile('bomb.npz', partial(zeros_archive, 960_000_000))
+    yield Hostile('bombs.npz', partial(zeros_archive, 200_000_000, 9))
+    yield Hostile('members.npz', lambda: _zip({f'a{i}': b'' for i in range(60_000)}))
+    small = _npy({**usual, 'shape': (1,)}, bytes(8))
+    yield Hostile('arrays.npz', lambda: _zip({f'a{i}': small for i in range(9_999)}))
+    yield Hostile('dots.npz', _zip(dict.fromkeys(('../../kept/canary', '/tmp/pwned'), small)))
+    yield Hostile('control.npz', _zip({CONTROL: small, **dict.fromkeys(_WANTED, small)}))
+    yield Hostile('lies.npz', _lying(_zip(dict.fromkeys(_WANTED, small))))
+    yield Hostile('doubled.npz', lambda: _zip(dict.fromkeys(_WANTED, small)) * 2)
+    keypoints: dict[str, Any] = {
+        'pixels': np.full((3, 6, 2), 1e300),
+        'landmark_names': np.array([CONTROL] * 6),
+        'visibility': np.full((3, 6), np.nan),
+        'detected': np.array([2**62] * 3),
+        'world': np.full((3, 6, 3), np.inf),
+    }
+    good = {'pixels': np.ones((3, 6, 2)), 'landmark_names': np.array(list('abcdef'))}
+    for name, value in keypoints.items():
+        yield Hostile(f'value_{name}.npz', _saved({**good, name: value}))
+        yield Hostile(f'scalar_{name}.npz', _saved({**good, name: np.array(7)}))
+        yield Hostile(f'text_{name}.npz', _saved({**good, name: np.array(['x' * 10_000])}))
+    wide = {'pixels': np.ones((2, 50_000, 2)), 'landmark_names': np.arange(50_000).astype('U')}
+    yield Hostile('landmarks.npz', lambda: _saved(wide))
+    yield Hostile('frames.npz', lambda: _saved({**good, 'pixels': np.zeros((500_000, 6, 2), 'f2')}))
+    truth = {'stamps': np.array([-(2**63), 0, 2**63 - 1]), 'joint_names': np.array(['pelvis'] * 3)}
+    yield Hostile('truth.npz', _saved({**truth, 'joints': np.full((3, 3, 3), 1e300)}))
+
+
+_WANTED = ('pixels', 'stamps', 'joints', 'joint_names', 'positions_2d', 'format', 'parameters')
+
+
+def _zip(members: Mapping[str, bytes], zeros: int = 0) -> bytes:
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            with archive.open(f'{name}.npy', 'w', force_zip64=True) as member:
+                member.write(content)
+                for _ in range(zeros // 2**20):
+                    member.write(bytes(2**20))
+    return target.getvalue()
+
+
+def zeros_archive(size: int, count: int = 1) -> bytes:
+    """An archive of arrays of zeros, each of so many bytes when it is unpacked."""
+    head = _npy({'descr': '<f8', 'fortran_order': False, 'shape': (size // 96, 6, 2)}, b'')
+    return _zip({f'pixels{i or ""}': head for i in range(count)}, size)
+
+
+def _lying(data: bytes) -> bytes:
+    """An archive whose directory tells other sizes than there are."""
+    at = data.rindex(b'PK\x01\x02')
+    return data[: at + 24] + struct.pack('<I', 100) + data[at + 28 :]
+
+
+def _saved(arrays: Mapping[str, Any]) -> bytes:
+    target = io.BytesIO()
+    np.savez_compressed(target, **arrays)
+    return target.getvalue()
+
+
+def _models() -> Iterator[Hostile]:
+    """Models that ship, with one array changed: whole, and of the right type."""
+    for name in ('silhouettes', 'keypoints'):
+        with np.load(ROOT / 'hmt_ros' / 'experts' / 'models' / f'{name}.npz') as archive:
+            arrays = dict(archive)
+        for key, values in arrays.items():
+            changed: dict[str, Any] = {}
+            if values.dtype.kind == 'f':
+                changed = {
+                    'zero': np.zeros_like(values),
+                    'large': np.full_like(values, 6e4),
+                    'negative': -np.abs(values) - 1,
+                    'nan': np.full_like(values, np.nan),
+                    'tiny': np.full_like(values, 1e-7),
+                }
+            elif values.dtype.kind in 'iu':
+                changed = {'negative': -values, 'large': values * 0 + 2**62, 'zero': values * 0}
+            elif key.endswith('parameters'):
+                changed = dict(_changed_parameters(str(values)))
+            for how, value in changed.items():
+                file = f'{name}_{key.replace("/", ".")}_{how}.npz'
+                content = partial(_saved, {**arrays, key: value})
+                yield Hostile(file, content, routes=('model', 'lifter'))
+
+
+def _changed_parameters(text: str) -> Iterator[tuple[str, Any]]:
+    found = json.loads(text)
+    yield 'deep', np.array(DEEP[:4000] + ']' * 4000)
+    yield 'deep_inside', np.array(text[:-1] + ', "x": ' + '[' * 9000 + ']' * 9000 + '}')
+    yield 'digits', np.array(text[:-1] + f', "x": {DIGITS[:100_000]}}}')
+    yield 'list', np.array('[' + '[],' * 100_000 + '1]')
+    for key in found:
+        for number, value in enumerate((None, -1, 10**9, [], {}, '\x1b[2J', '../../x', 1e308)):
+            yield f'{key}_{number}', np.array(json.dumps({**found, key: value}))
+
+
+def _png(width: int, height: int, content: bytes, more: bytes = b'', colour: int = 0) -> bytes:
+    head = struct.pack('>IIBBBBB', width, height, 8, colour, 0, 0, 0)
+    parts = _part(b'IHDR', head) + more + _part(b'IDAT', content) + _part(b'IEND', b'')
+    return b'\x89PNG\r\n\x1a\n' + parts
+
+
+def _part(kind: bytes, data: bytes) -> bytes:
+    check = zlib.crc32(kind + data)
+    return struct.pack('>I', len(data)) + kind + data + struct.pack('>I', check)
+
+
+def _zeros(size: int) -> bytes:
+    press = zlib.compressobj(9)
+    return b''.join(press.compress(bytes(2**20)) for _ in range(size // 2**20)) + press.flush()
+
+
+def _claimed_images() -> Iterator[tuple[str, Callable[[], bytes]]]:
+    """Images that claim to be large, by suffix."""
+    for side in (20_000, 60_000, 2**31 - 1):
+        little, big = struct.pack('<II', side, side), struct.pack('>HH', side % 65536, 65000)
+        content = _zeros(2**20 if side > 20_000 else side * (side + 1))
+        yield f'{side}.png', partial(_png, side, side, content)
+        yield f'colour_{side}.png', partial(_png, side, side, _zeros(2**20), b'', 2)
+        jpeg = b'\xff\xd8\xff\xc0\x00\x11\x08' + big + b'\x03\x01\x22\x00\x02\x11\x01\x03\x11\x01'
+        scan = (
+            b'\xff\xda\x00\x0c\x03\x01\x00\x02\x11\x03\x11\x00\x3f\x00' + bytes(2000) + b'\xff\xd9'
+        )
+        yield f'{side}.jpg', partial(bytes, jpeg + scan)
+        bmp = struct.pack('<IIIIHHIIIIII', 10**6, 0, 54, 40, 0, 0, 0, 0, 0, 0, 0, 0)
+        bmp = bmp[:16] + little + struct.pack('<HHIIIIII', 1, 24, 0, 0, 0, 0, 0, 0)
+        yield f'{side}.bmp', partial(bytes, b'BM' + bmp + bytes(1000))
+        yield f'rle_{side}.bmp', partial(bytes, b'BM' + bmp[:28] + b'\1\0\x08\0\1' + bytes(999))
+        for kind in (b'P5', b'P2', b'P6', b'P4', b'P3'):
+            text = kind + f' {side} {side} 255\n'.encode() + bytes(100)
+            yield f'{kind.decode()}_{side}.pgm', partial(bytes, text)
+        yield (
+            f'{side}.hdr',
+            partial(
+                bytes,
+                f'#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {side} +X {side}\n'.encode() + bytes(99),
+            ),
+        )
+        gif = b'GIF89a' + struct.pack('<HH', 65535, 65535) + b'\xf0\0\0' + bytes(6)
+        yield (
+            f'{side}.gif',
+            partial(bytes, gif + (b',' + bytes(4) + b'\xff\xff\xff\xff\0\2\2D\1\0') * 999 + b';'),
+        )
+        yield f'{side}.tif', partial(_tiff, side)
+        yield f'tiles_{side}.tif', partial(_tiff, side, tiled=True)
+        webp = b'VP8X' + struct.pack('<I', 10) + bytes(4) + b'\xfe\xff\xff\xfe\xff\0'
+        yield (
+            f'{side}.webp',
+            partial(bytes, b'RIFF' + struct.pack('<I', len(webp) + 4) + b'WEBP' + webp),
+        )
+        j2k = struct.pack('>HHIIIIIIII', 47, 0, side, side, 0, 0, side, side, 0, 0)
+        yield (
+            f'{side}.jp2',
+            partial(bytes, b'\xff\x4f\xff\x51' + j2k + b'\0\3' + b'\7\1\1' * 3 + bytes(99)),
+        )
+
+
+def _tiff(side: int, *, tiled: bool = False) -> bytes:
+    tags = [(256, side), (257, side), (258, 8), (259, 8), (262, 1), (277, 1)]
+    tags += (
+        [(322, side), (323, side), (324, 200), (325, 99)]
+        if tiled
+        else [(273, 200), (278, side), (279, 99)]
+    )
+    directory = struct.pack('<H', len(tags)) + b''.join(
+        struct.pack('<HHII', tag, 4, 1, value) for tag, value in tags
+    )
+    return (b'II*\0\x08\0\0\0' + directory + bytes(4)).ljust(200, b'\0') + zlib.compress(
+        bytes(9999)
+    )
+
+
+def _images() -> Iterator[Hostile]:
+    """Pictures, and the same in folders of frames and of masks."""
+    found = dict(_claimed_images())
+    text = _part(b'zTXt', b'a\0\0' + zlib.compress(bytes(2**26)))
+    profile = _part(b'iCCP', b'a\0\0' + zlib.compress(bytes(2**26)))
+    pixel = zlib.compress(bytes(64 * 65))
+    found['texts.png'] = lambda: _png(64, 64, pixel, text * 100)
+    found['profile.png'] = lambda: _png(64, 64, pixel, profile)
+    found['parts.png'] = lambda: _png(64, 64, pixel, _part(b'tEXt', b'a\0b') * 200_000)
+    found['longer.png'] = lambda: _png(64, 64, _zeros(2**30))
+    found['strange_name\x1b[2J.png'] = lambda: _png(2**20, 64, pixel)
+    for name, make in found.items():
+        yield Hostile(name, make)
+        if name.endswith(('.png', '.jpg', '.tif')):
+            yield Hostile(f'folder_{name}', write=partial(_write_frames, name, make))
+
+
+def _write_frames(name: str, make: Callable[[], bytes], folder: Path) -> None:
+    folder.mkdir()
+    for number in range(2):
+        (folder / f'{number}_{name}').write_bytes(make())
+
+
+def _box(kind: bytes, content: bytes, size: int | None = None) -> bytes:
+    return struct.pack('>I', len(content) + 8 if size is None else size) + kind + content
+
+
+def _videos(good: Path) -> Iterator[Hostile]:
+    video = (good / 'video.avi').read_bytes()
+    for side in (20_000, 60_000, 2**31 - 1):
+        size = struct.pack('<II', side, side)
+        at = video.index(b'strf')
+        changed = video[: at + 12] + size + video[at + 20 :]
+        yield Hostile(f'format_{side}.avi', changed)
+        yield Hostile(f'head_{side}.avi', changed[:64] + size + changed[72:])
+        yield Hostile(f'{side}.y4m', f'YUV4MPEG2 W{side} H{side} F25:1 C420\nFRAME\n' + 'x' * 1000)
+    at = video.index(b'avih')
+    yield Hostile('frames.avi', video[: at + 24] + b'\xff\xff\xff\x7f' + video[at + 28 :])
+    yield Hostile('rate.avi', video[: at + 8] + b'\0\0\0\0' + video[at + 12 :])
+    file = _box(b'ftyp', b'isom\0\0\0\0isom')
+    nested = b''
+    for _ in range(3000):
+        nested = _box(b'moov', nested)
+    for name, content in {
+        'nested': file + nested,
+        'boxes': file + _box(b'free', b'') * 500_000,
+        'tracks': file + _box(b'moov', _box(b'trak', _box(b'tkhd', bytes(84))) * 20_000),
+        'zero': file + _box(b'moov', b'', 0) * 100,
+        'one': file + _box(b'moov', struct.pack('>Q', 2**63), 1),
+        'small': file + _box(b'moov', b'', 4),
+        'long': file + _box(b'moov', bytes(100), 2**31),
+        'playlist': b'#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n#EXTINF:1,\nhttp://127.0.0.1:9/x\n',
+        'concat': b'ffconcat version 1.0\nfile /etc/passwd\nfile ../kept/canary\n' * 100,
+        'sdp': b'v=0\no=- 0 0 IN IP4 127.0.0.1\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 9 RTP/AVP 96\n',
+        'subtitles': b'1\n00:00:00,000 --> 99:00:00,000\n\x1b[2Jx\n' * 10_000,
+    }.items():
+        yield Hostile(f'{name}.mp4', content)
+        yield Hostile(f'{name}.mkv', content)
+    playlist = '#EXTM3U\n#EXT-X-TARGETDURATION:1\n' + '#EXTINF:1,\nx.ts\n' * 50_000
+    yield Hostile('many.m3u8', playlist)
+    yield Hostile('itself.m3u8', '#EXTM3U\n#EXTINF:1,\nitself.m3u8\n' * 100)
+
+
+def _motions() -> Iterator[Hostile]:
+    joint = 'JOINT a%d\n{\nOFFSET 0 1 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n'
+    channels = 'Xposition Yposition Zposition Zrotation Xrotation Yrotation'
+    root = f'HIERARCHY\nROOT Hips\n{{\nOFFSET 0 0 0\nCHANNELS 6 {channels}\n'
+    motion = 'MOTION\nFrames: %s\nFrame Time: %s\n'
+    for depth in (500, 20_000):
+        deep = ''.join(joint % i for i in range(depth)) + '}\n' * depth
+        yield Hostile(
+            f'deep_{depth}.bvh', f'{root}{deep}}}\n{motion % (1, 0.03)}' + '0 ' * (6 + 3 * depth)
+        )
+    flat = ''.join(joint % i + '}\n' for i in range(20_000))
+    yield Hostile('joints.bvh', f'{root}{flat}}}\n{motion % (1, 0.03)}' + '0 ' * 60_006)
+    for number, value in enumerate(('1000000000000', '-1', DIGITS, 'nan', '1e-320', '\x1b[2J', '')):
+        row = '0 0 0 0 0 0\n'
+        yield Hostile(f'frames_{number}.bvh', f'{root}}}\n{motion % (value, 0.03)}{row}')
+        yield Hostile(f'time_{number}.bvh', f'{root}}}\n{motion % (2, value)}{row * 2}')
+        yield Hostile(f'value_{number}.bvh', f'{root}}}\n{motion % (1, 0.03)}0 0 0 0 0 {value}\n')
+        yield Hostile(
+            f'name_{number}.bvh', f'{root.replace("Hips", value)}}}\n{motion % (1, 0.03)}{row}'
+        )
+        yield Hostile(
+            f'channels_{number}.bvh',
+            root.replace('S 6', f'S {value}') + '}\n' + motion % (1, 1) + row,
+        )
+        yield Hostile(
+            f'{number}.amc', f':FULLY-SPECIFIED\n:DEGREES\n{value}\nroot {value} 0 0 0 0 0\n'
+        )
+    yield Hostile('numbers.bvh', f'{root}}}\n{motion % (1, 0.03)}' + '0 ' * 2_000_000)
+    yield Hostile('rows.bvh', f'{root}}}\n{motion % (300_000, 0.03)}' + '0 0 0 0 0 0\n' * 300_000)
+
+
+_SUFFIXES = '.mcap .db3 .zstd .yaml .xml .json .toml .npz .csv .trc .png .jpg .mp4 .avi .bvh .amc'
+
+
+def _no_files() -> Iterator[Hostile]:
+    """What stands in the place of a file and is none."""
+    for suffix in _SUFFIXES.split():
+        yield Hostile(f'pipe{suffix}', write=os.mkfifo)
+        yield Hostile(f'zeros{suffix}', write=lambda path: path.symlink_to('/dev/zero'))
+        yield Hostile(f'random{suffix}', write=lambda path: path.symlink_to('/dev/urandom'))
+        yield Hostile(f'directory{suffix}', write=Path.mkdir)
+        yield Hostile(f'memory{suffix}', write=lambda path: path.symlink_to('/proc/self/mem'))
+        yield Hostile(f'circle{suffix}', write=lambda path: path.symlink_to(path))
+        yield Hostile(f'sparse{suffix}', write=_write_sparse)
+        yield Hostile(f'empty{suffix}', b'')
+        yield Hostile(f'control\x1b[2J\n{suffix}', b'x')
+        yield Hostile(f'{"x" * 240}{suffix}', b'x')
+    yield Hostile('folder_pipes', write=_write_pipes)
+    yield Hostile('folder_links', write=lambda path: path.symlink_to('/proc/self/root'))
+    yield Hostile('folder_many', write=_write_many)
+
+
+def _write_sparse(path: Path) -> None:
+    with path.open('wb') as file:
+        file.truncate(2**33)
+
+
+def _write_pipes(path: Path) -> None:
+    path.mkdir()
+    for suffix in _SUFFIXES.split():
+        os.mkfifo(path / f'x_0{suffix}')
+    os.mkfifo(path / 'metadata.yaml')
+
+
+def _write_many(path: Path) -> None:
+    path.mkdir()
+    for number in range(20_000):
+        (path / f'x_{number:06}.json').write_bytes(b'')
+
+
+def _outputs() -> Iterator[Hostile]:
+    """Places of outputs that lead elsewhere: links to a folder, and to a file, of somebody else."""
+    # A folder on the way to an output may be a link.
+    over = ('written over',)
+    yield Hostile('link.out', write=lambda path: path.symlink_to('../kept'), routes=over)
+    yield Hostile('linked_file.out', write=lambda path: path.symlink_to('../kept/canary'))
+    yield Hostile('nowhere.out', write=lambda path: path.symlink_to('../kept/new'))
+    yield Hostile('folder.out', write=_write_linked)
+    yield Hostile('file.out', b'alive')
+    yield Hostile('pipe.out', write=os.mkfifo)
+
+
+def _write_linked(path: Path) -> None:
+    path.mkdir()
+    for name in ('x.npz', 'report.html', '.x.npz.partial'):
+        (path / name).symlink_to('../../kept/canary')
