@@ -215,7 +215,7 @@ class World:
         return self.call(GetState, 'get_state').current_state.label
 
     def set(self, **values):
-        """Sets parameters; the reasons why not."""
+        """Sets parameters; the reasons why not, once a busy machine has read the files of them."""
         from rcl_interfaces.srv import SetParametersAtomically
         from rclpy.parameter import Parameter
 
@@ -223,10 +223,13 @@ class World:
             Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
             for name, value in values.items()
         ]
-        result = self.call(
-            SetParametersAtomically, 'set_parameters_atomically', parameters=parameters
-        ).result
-        return result.successful, result.reason
+        end = time.monotonic() + 60.0
+        while True:
+            result = self.call(
+                SetParametersAtomically, 'set_parameters_atomically', parameters=parameters
+            ).result
+            if 'ask again later' not in result.reason or time.monotonic() > end:
+                return result.successful, result.reason
 
     def assert_described(self, defaults, *others):
         """Parameters are those of the files, with their descriptions; all of them by name.

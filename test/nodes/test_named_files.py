@@ -66,15 +66,6 @@ def secrets(folder):
     return sorted(path for path in folder.iterdir())
 
 
-def settled(one, **values):
-    """The answer, once the files are read: on a busy machine it takes several questions."""
-    end = time.monotonic() + 60.0
-    while True:
-        good, reason = one.set(**values)
-        if good or 'ask again later' not in reason or time.monotonic() > end:
-            return good, reason
-
-
 @pytest.fixture
 def node_of(world_of):
     def make(name, **values):
@@ -90,7 +81,7 @@ def test_no_content_of_a_file_is_told(node_of, name, tmp_path):
     one = node_of(name, file_folders=str(tmp_path), **values)
     for parameter in KINDS[name][1]:
         for file in files:
-            good, reason = settled(one, **{parameter: str(file)})
+            good, reason = one.set(**{parameter: str(file)})
             assert not good, (parameter, file)
             assert reason.startswith(f'{parameter}: {file}'), reason
             assert '\n' not in reason
@@ -118,7 +109,7 @@ def test_files_elsewhere_are_refused_whether_or_not_they_exist(node_of, subject_
     one = node_of('filter_node', file_folders=str(inside), background_file=str(subject_file))
     reasons = set()
     for path in (subject_file, tmp_path / 'not_there', inside / 'link.yaml', inside / '../x'):
-        good, reason = settled(one, subject_file=str(path))
+        good, reason = one.set(subject_file=str(path))
         assert not good
         reasons.add(reason.replace(str(path), 'PATH'))
     assert reasons == {
@@ -126,11 +117,11 @@ def test_files_elsewhere_are_refused_whether_or_not_they_exist(node_of, subject_
         'there, or name it at launch'
     }
     # Named at launch: read, though it is no picture.
-    good, reason = settled(one, subject_file='')
+    good, reason = one.set(subject_file='')
     assert f'background_file: {subject_file}: not a PNG or JPEG image' in reason
-    assert settled(one, background_file='')[0]
+    assert one.set(background_file='')[0]
     (inside / 'good.yaml').write_bytes(subject_file.read_bytes())
-    assert settled(one, subject_file=str(inside / 'good.yaml')) == (True, '')
+    assert one.set(subject_file=str(inside / 'good.yaml')) == (True, '')
 
 
 def test_usual_folders(tmp_path, monkeypatch):
@@ -167,7 +158,7 @@ def test_hostile_requests_are_answered(node_of):
     many = [Parameter(name='queue_size', value=ParameterValue(type=2, integer_value=2))] * 1000
     results = one.call(SetParameters, 'set_parameters', parameters=many).results
     assert {result.reason for result in results} == {'1000 parameters, the limit is 256'}
-    assert settled(one, queue_size=2) == (True, '')
+    assert one.set(queue_size=2) == (True, '')
 
 
 def test_a_slow_reader_is_not_waited_for():
