@@ -136,7 +136,7 @@ def _content(path: Path, text: str) -> tuple[Any, str]:
     if of_opencv:
         text = text.replace("\\'", "'")
     if start.startswith('{'):
-        text = re.sub(r'^\s*//.*$', '', text, flags=re.MULTILINE)
+        text = re.sub(r'^[ \t]*//.*$', '', text, flags=re.MULTILINE)
         return load_plain_json(re.sub(r'(?<=[\s\[,])-?\.(Nan|Inf)\b', 'NaN', text)), 'pinhole'
     if of_opencv:
         text = _TAG_OF_OPENCV.sub('', text.partition('\n')[2])

@@ -30,7 +30,7 @@ _MSG_FIELD = re.compile(
 # Stands before each of the IDL files that a bag strings together.
 _IDL_HEADER = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
 # Space, comments, preprocessor lines, strings and annotations are no tokens.
-_STRING = r'"(?:[^"\\]|\\.?)*(?:"|\Z)'
+_STRING = r'"(?:[^"\\]|\\.)*(?:"|\\?\Z)'
 _IDL_TOKEN = re.compile(
     rf'\s+|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)|{_STRING}|@\w+\s*(?:\((?:[^()"]|{_STRING})*\))?|'
     r'([\w:.]+|.)',

@@ -10,17 +10,15 @@ nothing was measured; `32FC1` counts metres, NaN where nothing was measured.
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
-from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image as Pillow
 
-from msg_tools.files.error_line import error_line
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import MessageFactory
 
@@ -38,6 +36,10 @@ _PNG_SIZES, _PNG_DEPTH = 16, 24
 # Chunks of a PNG that its picture needs: texts, profiles and animations may unpack to anything.
 _PNG_CHUNKS = b'IHDR', b'PLTE', b'tRNS', b'IDAT', b'IEND'
 
+# Segments of a JPEG before that with its sizes, whose markers are in the set.
+_JPEG_START, _MAX_JPEG_SEGMENTS = b'\xff\xd8', 1000
+_JPEG_SEGMENT = re.compile(rb'\xff+([\xc0-\xcf\xdb-\xfe])(..)', re.DOTALL)
+_JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _JPEG_SCAN, _JPEG_END = b'\xff\xda', b'\xff\xd9'
 # A progressive JPEG has a dozen; each costs the decoder a pass over the whole picture.
 MAX_JPEG_SCANS = 100
@@ -286,13 +288,16 @@ def _plain_png(content: bytes) -> bytes:
 def _jpeg_size(content: bytes) -> tuple[int, int]:
     """Width and height of a JPEG file that is whole; a decoder would invent what is not."""
     what = f'jpeg of {len(content)} bytes'
-    try:
-        with Pillow.open(BytesIO(content), formats=('jpeg',)) as opened:
-            width, height = opened.size
-    except Exception as error:
-        # The parser meets any bytes here, and does not say what it may raise.
-        why = error_line(error).partition(' <')[0]  # an address in memory tells nobody anything
-        raise ImageError(f'{what} breaks off or is damaged: {why}') from error
+    found = _JPEG_SEGMENT.match(content, len(_JPEG_START))
+    for _ in range(_MAX_JPEG_SEGMENTS):
+        if found is None or found[1][0] in _JPEG_FRAMES:
+            break
+        end = found.end() - 2 + int.from_bytes(found[2], 'big')
+        found = _JPEG_SEGMENT.match(content, end)
+    if found is None or found[1][0] not in _JPEG_FRAMES or len(content) < found.end() + 5:
+        raise ImageError(f'{what} breaks off or is damaged: its size is missing')
+    height, width = struct.unpack_from('>HH', content, found.end() + 1)
+    _check_size(width, height)
     # Within a scan a byte ff is never followed by the number of a marker like these.
     scans = content.count(_JPEG_SCAN)
     most = min(MAX_JPEG_SCANS, _MAX_SCANNED // (width * height + 1))

@@ -249,6 +249,7 @@ HOSTILE = {
     'deep.yaml': ('%YAML:1.0\n---\na: ' + '[' * 50_000, 'nested deeper than 50 levels'),
     'deep.xml': ('<?xml version="1.0"?>' + '<a>' * 50_000 + '</a>' * 50_000, 'recursion'),
     'deep.json': ('{"a": ' + '[' * 50_000, 'not JSON .nested too deep.'),
+    'blank.json': ('{' + '\n' * 500_000 + '}', 'no calibration'),
     'deep.toml': ('a = ' + '[' * 50_000, 'recursion'),
     'parts.toml': ('a' + '.a' * 50_000 + ' = 1', 'a line with more than 200 points'),
     'entities.xml': (f'<?xml version="1.0"?>{ENTITIES}<a>&c;</a>', 'XML with a DOCTYPE'),

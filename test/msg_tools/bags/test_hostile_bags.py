@@ -289,6 +289,11 @@ TOPICS = (
 )
 MESSAGES = 'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)'
 NUMBERS = 'WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT {})'
+# Each names the one before twice: their number of columns is known after 2**40 steps.
+NESTED_VIEWS = (
+    'CREATE VIEW v0 AS SELECT 1 AS x',
+    *(f'CREATE VIEW v{i + 1} AS SELECT a.x FROM v{i} a, v{i} b' for i in range(40)),
+)
 TOPIC = f"INSERT INTO topics VALUES (1, '/a', '{STRING}', 'cdr', 'a: &a [*a]')"
 
 
@@ -304,9 +309,10 @@ def database(path, *statements):
 @pytest.mark.parametrize(
     ('statements', 'error'),
     [
-        ([TOPICS, f'CREATE VIEW messages AS {NUMBERS.format(-1)} SELECT i FROM n'], 'no tables'),
-        ([MESSAGES, f'CREATE VIEW topics AS {NUMBERS.format(-1)} SELECT i FROM n'], 'no tables'),
-        ([TOPICS, 'CREATE VIRTUAL TABLE messages USING fts4(topic_id, timestamp)'], 'no tables'),
+        ([TOPICS, f'CREATE VIEW messages AS {NUMBERS.format(-1)} SELECT i FROM n'], 'has views'),
+        ([MESSAGES, f'CREATE VIEW topics AS {NUMBERS.format(-1)} SELECT i FROM n'], 'has views'),
+        ([TOPICS, 'CREATE VIRTUAL TABLE messages USING fts4(topic_id, timestamp)'], 'has views'),
+        ([TOPICS, MESSAGES, *NESTED_VIEWS], 'has views'),
         (
             [
                 TOPICS,

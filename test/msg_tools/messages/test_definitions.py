@@ -120,6 +120,7 @@ def idl(member, constants=''):
         ('ros2idl', idl('long x[2][3]'), 'can not be parsed'),
         ('ros2idl', idl('a::msg::X x'), 'nested deeper than 20 levels'),
         ('ros2idl', 'module a {' * 6000, 'its end is missing'),
+        ('ros2idl', '@a("' + '\\\\' * 30_000, 'can not be parsed'),
         ('ros2idl', 'union U switch(long) { case 1: long x; };', 'can not be parsed'),
         ('ros2idl', '};' * 10, 'can not be parsed'),
     ],
