@@ -80,6 +80,7 @@ def test_limits_are_those_of_the_page():
     limits = {
         images.MAX_PIXELS,
         images.MAX_JPEG_SCANS,
+        images.FREE_PIXELS,
         camera_session._LARGEST_PICTURE_FILE,
         pose_mixtures.MAX_COMPONENTS,
         keypoints.MAX_KEYPOINTS,

@@ -49,6 +49,9 @@ _MAX_SCANNED = 16 * MAX_PIXELS  # pixels of all scans
 # on 1032, which in PNG may be 8 pixels each.
 _JPEG_PIXELS_PER_BYTE = 512
 _PNG_PIXELS_PER_BYTE = 8 * 1032
+# Pixels that any file may have, and more for each of its bytes: a few small files of one colour
+# must not keep a reader for minutes.
+FREE_PIXELS, _PIXELS_PER_BYTE = 2**24, 100
 # Four channels of 16 bits that deflate does not compress; what follows would be inflated, too.
 _PNG_BYTES_PER_PIXEL, _PNG_BYTES = 9, 10_000
 
@@ -218,7 +221,7 @@ def decode_picture(
 
     Raises:
         ImageError: another format, a damaged file, more pixels than `MAX_PIXELS`, more pixels than
-            so many bytes can hold.
+            so many bytes can hold, or may have.
     """
     if content.startswith(b'\xff\xd8\xff'):
         width, height = _jpeg_size(content)
@@ -234,7 +237,7 @@ def decode_picture(
             f'compressed image of {form} starts with {content[:4]!r}, wanted jpeg or png'
         )
     _check_size(width, height)
-    if width * height > densest * len(content):
+    if width * height > min(densest, _PIXELS_PER_BYTE + FREE_PIXELS / len(content)) * len(content):
         raise ImageError(
             f'compressed image of {len(content)} bytes can not have a size of {width}x{height}'
         )

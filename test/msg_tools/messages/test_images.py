@@ -227,6 +227,14 @@ def with_size(png, width, height):
     return png[:12] + header + struct.pack('>I', zlib.crc32(header)) + png[33:]
 
 
+def test_a_small_file_of_one_colour_is_not_a_huge_picture():
+    png = encoded('.png', np.zeros((4096, 4096), np.uint8))
+    assert decode_picture(png, colours=cv2.IMREAD_GRAYSCALE).shape == (4096, 4096)
+    png = encoded('.png', np.zeros((4096, 8192), np.uint8))
+    with pytest.raises(ImageError, match='can not have a size of 8192x4096'):
+        decode_picture(png)
+
+
 def test_defects_of_compressed_images():
     jpeg = encoded('.jpg', BGR)
     frame = jpeg.index(b'\xff\xc0')
