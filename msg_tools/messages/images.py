@@ -306,7 +306,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
     most = min(MAX_JPEG_SCANS, _MAX_SCANNED // (width * height + 1))
     if scans > most:
         raise ImageError(f'jpeg has {scans} scans, the limit is {most}')
-    if content.rfind(_JPEG_END) < content.rfind(_JPEG_SCAN):
+    if content.rfind(_JPEG_END) <= content.rfind(_JPEG_SCAN):
         raise ImageError(f'{what} breaks off or is damaged: its end is missing')
     return width, height
 

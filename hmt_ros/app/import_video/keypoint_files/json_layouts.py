@@ -112,6 +112,8 @@ def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
     elif isinstance(content, list):
         for i, entry in enumerate(content):
             entry = load_plain_json(entry) if isinstance(entry, str) else entry
+            if not isinstance(entry, (dict, list)):
+                raise ValueError(f'entry {i} is a {type(entry).__name__}, wanted an object')
             own = _get(entry, _FRAME, label)
             if isinstance(entry, list):
                 yield i, entry
