@@ -22,7 +22,6 @@ from hmt_ros.experts import (  # noqa: E402
     ConditionalDensity,
     ConditionalExperts,
     JointExperts,
-    RelevanceVectorRegression,
 )
 
 EXPERTS = 5
@@ -47,7 +46,7 @@ def main() -> int:
     models: dict[str, ConditionalDensity] = {
         'conditional': ConditionalExperts(EXPERTS, seed=0),
         'joint': JointExperts(EXPERTS, seed=0),
-        'one regression': RelevanceVectorRegression(seed=0),
+        'one regression': ConditionalExperts(1, seed=0),
     }
     figure, axes = plt.subplots(
         2, 3, figsize=(8.4, 4.2), sharex=True, sharey='row', layout='constrained',

@@ -29,7 +29,6 @@ from hmt_ros.experts.descriptor.silhouette_descriptor import (
 from hmt_ros.experts.expert_mixture import (
     ConditionalExperts,
     JointExperts,
-    RelevanceVectorRegression,
 )
 from hmt_ros.experts.neighbour_models import LocalExperts, NearestNeighbours
 from hmt_ros.experts.pose_encoding import PoseEncoding
@@ -111,7 +110,7 @@ KINDS = {
     'conditional': ModelKind(_conditional, 16, 20, 6, few=True, folds=2),
     'joint': ModelKind(_joint, 120, 20, 40, few=True, folds=2),
     'relevance-vector': ModelKind(
-        lambda _, seed, __: RelevanceVectorRegression(scaling='common', seed=seed), 1
+        lambda _, seed, __: ConditionalExperts(1, scaling='common', seed=seed, n_starts=1), 1
     ),
     'nearest': ModelKind(lambda experts, _, __: NearestNeighbours(experts, scaling='common'), 5),
 }

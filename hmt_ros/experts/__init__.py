@@ -6,7 +6,6 @@ from hmt_ros.experts.density_propagation import propagate, propagate_by_dynamics
 from hmt_ros.experts.expert_mixture import (
     ConditionalExperts,
     JointExperts,
-    RelevanceVectorRegression,
 )
 from hmt_ros.experts.lifted_fit import KeypointPredictor, lift_poses
 from hmt_ros.experts.lifter import Lifter, load_lifter
@@ -25,7 +24,6 @@ __all__ = [
     'NearestNeighbours',
     'NetworkExperts',
     'PosePredictor',
-    'RelevanceVectorRegression',
     'lift_poses',
     'load_lifter',
     'load_predictor',

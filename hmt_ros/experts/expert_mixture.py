@@ -1,9 +1,10 @@
-"""Mixtures of sparse Bayesian experts: the conditional and the joint BME, and one regression.
+"""Mixtures of sparse Bayesian experts: the conditional and the joint BME.
 
     p(x | r) = sum_i g_i(r) N(x; M_i' phi(r), O_i (1 + phi' S_i phi))           (BME 14 and 31)
 
-`ConditionalExperts` have softmax gates (BME 16), `JointExperts` Gaussian gates (BME 32), and
-`RelevanceVectorRegression` has one expert. All are learned by `expectation_maximisation`.
+`ConditionalExperts` have softmax gates (BME 16), `JointExperts` Gaussian gates (BME 32). One expert
+is a sparse Bayesian regression, the baseline with a single mode (BME 3). All are learned by
+`expectation_maximisation`.
 
 Several starts, each with all candidate kernel widths, run for a few iterations on some of the
 samples; the one with the highest bound continues with all samples.
@@ -331,42 +332,6 @@ class JointExperts(ExpertMixture):
 
     kind = 'joint_experts'
     _gates = GaussianGates
-
-
-class RelevanceVectorRegression(ExpertMixture):
-    """One sparse Bayesian regression, the baseline with a single mode (BME 3).
-
-    Arguments and attributes are those of `ExpertMixture`, without those that choose experts.
-    """
-
-    kind = 'relevance_vector_regression'
-    _gates = SoftmaxGates
-
-    def __init__(
-        self,
-        basis: str = 'rbf',
-        seed: int = 0,
-        *,
-        width: float | None = None,
-        max_kernels: int = 400,
-        max_iterations: int = 100,
-        tolerance: float = 1e-4,
-        scaling: str = 'each',
-    ) -> None:
-        super().__init__(
-            1,
-            basis,
-            seed,
-            width=width,
-            max_kernels=max_kernels,
-            n_starts=1,
-            max_iterations=max_iterations,
-            tolerance=tolerance,
-            scaling=scaling,
-        )
-
-    def _expert(self, sums: WeightedSums, old: SparseRegression | None) -> SparseRegression:
-        return maximise_evidence(sums, self._prior, old)
 
 
 def _stored_expert(own: Mapping[str, NDArray[Any]]) -> SparseRegression:

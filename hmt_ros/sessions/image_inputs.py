@@ -230,17 +230,14 @@ class ImageInputs:
         content = taken.get(stamp_ns)
         if row.told:
             for each in (x for x in taken if x != stamp_ns and x not in dropped):
-                verb, what = ('belong', 'come') if row.name.endswith('s') else ('belongs', 'comes')
                 self._log.note(
                     f'{row.name} without an image',
-                    f'{row.name} of {each} ns {verb} to no image, or {what} too late: wanted the '
-                    'stamp of an image',
+                    f'{row.name} of {each} ns: no image has this stamp, or waits any more; wanted '
+                    'the stamp of an image',
                 )
         if row.told and stamp_ns not in taken:
-            verb = 'have' if row.name.endswith('s') else 'has'
-            self._log.note(
-                f'no {row.name}', f'no {row.name} {verb} come for the image of {stamp_ns} ns'
-            )
+            text = f'no {row.name} came for the image of {stamp_ns} ns'
+            self._log.note(f'no {row.name}', text)
         if content is None or row.pixels is None or content.shape == image.shape[:2]:
             return content
         (height, width), (rows, columns) = content.shape, image.shape[:2]

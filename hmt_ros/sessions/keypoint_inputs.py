@@ -49,8 +49,6 @@ LONGEST_ABSENCE = 1.0
 _FARTHEST = 1.0
 # Factor per image on the size of a person who is partly hidden now.
 _SIZE_KEPT = 0.95
-# Sets of unknown names that are warned of, each once; a detector has one.
-_MOST_WARNINGS = 20
 
 
 def known_lifter(model: str) -> Lifter | None:
@@ -149,7 +147,7 @@ def _distance(one: Keypoints, other: Keypoints) -> float:
 
 
 class DetectionReader:
-    """Reads the messages of a detector; of each kind of unknown names it warns once.
+    """Reads the messages of a detector.
 
     Args:
         source: type of the messages, see `CameraNodeParameters.source`.
@@ -157,7 +155,6 @@ class DetectionReader:
 
     def __init__(self, source: str, log: HandlingLog) -> None:
         self._source, self._log = source, log
-        self._unknown: set[frozenset[str]] = set()
 
     def _people(
         self, message: Any, stamp: int, order: Scheme, camera: Camera | None = None
@@ -178,16 +175,11 @@ class DetectionReader:
 
     def _report(self, unknown: list[str], scheme: str) -> None:
         """Counts names of keypoints that are not known."""
-        names = frozenset(unknown)
-        new = names not in self._unknown and len(self._unknown) < _MOST_WARNINGS
-        if new:
-            self._unknown.add(names)
         known = {AUTO: 'of the body or of a known scheme', JOINTS: 'of the body'}
         self._log.note(
             'names of keypoints',
             f'keypoints {unknown} are not used: wanted names of joints '
             f'{known.get(scheme, f"in the scheme {scheme}")}',
-            warn=new,
         )
 
 

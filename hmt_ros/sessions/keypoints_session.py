@@ -94,8 +94,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
     def restart(self) -> None:
         """See `Session`."""
         # The detector sees by the stamps that a new sequence begins.
-        self._newest: int | None = None
-        self._landmarks = 0
+        self._landmarks: int | None = None
         super().restart()
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
@@ -105,7 +104,6 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
         except ImageError as error:
             self._log.skip('image', str(error))
             return
-        self._newest = stamp
         self._landmarks = 0 if found is None else len(found.names)
         self._log.counts['detected'] += 1
         self._log.counts['empty'] += found is None
@@ -125,8 +123,8 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
             self._publish(MASK, stamp, image_message(messages, picture, stamp, frame_id))
 
     def _present_state(self) -> KeypointsState:
-        if self._newest is None:
-            status, wants = 'waiting', 'an image'
-        else:
-            status, wants = 'detecting' if self._landmarks else 'nobody', ''
-        return KeypointsState(status, wants, **self._totals(), landmarks=self._landmarks)
+        landmarks = self._landmarks
+        if landmarks is None:
+            return KeypointsState('waiting', 'an image', **self._totals())
+        status = 'detecting' if landmarks else 'nobody'
+        return KeypointsState(status, '', **self._totals(), landmarks=landmarks)

@@ -88,7 +88,7 @@ class PeopleReader(DetectionReader):
             if use_keypoints and person.keypoints.names:
                 known, unknown = person.keypoints.named_for(body, scheme)
                 keypoints = known[np.flatnonzero(known.seen)]
-                if unknown and frozenset(unknown) not in self._unknown:
+                if unknown:
                     self._report(sorted(unknown), scheme)
             result.append(Found(person, keypoints, Sighting.of(keypoints, corners)))
         return result

@@ -29,7 +29,7 @@ The rules, besides those of `Session`:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -150,7 +150,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def prepare(self) -> None:
         """See `Session`."""
         other = SmootherSession(self.parameters, lambda output: None)
-        for message in likelihoods(known_body(self.parameters.body_model or 'human37')):
+        for message in likelihoods(load_body(self.parameters.body_model or 'human37')):
             other.take(MIXTURE, message)
         other.smooth_span()
         other.finish()
@@ -285,8 +285,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         chosen = self.parameters.body_model
         try:
             # A message must not cause files to be read: its body has to ship with the package.
-            model = _chosen_body(chosen) if chosen else known_body(content.body_model, named_body)
-        except ValueError as error:
+            model = _chosen_body(chosen) if chosen else named_body(content.body_model)
+        except (OSError, ValueError) as error:
             raise MessageError(public_line(error), 'body') from error
         body = body_of(content, model, any_name=bool(chosen))
         of = SmoothedBody(body, content.frame_id, content.track_id)
@@ -410,23 +410,10 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         )
 
 
-def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
-    """The body of a name, or of a file where `load` takes one.
-
-    Raises:
-        ValueError: there is none.
-    """
-    try:
-        return load(name)
-    except OSError as error:
-        text = error_line(error)
-        raise ValueError(f'{text}; body_model names it, or a file with it') from error
-
-
 def _chosen_body(model: str) -> Body:
     """The body that the parameters name."""
     with named_file('body_model', model, 'body model'):
-        return known_body(model)
+        return load_body(model)
 
 
 def _levelled(evidence: Evidence, body: Body) -> Evidence:

@@ -16,7 +16,6 @@ from hmt_ros.experts import (
     NearestNeighbours,
     NetworkExperts,
     PosePredictor,
-    RelevanceVectorRegression,
     lift_poses,
     load_lifter,
     load_predictor,
@@ -79,7 +78,7 @@ def densities() -> dict[str, object]:
         'conditional': ConditionalExperts(2, width=2.0, **fast).fit(x, y),
         'conditional, linear': ConditionalExperts(2, 'linear', **fast).fit(x, y),
         'joint': JointExperts(2, 'linear', **fast).fit(x, y),
-        'relevance vectors': RelevanceVectorRegression(width=2.0, max_kernels=12).fit(x, y),
+        'one expert': ConditionalExperts(1, width=2.0, **fast).fit(x, y),
         'network': _network(),
         'calibrated': _calibrated(_network()),
     }

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from hmt_ros.experts import ConditionalExperts, JointExperts, RelevanceVectorRegression
+from hmt_ros.experts import ConditionalExperts, JointExperts
 from test.oracles.branching import true_log_density
 
 MODELS = [
     ConditionalExperts(3, n_starts=2),
     JointExperts(3, n_starts=2),
-    RelevanceVectorRegression(),
+    ConditionalExperts(1),
     ConditionalExperts(3, 'linear', n_starts=2),
     JointExperts(3, 'linear', n_starts=2),
 ]
-NAMES = ['conditional', 'joint', 'rvm', 'conditional_linear', 'joint_linear']
+NAMES = ['conditional', 'joint', 'one', 'conditional_linear', 'joint_linear']
 
 
 def fresh(model, **parameters):
@@ -47,7 +47,7 @@ def test_five_experts_are_better_than_three(model, toy_pairs, toy_test):
 
 
 def test_one_regression_averages_the_branches(toy_pairs, toy_test):
-    found = RelevanceVectorRegression().fit(*toy_pairs)
+    found = ConditionalExperts(1).fit(*toy_pairs)
     assert 0.1 < found.log_density(*toy_test).mean() < 0.25
 
 
@@ -207,5 +207,5 @@ def test_experts_come_near_the_truth_of_the_toy(toy_pairs, toy_test):
         heaviest = means[np.arange(4), weights.argmax(1)]
         near = np.abs(means - heaviest[:, None])[:, :, 0] < 0.15
         assert (weights * near).sum(1).mean() > 0.9
-    one = RelevanceVectorRegression(seed=0).fit(*toy_pairs)
+    one = ConditionalExperts(1, seed=0).fit(*toy_pairs)
     assert one.log_density(*toy_test).mean() < 0.3

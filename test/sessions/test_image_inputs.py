@@ -125,10 +125,12 @@ def test_an_input_of_no_image_is_told(small_camera):
         given.put('detections', None, stamp, lambda message, stamp: ['somebody'])
     assert given.take(MASK_INPUT, 3, image, dropped={2}) is not None
     assert log.faults == {'mask without an image': 1}
-    assert log.last_fault.startswith('mask of 1 ns belongs to no image, or comes too late')
+    assert log.last_fault.startswith('mask of 1 ns: no image has this stamp, or waits any more')
     given.take(DETECTIONS_INPUT, 2, image, dropped=())
-    assert log.last_fault.startswith('detections of 1 ns belong to no image, or come too late')
+    assert log.last_fault.startswith(
+        'detections of 1 ns: no image has this stamp, or waits any more'
+    )
     assert given.take(DETECTIONS_INPUT, 5, image, dropped={3}) is None
-    assert log.last_fault == 'no detections have come for the image of 5 ns'
+    assert log.last_fault == 'no detections came for the image of 5 ns'
     with pytest.raises(KeyError):
         given.put('tail', None, 1, MASK_INPUT.read)

@@ -237,11 +237,11 @@ def test_detections_without_an_image_and_images_without_detections(session, smal
     show(one, small_camera, 0, somebody_at(15))
     one.take(DETECTIONS, seen(small_camera, 0.5, somebody_at(15)))
     told = show(one, small_camera, 1, somebody_at(15))
-    assert [x for x in told if 'belong to no image' in x]
+    assert [x for x in told if 'no image has this stamp' in x]
     # The image of 2 waits for its detections, until those of 3 come.
     assert one.take(IMAGE, small_camera.image(2)).published == ()
     told = show(one, small_camera, 3, somebody_at(15))
-    assert [x for x in told if 'no detections have come for the image' in x]
+    assert [x for x in told if 'no detections came for the image' in x]
     assert one.state.counts['tracked'] == 4
 
 

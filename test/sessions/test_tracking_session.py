@@ -441,7 +441,7 @@ def test_images_wait_for_masks(session, small_camera, stub_tracker, outputs):
     # An image that is over 0.25 s younger ends the wait.
     handled = one.take(IMAGE, small_camera.image(3))
     assert tracked(outputs) == [small_camera.stamp(0)]
-    assert handled.warnings == (f'no mask has come for the image of {small_camera.stamp(0)} ns',)
+    assert handled.warnings == (f'no mask came for the image of {small_camera.stamp(0)} ns',)
     assert handled.faults == ()
     # So does the mask of a later image.
     one.take(MASK, small_camera.mask(2))
@@ -449,7 +449,7 @@ def test_images_wait_for_masks(session, small_camera, stub_tracker, outputs):
     # Too late for 1.
     one.take(MASK, small_camera.mask(1))
     (warning,) = one.take(MASK, small_camera.mask(3)).warnings
-    assert f'mask of {small_camera.stamp(1)} ns belongs to no image' in warning
+    assert f'mask of {small_camera.stamp(1)} ns: no image has this stamp' in warning
     assert masks(stub_tracker) == [None, None, 240, 240]
     assert one.state.faults == {'no mask': 2, 'mask without an image': 1}
 

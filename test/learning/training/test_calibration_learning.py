@@ -7,7 +7,7 @@ import pytest
 
 from hmt_learning.training.calibration_learning import LearningCalibration, calibration, folds_of
 from hmt_ros.body.learned_file import nested
-from hmt_ros.experts import JointExperts, NearestNeighbours, RelevanceVectorRegression
+from hmt_ros.experts import ConditionalExperts, JointExperts, NearestNeighbours
 from hmt_ros.experts.calibrated_experts import CalibratedExperts, Calibration
 from hmt_ros.experts.conditional_density import Components
 
@@ -80,7 +80,7 @@ def test_means_stay_as_they_are() -> None:
 
 def test_a_file_brings_it_back(tmp_path: Path) -> None:
     inputs, targets, groups = grouped(5, 0.2)
-    model = LearningCalibration(RelevanceVectorRegression(), folds=2)
+    model = LearningCalibration(ConditionalExperts(1), folds=2)
     model.fit(inputs, targets, groups=groups)
     again = CalibratedExperts.load(model.save(tmp_path / 'model'))
     assert again.folds == 2
