@@ -225,14 +225,14 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return session
 
     def _answer(self, response: Any, field: str, make: Callable[[AnySession], Any]) -> Any:
-        """A response with the message that a session makes in a field, or why there is none."""
-        try:
-            if self._session is None:
-                raise ValueError('the node is not configured')
-            data = serialise(make(self._session))
-        except (ValueError, ArithmeticError) as error:
-            response.success, response.message = False, error_line(error)
-            return response
+        """A response with the message that a session makes in a field.
+
+        Raises:
+            ValueError: there is none.
+        """
+        if self._session is None:
+            raise ValueError('the node is not configured')
+        data = serialise(make(self._session))
         response.success = True
         setattr(response, field, deserialize_message(data, type(getattr(response, field))))
         return response

@@ -23,7 +23,6 @@ from hmt_ros.nodes.subscribed_topic import (
     input_topics,
     types_of_others,
 )
-from hmt_ros.sessions.named_file import public_line
 from hmt_ros.sessions.track_start import TrackStart
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
@@ -84,14 +83,8 @@ class TrackingNode(SessionNode[Any, Any]):
     def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
         session, estimator = self._session, self._estimator
         if session is None or estimator is None:
-            response.success, response.message = False, 'the node is not active'
-            return response
-        try:
-            start = self._start_asked_for(request)
-        except ValueError as error:
-            response.success, response.message = False, public_line(error)
-            self.get_logger().warn(f'~/reset is refused: {response.message}')
-            return response
+            raise ValueError('the node is not active')
+        start = self._start_asked_for(request)
         estimator.restart(lambda: session.restart(start))
         wants = start.wants(start.parameters.sources)
         response.success, response.message = True, f'a new track waits for {wants}'

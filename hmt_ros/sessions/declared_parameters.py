@@ -162,10 +162,6 @@ class CameraNodeParameters(ImageNodeParameters):
         return schemes().get(self.keypoint_scheme) or schemes()[USUAL_ORDER]
 
 
-class ParameterError(ValueError):
-    """A value that a parameter can not have: one line, what was seen and what was wanted."""
-
-
 @dataclass(frozen=True)
 class DeclaredParameter:
     """A parameter.
@@ -198,11 +194,11 @@ class DeclaredParameter:
         """A value from a file or a command line, with the type of the parameter.
 
         Raises:
-            ParameterError: another type, or beyond the limits.
+            ValueError: another type, or beyond the limits.
         """
         wanted: Any = type(self.default)
         if hasattr(value, '__len__') and len(value) > LONGEST_VALUE:
-            raise ParameterError(
+            raise ValueError(
                 f'{self.name} has the length {len(value)}, the limit is {LONGEST_VALUE}'
             )
         if wanted is tuple:
@@ -210,12 +206,10 @@ class DeclaredParameter:
         if wanted is float and type(value) is int:
             value = float(value)
         if type(value) is not wanted:
-            raise ParameterError(f'{self.name} must be a {_NAMES[wanted]}, saw {value!r}')
+            raise ValueError(f'{self.name} must be a {_NAMES[wanted]}, saw {value!r}')
         if self.limits is not None and not self.limits[0] <= value <= self.limits[1]:
             low, high = self.limits
-            raise ParameterError(
-                f'{self.name} must lie between {low:g} and {high:g}, saw {value!r}'
-            )
+            raise ValueError(f'{self.name} must lie between {low:g} and {high:g}, saw {value!r}')
         return wanted(value)
 
     def _numbers(self, value: Any) -> tuple[float, ...]:
@@ -225,7 +219,7 @@ class DeclaredParameter:
         if not isinstance(numbers, list | tuple | array) or not all(
             type(number) in (int, float) for number in numbers
         ):
-            raise ParameterError(f'{self.name} must be a list of numbers, saw {value!r}')
+            raise ValueError(f'{self.name} must be a list of numbers, saw {value!r}')
         return tuple(map(float, numbers))
 
 
@@ -265,15 +259,15 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
     """The settings with some parameters changed.
 
     Raises:
-        ParameterError: an unknown name, a value of another type or beyond its limits.
-        ValueError: values that do not go together, as the dataclasses say.
+        ValueError: an unknown name, a value of another type or beyond its limits, or values that do
+            not go together, as the dataclasses say.
     """
     known = {parameter.name: parameter for parameter in declared_parameters(settings)}
     for name in values:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             hint = f'; is {near[0]} meant?' if near else ''
-            raise ParameterError(f'there is no parameter {name}{hint}')
+            raise ValueError(f'there is no parameter {name}{hint}')
     changes: dict[str, Any] = {}
     for name, value in values.items():
         field, *inner = known[name].path

@@ -8,10 +8,7 @@ from typing import Any
 
 import yaml
 
-from hmt_ros.sessions.declared_parameters import (
-    ParameterError,
-    Value,
-)
+from hmt_ros.sessions.declared_parameters import Value
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 PARAMETERS_KEY = 'ros__parameters'
@@ -37,17 +34,17 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
         by_name: whether only sections count that name the node, not those for all nodes.
 
     Raises:
-        ParameterError: not such a file; one line that says why.
+        ValueError: not such a file; one line that says why.
     """
     path = Path(path)
     try:
         document = read_plain_yaml(path, LARGEST_FILE)
     except ValueError as error:
-        raise ParameterError(f'{path}: {error}') from error
+        raise ValueError(f'{path}: {error}') from error
     if document is None:
         return {}
     if not isinstance(document, dict):
-        raise ParameterError(f'{path}: wanted parameters by name, saw {type(document).__name__}')
+        raise ValueError(f'{path}: wanted parameters by name, saw {type(document).__name__}')
     sections = {
         str(key): value
         for key, value in document.items()
@@ -58,7 +55,7 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     result: dict[str, Any] = {}
     for key in document:
         if str(key) not in sections:
-            raise ParameterError(f'{path}: section {key!r} has no {PARAMETERS_KEY}')
+            raise ValueError(f'{path}: section {key!r} has no {PARAMETERS_KEY}')
     # As in ROS, a section for one node overrides a section for all.
     for key in sorted(sections, key=lambda key: '*' not in key):
         if key.rpartition('/')[2] in ((node,) if by_name else (node, '*', '**')):
@@ -68,7 +65,7 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
 
 def _flattened(values: Any, prefix: str, path: Path) -> Iterator[tuple[str, Any]]:
     if not isinstance(values, Mapping):
-        raise ParameterError(f'{path}: wanted parameters by name, saw {values!r}')
+        raise ValueError(f'{path}: wanted parameters by name, saw {values!r}')
     for key, value in values.items():
         name = f'{prefix}{key}'
         if isinstance(value, Mapping):

@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from docs.generate import parameter_file_text
-from hmt_ros.sessions.declared_parameters import ParameterError, values_of, with_values
+from hmt_ros.sessions.declared_parameters import values_of, with_values
 from hmt_ros.sessions.parameter_file import read_parameter_file, yaml_scalar
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 
@@ -93,7 +93,7 @@ def test_files_that_are_none(tmp_path, text, message):
     path = tmp_path / 'wrong.yaml'
     if text is not None:
         path.write_text(text)
-    with pytest.raises(ParameterError, match=message) as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         read_parameter_file(path, 'filter_node')
     assert str(path) in str(caught.value)
     assert '\n' not in str(caught.value)
