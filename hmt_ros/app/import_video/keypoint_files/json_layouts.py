@@ -113,7 +113,7 @@ def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
         for i, entry in enumerate(content):
             entry = load_plain_json(entry) if isinstance(entry, str) else entry
             if not isinstance(entry, (dict, list)):
-                raise ValueError(f'entry {i} is a {type(entry).__name__}, wanted an object')
+                raise ValueError(f'entry {i} is no object')
             own = _get(entry, _FRAME, label)
             if isinstance(entry, list):
                 yield i, entry
