@@ -37,9 +37,9 @@ from msg_tools.bags.mcap_file import MAGIC as _MCAP_MAGIC
 from msg_tools.bags.mcap_file import McapFile
 from msg_tools.bags.sqlite_file import MAGIC as _SQLITE_MAGIC
 from msg_tools.bags.sqlite_file import SqliteFile
-from msg_tools.bags.storage import LARGEST, BagFile, Channel, StoredMessage
+from msg_tools.bags.storage import LARGEST, BagFile, Channel, StoredMessage, faults_told
 from msg_tools.files.budget import Budget, BudgetError
-from msg_tools.messages.cdr import ValueBudget, deserialise
+from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.message_types import typestore, typestore_of_definition
 
 _log = logging.getLogger(__name__)
@@ -258,7 +258,7 @@ class BagReader(AbstractContextManager['BagReader']):
         return self._merged(names)
 
     def _merged(self, names: Collection[str]) -> Iterator[BagMessage]:
-        budget, values = Budget(self._size), ValueBudget(self._size)
+        budget = Budget(self._size)
         found = (_from_its_start(file, names, budget) for file in self._files)
         for stored in heapq.merge(*found, key=attrgetter('log_time')):
             if stored.channel is not None:
@@ -268,12 +268,10 @@ class BagReader(AbstractContextManager['BagReader']):
                     _full_name(stored.channel.msgtype),
                     stored.log_time,
                     stored.data,
-                    partial(self._deserialise, stored.channel, budget, values),
+                    partial(self._deserialise, stored.channel, budget),
                 )
 
-    def _deserialise(
-        self, channel: Channel, budget: Budget, values: ValueBudget, stored: BagMessage
-    ) -> Any:
+    def _deserialise(self, channel: Channel, budget: Budget, stored: BagMessage) -> Any:
         self._check_encoding(stored.topic, channel.encoding)
         what = f'{self.path}: message of {stored.topic} at {stored.log_time_ns} ns'
         data = stored.data
@@ -290,7 +288,7 @@ class BagReader(AbstractContextManager['BagReader']):
             # Bags with the compression mode "message". No CDR message starts like this.
             if data[:4] == _ZSTD_MAGIC:
                 data = b''.join(_decompressed(data, budget, LARGEST))
-            return deserialise(data, stored.msgtype, store, values)
+            return deserialise(data, stored.msgtype, store, budget)
         except Exception as error:
             # Bytes from outside meet generated code here, which does not say what it may raise.
             raise BagError(
@@ -328,17 +326,11 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def _open_file(self, path: Path, budget: Budget) -> BagFile:
         name = str(path)
-        try:
+        with faults_told(name):
             magic = _first_bytes(path)
             if magic.startswith(_ZSTD_MAGIC):
                 path = self._decompressed(path, budget)
                 magic = _first_bytes(path)
-        except OSError as error:
-            raise BagError(f'{name} can not be read: {reason(error)}') from error
-        except BudgetError as error:
-            raise BagError(f'{name} is refused: {reason(error)}') from error
-        except zstandard.ZstdError as error:
-            raise BagError(f'{name} is damaged: {reason(error)}') from error
         if magic == _SQLITE_MAGIC:
             return SqliteFile(path, name, budget)
         if magic.startswith(_MCAP_MAGIC):

@@ -22,7 +22,7 @@ class Channel(NamedTuple):
         topic: as written, with or without a leading slash.
         msgtype: as written; '' if the file does not contain it.
         encoding: 'cdr' for ROS 2.
-        definition_encoding: 'ros2msg', 'ros2idl', or '' when there is no definition.
+        definition_encoding: 'ros2msg' for the text of a .msg file; '' when there is no definition.
         definition: text of the message definition.
     """
 

@@ -69,7 +69,7 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
 
     Args:
         msgtype: for example 'sensor_msgs/msg/Image'.
-        encoding: 'ros2msg', 'ros2idl', or '' when there is no definition.
+        encoding: 'ros2msg'; for known types, another or '' leads to the known definition.
         definition: text of the definition, with those of the nested types.
 
     Returns:
@@ -81,15 +81,18 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
     if not msgtype:
         raise ValueError('the bag does not name the type')
     known = typestore()
+    ours = msgtype in known.fielddefs
     types: Types = {}
-    if definition.strip() or msgtype not in known.fielddefs:
+    if encoding == 'ros2msg' and (definition.strip() or not ours):
         try:
-            types = types_of_definition(definition, encoding, msgtype)
-        except ValueError as error:
-            if msgtype not in known.fielddefs:
-                raise ValueError(f'its {encoding} definition can not be parsed: {error}') from error
-    if msgtype not in types and msgtype not in known.fielddefs:
-        raise ValueError('the type is not known, and the bag does not define it')
+            types = types_of_definition(definition, msgtype)
+        except ValueError:
+            if not ours:
+                raise
+    if not types and not ours:
+        raise ValueError(
+            f"the type is not known, and its definition is {encoding[:20]!r}, wanted 'ros2msg'"
+        )
     changed: Any = {
         name: ([], types[name]) for name in types if not _same_fields(name, types, known)
     }
@@ -105,7 +108,7 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
         own.register(changed)
     except Exception as error:
         # The generator of code does not say what it may raise.
-        raise ValueError(f'its {encoding} definition can not be used') from error
+        raise ValueError('its definition can not be used') from error
     return own
 
 
