@@ -16,7 +16,6 @@ from __future__ import annotations
 import heapq
 import logging
 import os
-import stat
 import sys
 import tempfile
 from collections import defaultdict
@@ -37,7 +36,7 @@ from msg_tools.bags.mcap_file import MAGIC as _MCAP_MAGIC
 from msg_tools.bags.mcap_file import McapFile
 from msg_tools.bags.sqlite_file import MAGIC as _SQLITE_MAGIC
 from msg_tools.bags.sqlite_file import SqliteFile
-from msg_tools.bags.storage import LARGEST, BagFile, Channel, StoredMessage, faults_told
+from msg_tools.bags.storage import LARGEST, Channel, StoredMessage, faults_told
 from msg_tools.files.budget import Budget, BudgetError
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.message_types import typestore, typestore_of_definition
@@ -308,14 +307,10 @@ class BagReader(AbstractContextManager['BagReader']):
     # Files
 
     def _storage_paths(self) -> list[Path]:
-        try:
-            mode = self.path.stat().st_mode
-        except (OSError, ValueError) as error:
-            raise BagError(f'{self.path} can not be read: {reason(error)}') from error
-        if stat.S_ISREG(mode):
+        if os.path.isfile(self.path):  # noqa: PTH113 - False, too, for names that can not be
             return [self.path]
-        if not stat.S_ISDIR(mode):
-            raise BagError(f'{self.path} is neither a file nor a folder')
+        if not os.path.isdir(self.path):  # noqa: PTH112
+            raise BagError(f'{self.path} can not be read: it is neither a file nor a folder')
         paths = [self.path / name for name in read_file_names(self.path)]
         for path in paths:
             if not os.path.isfile(path):  # noqa: PTH113 - False, too, for names that can not be
@@ -324,7 +319,7 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
         return paths
 
-    def _open_file(self, path: Path, budget: Budget) -> BagFile:
+    def _open_file(self, path: Path, budget: Budget) -> McapFile | SqliteFile:
         name = str(path)
         with faults_told(name):
             magic = _first_bytes(path)
@@ -392,7 +387,7 @@ def _listed(names: Collection[str]) -> str:
 
 
 def _from_its_start(
-    file: BagFile, topics: Collection[str], budget: Budget
+    file: McapFile | SqliteFile, topics: Collection[str], budget: Budget
 ) -> Iterator[StoredMessage]:
     """A mark without a channel, then the messages: no file is opened before its time has come."""
     yield StoredMessage(file.start, None, b'')

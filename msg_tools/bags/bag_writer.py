@@ -83,7 +83,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._start: int | None = None
         self._end = 0
         self._file: BinaryIO | None = None
-        self._handed_over = 0
         self._place = ExitStack()
         with self._dropping_on_error():
             new = _FOLDER.new(self.path, overwrite=overwrite)
@@ -170,7 +169,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             )
         with self._dropping_on_error():
             self._writer.add_message(known.channel, stamp_ns, data, stamp_ns)
-            self._hand_over()
+            self._file.flush()  # the system keeps it should the process be killed
         known.message_count += 1
         self._start = stamp_ns if self._start is None else min(self._start, stamp_ns)
         self._end = max(self._end, stamp_ns)
@@ -227,14 +226,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         except BaseException:
             self.abort()
             raise
-
-    def _hand_over(self) -> None:
-        """Hands the bytes of the library to the system, where they outlive the process."""
-        assert self._file is not None
-        written = self._file.tell()
-        if written != self._handed_over:
-            self._file.flush()
-            self._handed_over = written
 
     def _information(self) -> dict[str, Any]:
         """Content of metadata.yaml, as rosbag2 of Jazzy writes it."""

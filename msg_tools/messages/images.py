@@ -236,13 +236,25 @@ def decode_picture(
         raise ImageError(
             f'compressed image of {len(content)} bytes can not have a size of {width}x{height}'
         )
-    flags = colours | cv2.IMREAD_IGNORE_ORIENTATION
+    image = decoded(content, colours | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.shape[:2] != (height, width):
+        raise ImageError(f'compressed image of {len(content)} bytes and {form} is damaged')
+    return image
+
+
+def decoded(content: bytes, flags: int = cv2.IMREAD_COLOR) -> Picture:
+    """The picture that OpenCV finds in a file of any format.
+
+    Raises:
+        ImageError: another format, or a damaged file.
+    """
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     except cv2.error as error:
-        raise ImageError(f'compressed image can not be decoded: {error.err}') from error
-    if image is None or image.shape[:2] != (height, width):
-        raise ImageError(f'compressed image of {len(content)} bytes and {form} is damaged')
+        raise ImageError(f'the image can not be decoded: {error.err}') from error
+    if image is None:
+        raise ImageError('not an image that OpenCV can read, or it is damaged')
+    _check_size(image.shape[1], image.shape[0])
     return np.array(image, dtype=np.uint8, order='C')
 
 
