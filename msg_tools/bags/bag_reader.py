@@ -177,6 +177,10 @@ class BagReader(AbstractContextManager['BagReader']):
         names = self.topics if topics is None else {self.topic(name).name for name in topics}
         return sum(self.topics[name].message_count for name in names)
 
+    def topics_of(self, *msgtypes: str) -> list[Topic]:
+        """The topics of some types that have messages."""
+        return [x for x in self.topics.values() if x.msgtype in msgtypes and x.message_count]
+
     def topic(self, name: str) -> Topic:
         """The topic of a name, with or without its leading slash.
 
@@ -217,7 +221,7 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
         else:
             found = [topic for topic in self.topics.values() if topic.msgtype in wanted]
-            used = [topic for topic in found if topic.message_count]
+            used = self.topics_of(*wanted)
             if len(used) > 1:
                 names = _listed([topic.name for topic in used])
                 raise BagError(f'{self.path} has several topics of {short}: name one of {names}')
@@ -310,7 +314,9 @@ class BagReader(AbstractContextManager['BagReader']):
         if os.path.isfile(self.path):  # noqa: PTH113 - False, too, for names that can not be
             return [self.path]
         if not os.path.isdir(self.path):  # noqa: PTH112
-            raise BagError(f'{self.path} can not be read: it is neither a file nor a folder')
+            raise BagError(
+                f'{self.path} can not be read: No such file or folder (pipes are neither)'
+            )
         paths = [self.path / name for name in read_file_names(self.path)]
         for path in paths:
             if not os.path.isfile(path):  # noqa: PTH113 - False, too, for names that can not be

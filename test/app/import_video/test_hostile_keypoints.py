@@ -38,7 +38,6 @@ LAYOUTS = {
             }
         ],
     },
-    'mmpose test': [{'preds': [PLACES], 'boxes': [[1, 2, 3, 4, 5, 0.8]], 'image_paths': ['1.jpg']}],
     'alphapose': [{'image_id': '1.jpg', 'keypoints': POINTS, 'score': 0.8, 'idx': [4.0]}],
     'alphapose cmu': {'1.jpg': {'version': 'AlphaPose', 'bodies': [{'joints': POINTS}]}},
     'alphapose tracked': {'4': {'1': {'keypoints': POINTS, 'scores': 0.8}}},

@@ -251,12 +251,12 @@ def test_files_that_are_no_bag(tmp_path, content, error):
 
 
 def test_places_that_are_no_bag(tmp_path):
-    with pytest.raises(BagError, match='neither a file nor a folder'):
+    with pytest.raises(BagError, match='can not be read: No such file or folder'):
         BagReader(tmp_path / 'nowhere')
     with pytest.raises(BagError, match=r'has no metadata\.yaml'):
         BagReader(tmp_path)
     os.mkfifo(tmp_path / 'pipe')
-    with pytest.raises(BagError, match='neither a file nor a folder'):
+    with pytest.raises(BagError, match='can not be read: No such file or folder'):
         BagReader(tmp_path / 'pipe')
     with pytest.raises(BagError, match='can not be read'):
         BagReader('name\0with zero')
