@@ -95,14 +95,5 @@ def quality_of_service(latched: bool) -> list[dict[str, Any]]:
 
 def as_yaml(document: Any) -> str:
     """YAML text, the same for the same document."""
-    text: str = yaml.dump(
-        document, Dumper=_PlainDumper, sort_keys=False, default_flow_style=False, width=2**31
-    )
+    text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=False, width=2**31)
     return text
-
-
-class _PlainDumper(yaml.SafeDumper):
-    """Writes a value out wherever it occurs, without anchors."""
-
-    def ignore_aliases(self, data: object) -> bool:
-        return True

@@ -19,6 +19,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -255,7 +256,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             'compression_format': '',
             'compression_mode': '',
             'relative_file_paths': [self._file_name],
-            'files': [{'path': self._file_name, **span}],
+            'files': [{'path': self._file_name, **deepcopy(span)}],
             'custom_data': None,
             'ros_distro': 'jazzy',
         }

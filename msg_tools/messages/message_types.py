@@ -117,10 +117,9 @@ def _same_fields(name: str, types: Types, known: Typestore) -> bool:
 
     Names are compared without case: the first ROS 2 releases wrote D, K, R, P in CameraInfo.
     """
-    if name not in known.fielddefs:
-        return False
+    ours: Any = known.fielddefs.get(name, ((), ()))[1]
     return [(field.lower(), kind) for field, kind in types[name]] == [
-        (field.lower(), kind) for field, kind in known.fielddefs[name][1]
+        (field.lower(), kind) for field, kind in ours
     ]
 
 
@@ -149,12 +148,6 @@ class RosbagsMessages:
         Raises:
             TypeError: a field that the type does not have.
         """
-        plain = _plain_class(msgtype)
-        if plain is not None and len(fields) == plain[1]:
-            try:
-                return plain[0](**fields)
-            except TypeError:
-                pass  # a wrong name: the error is raised below
         defaults = _defaults(msgtype)
         unknown = fields.keys() - defaults.keys()
         if unknown:
@@ -268,15 +261,6 @@ def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
     if msgtype == 'geometry_msgs/msg/Quaternion':
         result['w'] = (lambda: 1.0), None
     return result
-
-
-@cache
-def _plain_class(msgtype: str) -> tuple[type, int] | None:
-    """Class and number of fields of a type without arrays of numbers, such as a point."""
-    defaults = _defaults(msgtype)
-    if any(dtype is not None for _, dtype in defaults.values()):
-        return None
-    return typestore().types[msgtype], len(defaults)
 
 
 def _list_default(element: Callable[[], Any], count: int) -> Callable[[], list[Any]]:
