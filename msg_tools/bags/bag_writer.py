@@ -168,6 +168,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise BagError(
                 f'{self.path}: stamp {stamp_ns} ns of a message of {topic} is not a time'
             )
+        assert self._file is not None
         with self._dropping_on_error():
             self._writer.add_message(known.channel, stamp_ns, data, stamp_ns)
             self._file.flush()  # the system keeps it should the process be killed

@@ -113,7 +113,10 @@ def decode_image(message: Any) -> Picture:
     """
     if hasattr(message, 'encoding'):
         return _decode_raw(message)
-    return _decode_compressed(message)
+    form = str(message.format)
+    if 'compressedDepth' in form:
+        raise ImageError(f'compressed image has format {form!r}: depth, wanted a picture')
+    return decode_picture(_bytes_of(message.data).tobytes(), f'format {form!r}')
 
 
 def _decode_raw(message: Any) -> Picture:
@@ -194,13 +197,6 @@ def decode_mask(message: Any) -> Mask:
             'at most 8 bits'
         )
     return picture > 0
-
-
-def _decode_compressed(message: Any) -> Picture:
-    form = str(message.format)
-    if 'compressedDepth' in form:
-        raise ImageError(f'compressed image has format {form!r}: depth, wanted a picture')
-    return decode_picture(_bytes_of(message.data).tobytes(), f'format {form!r}')
 
 
 def decode_picture(

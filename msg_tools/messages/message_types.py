@@ -78,8 +78,6 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
     Raises:
         ValueError: the type is not known and the definition can not be understood.
     """
-    if not msgtype:
-        raise ValueError('the bag does not name the type')
     known = typestore()
     ours = msgtype in known.fielddefs
     types: Types = {}

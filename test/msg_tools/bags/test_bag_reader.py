@@ -307,7 +307,7 @@ def test_foreign_encoding(tmp_path):
         (b'\x00\x03\x00\x00abcd', STRING, b'string data', 'encapsulation'),
         (b'\x00\x01\x00\x00', 'no_msgs/msg/X', b'far_msgs/Y y', 'no_msgs/msg/X'),
         (b'\x00\x01\x00\x00', 'no_msgs/msg/X', b'!!', 'line 1 of its definition'),
-        (b'\x00\x01\x00\x00', '', b'', 'unknown type: the bag does not name'),
+        (b'\x00\x01\x00\x00', '', b'', 'unknown type: its definition has a type named'),
         (b'\x28\xb5\x2f\xfd' + b'\xff' * 9, STRING, b'string data', 'encapsulation'),
     ],
 )

@@ -62,7 +62,7 @@ def test_only_what_differs_is_taken_from_a_definition():
 @pytest.mark.parametrize(
     ('msgtype', 'encoding', 'definition', 'error'),
     [
-        ('', 'ros2msg', 'int32 x', 'does not name the type'),
+        ('', 'ros2msg', 'int32 x', "its definition has a type named ''"),
         ('my_msgs/msg/X', '', '', "its definition is '', wanted 'ros2msg'"),
         ('my_msgs/msg/X', 'ros2msg', '?', 'line 1 of its definition is no field'),
         ('my_msgs/msg/X', 'ros2idl', 'struct', "its definition is 'ros2idl', wanted 'ros2msg'"),
