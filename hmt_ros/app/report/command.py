@@ -141,8 +141,8 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
     truth = read_truth(options.truth) if options.truth else recorded_truth(options.bag)
     with BagReader(options.bag) as bag:
         topics = chosen_topics(bag, options.topics)
-        read = {*topics, *(x.name for x in bag.topics_of(BODY))}
-        total = bag.message_count(read) * (1 if truth is None else 2)
+        counted = {*topics, *(x.name for x in bag.topics_of(BODY))}
+        total = bag.message_count(counted) * (1 if truth is None else 2)
         first = next(bag.messages(topics[:1]), None)
     frame = '' if first is None else first.message.header.frame_id
     grounds = read_grounds(options.bag, topics[0], frame)
