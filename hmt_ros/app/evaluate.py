@@ -14,8 +14,8 @@ from typing import Any
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import say, show_progress
-from hmt_ros.app.recorded_bodies import RecordedBodies, body_topics
-from hmt_ros.app.truth import is_truth, mixture_topics, read_truth, recorded_truth
+from hmt_ros.app.recorded_bodies import BODY, RecordedBodies
+from hmt_ros.app.truth import is_truth, read_truth, recorded_truth
 from hmt_ros.body import Body
 from hmt_ros.evaluation.ground_scores import GravityScores, gravity_scores
 from hmt_ros.evaluation.pose_scores import MODEL_SIGMA
@@ -95,7 +95,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         raise ValueError(f'{bag} has no ground truth: name a .npz file or a bag with --truth')
     with BagReader(bag) as reader:
         names = chosen_topics(reader, arguments.topics)
-        total = reader.message_count({*body_topics(reader), *names})
+        total = reader.message_count({*(x.name for x in reader.topics_of(BODY)), *names})
     with show_progress('evaluate', 'messages', total, quiet=arguments.quiet) as bar:
         found = score_bag(
             bag,
@@ -289,12 +289,8 @@ def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
     Raises:
         ValueError: there are none, or a wanted one has no mixtures.
     """
-    poses = [name for name in mixture_topics(bag) if not is_truth(bag, name)]
-    trajectories = [
-        topic.name
-        for topic in bag.topics.values()
-        if topic.msgtype == TRAJECTORY_MIXTURE and topic.message_count
-    ]
+    poses = [x.name for x in bag.topics_of(POSE_MIXTURE) if not is_truth(bag, x.name)]
+    trajectories = [x.name for x in bag.topics_of(TRAJECTORY_MIXTURE)]
     present = [*poses, *trajectories] or [
         topic.name  # of images without anybody
         for topic in bag.topics.values()

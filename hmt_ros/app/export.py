@@ -21,7 +21,6 @@ import numpy as np
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import say, show_progress
 from hmt_ros.app.recorded_bodies import RecordedBodies, read_grounds
-from hmt_ros.app.truth import mixture_topics
 from hmt_ros.body import Body
 from hmt_ros.body.moving_skeleton import CAMERA_TO_ROOM, MovingSkeleton, bvh_text
 from hmt_ros.inference.arrays import Array
@@ -331,8 +330,9 @@ def _topic(bag: BagReader, wanted: str | None) -> str:
     if wanted is not None:
         return bag.find_topic([POSE_MIXTURE], wanted).name
     kinds: dict[int, list[str]] = {}
-    for name in mixture_topics(bag):
-        kinds.setdefault(int(next(bag.messages([name])).message.kind), []).append(name)
+    for each in bag.topics_of(POSE_MIXTURE):
+        first = next(bag.messages([each.name])).message
+        kinds.setdefault(int(first.kind), []).append(each.name)
     named = ', '.join(name for names in kinds.values() for name in names)
     for kind in (MixtureKind.SMOOTHED, MixtureKind.POSTERIOR, MixtureKind.PREDICTION):
         if len(kinds.get(kind, [])) > 1:

@@ -21,14 +21,9 @@ from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
 BODY = 'hmt_msgs/msg/Body'
 
 
-def body_topics(bag: BagReader) -> list[str]:
-    """Topics of a bag on which bodies are described."""
-    return [topic.name for topic in bag.topics.values() if topic.msgtype == BODY]
-
-
 def topic_beside(bag: BagReader, msgtype: str, topic: str) -> str | None:
     """The topic of a type in the namespace of another topic, or else the only one of the bag."""
-    names = [x.name for x in bag.topics.values() if x.msgtype == msgtype and x.message_count]
+    names = [x.name for x in bag.topics_of(msgtype)]
     chosen = [name for name in names if _namespace(name) == _namespace(topic)] or names
     return chosen[0] if len(chosen) == 1 else None
 
@@ -57,7 +52,8 @@ class RecordedBodies:
         Raises:
             ValueError: a message about a body that can not be understood; the bag is damaged.
         """
-        for stored in bag.messages([*body_topics(bag), *topics]):
+        bodies = [x.name for x in bag.topics_of(BODY)]
+        for stored in bag.messages([*bodies, *topics]):
             progress(1)
             if stored.msgtype == BODY:
                 self._learn(stored)

@@ -16,7 +16,6 @@ from pathlib import Path
 from hmt_ros.app.command_line import CommandParser, gravity_of, number, run_command
 from hmt_ros.app.first_subject import find_start, subject_text
 from hmt_ros.app.import_video.command import (
-    ImportOptions,
     add_video_arguments,
     import_video,
 )
@@ -132,7 +131,7 @@ def _track(arguments: argparse.Namespace) -> int:
     for note in notes:
         tell(note)
     video, start = folder / VIDEO, folder / SUBJECT
-    imported = import_video(ImportOptions.of(arguments, video), tell)
+    imported = import_video(argparse.Namespace(**{**vars(arguments), 'output': video}), tell)
     done(f'{video}: {imported}')
     subject = arguments.subject
     if stature is not None:

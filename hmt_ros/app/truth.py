@@ -53,7 +53,7 @@ def recorded_truth(path: Path) -> Truth | None:
         ValueError: there are several, or messages that can not be understood.
     """
     with BagReader(path) as bag:
-        found = [topic for topic in mixture_topics(bag) if is_truth(bag, topic)]
+        found = [x.name for x in bag.topics_of(POSE_MIXTURE) if is_truth(bag, x.name)]
         if len(found) > 1:
             raise ValueError(f'{bag.path} has several ground truths ({", ".join(found)})')
         return _truth_of(bag, found[0]) if found else None
@@ -113,15 +113,6 @@ def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int
         )
         for i, stamp in enumerate(stamps)
     }
-
-
-def mixture_topics(bag: BagReader) -> list[str]:
-    """Topics of pose mixtures that have messages."""
-    return [
-        topic.name
-        for topic in bag.topics.values()
-        if topic.msgtype == POSE_MIXTURE and topic.message_count
-    ]
 
 
 def is_truth(bag: BagReader, topic: str) -> bool:

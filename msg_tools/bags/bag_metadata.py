@@ -7,9 +7,8 @@ from typing import Any
 
 import yaml
 
-from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line, one_line
-from msg_tools.files.plain_yaml import load_plain_yaml
+from msg_tools.files.plain_yaml import read_plain_yaml
 
 FILE_NAME = 'metadata.yaml'
 # Suffixes of the other files of a bag.
@@ -32,8 +31,7 @@ def reason(error: BaseException) -> str:
     """The text of a library's exception as one line of at most 160 characters."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    text = error_line(error)
-    return text if len(text) <= 160 else f'{text[:157]}...'
+    return error_line(error, 160)
 
 
 def absolute_name(topic: str, namespace: str = '') -> str:
@@ -62,23 +60,15 @@ def read_file_names(folder: Path) -> list[str]:
             'the metadata anew with `ros2 bag reindex`'
         )
     try:
-        content = read_bytes(path, MAX_BYTES)
+        document = read_plain_yaml(path, MAX_BYTES)
     except ValueError as error:
-        raise BagError(f'{path}: {error}') from error
+        raise BagError(f'{path}: {reason(error)}') from error
     try:
-        document = load_plain_yaml(content.decode('utf-8'))
-    except ValueError as error:
-        raise BagError(f'{path} is not YAML: {reason(error)}') from error
-    information = None
-    if isinstance(document, dict):
-        information = document.get('rosbag2_bagfile_information')
-    if not isinstance(information, dict):
-        raise BagError(f'{path} has no rosbag2_bagfile_information: it is not that of a bag')
-    names = information.get('relative_file_paths')
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise BagError(f'{path} has no list relative_file_paths; `ros2 bag reindex` writes it anew')
-    if not names:
-        raise BagError(f'{path} names no file: the bag is empty')
+        names = document['rosbag2_bagfile_information']['relative_file_paths']
+    except (TypeError, LookupError):
+        names = None
+    if not names or not isinstance(names, list) or not all(isinstance(x, str) for x in names):
+        raise BagError(f'{path} names no files of a bag; `ros2 bag reindex` writes it anew')
     # The first versions wrote the paths relative to the parent of the folder.
     names = [PurePosixPath(name).name for name in names]
     if len(set(names)) < len(names):
@@ -105,14 +95,5 @@ def quality_of_service(latched: bool) -> list[dict[str, Any]]:
 
 def as_yaml(document: Any) -> str:
     """YAML text, the same for the same document."""
-    text: str = yaml.dump(
-        document, Dumper=_PlainDumper, sort_keys=False, default_flow_style=False, width=2**31
-    )
+    text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=False, width=2**31)
     return text
-
-
-class _PlainDumper(yaml.SafeDumper):
-    """Writes a value out wherever it occurs, without anchors."""
-
-    def ignore_aliases(self, data: object) -> bool:
-        return True

@@ -16,7 +16,6 @@ from __future__ import annotations
 import heapq
 import logging
 import os
-import stat
 import sys
 import tempfile
 from collections import defaultdict
@@ -37,9 +36,9 @@ from msg_tools.bags.mcap_file import MAGIC as _MCAP_MAGIC
 from msg_tools.bags.mcap_file import McapFile
 from msg_tools.bags.sqlite_file import MAGIC as _SQLITE_MAGIC
 from msg_tools.bags.sqlite_file import SqliteFile
-from msg_tools.bags.storage import LARGEST, BagFile, Channel, StoredMessage
+from msg_tools.bags.storage import LARGEST, Channel, StoredMessage, faults_told
 from msg_tools.files.budget import Budget, BudgetError
-from msg_tools.messages.cdr import ValueBudget, deserialise
+from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.message_types import typestore, typestore_of_definition
 
 _log = logging.getLogger(__name__)
@@ -178,6 +177,10 @@ class BagReader(AbstractContextManager['BagReader']):
         names = self.topics if topics is None else {self.topic(name).name for name in topics}
         return sum(self.topics[name].message_count for name in names)
 
+    def topics_of(self, *msgtypes: str) -> list[Topic]:
+        """The topics of some types that have messages."""
+        return [x for x in self.topics.values() if x.msgtype in msgtypes and x.message_count]
+
     def topic(self, name: str) -> Topic:
         """The topic of a name, with or without its leading slash.
 
@@ -218,7 +221,7 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
         else:
             found = [topic for topic in self.topics.values() if topic.msgtype in wanted]
-            used = [topic for topic in found if topic.message_count]
+            used = self.topics_of(*wanted)
             if len(used) > 1:
                 names = _listed([topic.name for topic in used])
                 raise BagError(f'{self.path} has several topics of {short}: name one of {names}')
@@ -258,7 +261,7 @@ class BagReader(AbstractContextManager['BagReader']):
         return self._merged(names)
 
     def _merged(self, names: Collection[str]) -> Iterator[BagMessage]:
-        budget, values = Budget(self._size), ValueBudget(self._size)
+        budget = Budget(self._size)
         found = (_from_its_start(file, names, budget) for file in self._files)
         for stored in heapq.merge(*found, key=attrgetter('log_time')):
             if stored.channel is not None:
@@ -268,12 +271,10 @@ class BagReader(AbstractContextManager['BagReader']):
                     _full_name(stored.channel.msgtype),
                     stored.log_time,
                     stored.data,
-                    partial(self._deserialise, stored.channel, budget, values),
+                    partial(self._deserialise, stored.channel, budget),
                 )
 
-    def _deserialise(
-        self, channel: Channel, budget: Budget, values: ValueBudget, stored: BagMessage
-    ) -> Any:
+    def _deserialise(self, channel: Channel, budget: Budget, stored: BagMessage) -> Any:
         self._check_encoding(stored.topic, channel.encoding)
         what = f'{self.path}: message of {stored.topic} at {stored.log_time_ns} ns'
         data = stored.data
@@ -290,7 +291,7 @@ class BagReader(AbstractContextManager['BagReader']):
             # Bags with the compression mode "message". No CDR message starts like this.
             if data[:4] == _ZSTD_MAGIC:
                 data = b''.join(_decompressed(data, budget, LARGEST))
-            return deserialise(data, stored.msgtype, store, values)
+            return deserialise(data, stored.msgtype, store, budget)
         except Exception as error:
             # Bytes from outside meet generated code here, which does not say what it may raise.
             raise BagError(
@@ -310,14 +311,12 @@ class BagReader(AbstractContextManager['BagReader']):
     # Files
 
     def _storage_paths(self) -> list[Path]:
-        try:
-            mode = self.path.stat().st_mode
-        except (OSError, ValueError) as error:
-            raise BagError(f'{self.path} can not be read: {reason(error)}') from error
-        if stat.S_ISREG(mode):
+        if os.path.isfile(self.path):  # noqa: PTH113 - False, too, for names that can not be
             return [self.path]
-        if not stat.S_ISDIR(mode):
-            raise BagError(f'{self.path} is neither a file nor a folder')
+        if not os.path.isdir(self.path):  # noqa: PTH112
+            raise BagError(
+                f'{self.path} can not be read: No such file or folder (pipes are neither)'
+            )
         paths = [self.path / name for name in read_file_names(self.path)]
         for path in paths:
             if not os.path.isfile(path):  # noqa: PTH113 - False, too, for names that can not be
@@ -326,19 +325,13 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
         return paths
 
-    def _open_file(self, path: Path, budget: Budget) -> BagFile:
+    def _open_file(self, path: Path, budget: Budget) -> McapFile | SqliteFile:
         name = str(path)
-        try:
+        with faults_told(name):
             magic = _first_bytes(path)
             if magic.startswith(_ZSTD_MAGIC):
                 path = self._decompressed(path, budget)
                 magic = _first_bytes(path)
-        except OSError as error:
-            raise BagError(f'{name} can not be read: {reason(error)}') from error
-        except BudgetError as error:
-            raise BagError(f'{name} is refused: {reason(error)}') from error
-        except zstandard.ZstdError as error:
-            raise BagError(f'{name} is damaged: {reason(error)}') from error
         if magic == _SQLITE_MAGIC:
             return SqliteFile(path, name, budget)
         if magic.startswith(_MCAP_MAGIC):
@@ -400,7 +393,7 @@ def _listed(names: Collection[str]) -> str:
 
 
 def _from_its_start(
-    file: BagFile, topics: Collection[str], budget: Budget
+    file: McapFile | SqliteFile, topics: Collection[str], budget: Budget
 ) -> Iterator[StoredMessage]:
     """A mark without a channel, then the messages: no file is opened before its time has come."""
     yield StoredMessage(file.start, None, b'')

@@ -19,6 +19,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -83,7 +84,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._start: int | None = None
         self._end = 0
         self._file: BinaryIO | None = None
-        self._handed_over = 0
         self._place = ExitStack()
         with self._dropping_on_error():
             new = _FOLDER.new(self.path, overwrite=overwrite)
@@ -168,9 +168,10 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise BagError(
                 f'{self.path}: stamp {stamp_ns} ns of a message of {topic} is not a time'
             )
+        assert self._file is not None
         with self._dropping_on_error():
             self._writer.add_message(known.channel, stamp_ns, data, stamp_ns)
-            self._hand_over()
+            self._file.flush()  # the system keeps it should the process be killed
         known.message_count += 1
         self._start = stamp_ns if self._start is None else min(self._start, stamp_ns)
         self._end = max(self._end, stamp_ns)
@@ -228,14 +229,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
             self.abort()
             raise
 
-    def _hand_over(self) -> None:
-        """Hands the bytes of the library to the system, where they outlive the process."""
-        assert self._file is not None
-        written = self._file.tell()
-        if written != self._handed_over:
-            self._file.flush()
-            self._handed_over = written
-
     def _information(self) -> dict[str, Any]:
         """Content of metadata.yaml, as rosbag2 of Jazzy writes it."""
         start = 2**63 - 1 if self._start is None else self._start
@@ -264,7 +257,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             'compression_format': '',
             'compression_mode': '',
             'relative_file_paths': [self._file_name],
-            'files': [{'path': self._file_name, **span}],
+            'files': [{'path': self._file_name, **deepcopy(span)}],
             'custom_data': None,
             'ros_distro': 'jazzy',
         }

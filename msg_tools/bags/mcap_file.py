@@ -62,7 +62,6 @@ class _Index:
         channels: by their keys.
         chunks: in the order of the file; also runs of records that are not in a chunk.
         counts: number of messages of each channel, by its key.
-        start: log time of the first message, ns; `NEVER`: there is none.
         fault: what ended the pass over the file; `EndOfFile`: the end is missing.
     """
 
@@ -70,7 +69,6 @@ class _Index:
     channels: dict[int, ChannelRecord] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)
-    start: int = NEVER
     fault: Exception | None = None
 
     def add(self, file: _File, offset: int, end: int, *, bare: bool) -> None:
@@ -99,7 +97,6 @@ class _Index:
                 length = whole if bare else end - offset
                 self.chunks.append(ChunkIndex(length, offset, '', 0, 0, 0, {}, start, 0))
                 self.counts.update(counts)
-                self.start = min(self.start, start)
 
     def describe(self, record: object) -> None:
         """Takes in a schema or a channel."""
@@ -110,10 +107,16 @@ class _Index:
 
 
 class McapFile:
-    """A file in the format MCAP; see `BagFile`.
+    """A file in the format MCAP.
 
     Args:
+        name: for messages to the user.
         budget: of opening the bag.
+
+    Attributes:
+        counts: number of messages of each channel.
+        start: log time of the first message, ns, or an earlier time; `NEVER`: there is none.
+        cut_off: whether its end is missing.
     """
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
@@ -126,7 +129,7 @@ class McapFile:
             self._index = index or _index_of_a_pass(file)
         index = self._index
         self.cut_off = isinstance(index.fault, EndOfFile)
-        self.start = index.start
+        self.start = min((x.message_start_time for x in index.chunks), default=NEVER)
         definitions = {
             key: each.data.decode('utf-8', 'replace') for key, each in index.schemas.items()
         }
@@ -142,7 +145,15 @@ class McapFile:
             self.counts[channel] += index.counts[key]
 
     def messages(self, topics: Collection[str], budget: Budget) -> Iterator[StoredMessage]:
-        """See `BagFile.messages`."""
+        """Messages of some topics by log time, then by place in the file; marks between them.
+
+        Args:
+            budget: of one pass over the bag.
+
+        Raises:
+            BagError: where the file is damaged, after the messages before the damage; where it
+                takes more than the budget.
+        """
         wanted = {key for key, channel in self._channels.items() if channel.topic in topics}
         with faults_told(self.name), self._path.open('rb') as opened:
             file = _File(opened, budget)
@@ -283,14 +294,12 @@ def _written_index(file: _File) -> _Index | None:
     if statistics is None or place > summary:
         return None
     index.counts.update(statistics.channel_message_counts)
-    index.start = statistics.message_start_time if statistics.message_count else NEVER
-    described = [index.channels.get(key) for key in index.counts]
-    schemas = {0, *index.schemas}
     whole = (
         sum(index.counts.values()) == statistics.message_count
         and len(index.chunks) == statistics.chunk_count
         and (index.chunks or not statistics.message_count)
-        and all(each is not None and each.schema_id in schemas for each in described)
+        and index.channels.keys() >= index.counts.keys()
+        and {0, *index.schemas} >= {index.channels[key].schema_id for key in index.counts}
     )
     return index if whole else None
 

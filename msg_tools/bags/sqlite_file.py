@@ -26,7 +26,7 @@ _MAX_TOPICS = 2**16  # as in an MCAP file
 
 
 class SqliteFile:
-    """A file of SQLite; see `BagFile`.
+    """A file of SQLite; see `McapFile`.
 
     Args:
         budget: of opening the bag.
@@ -67,7 +67,7 @@ class SqliteFile:
                     self.start = min(self.start, start)
 
     def messages(self, topics: Collection[str], budget: Budget) -> Iterator[StoredMessage]:
-        """See `BagFile.messages`."""
+        """See `McapFile.messages`."""
         wanted = [str(key) for key, channel in self._channels.items() if channel.topic in topics]
         query = (
             f'SELECT topic_id, timestamp, CASE WHEN length(data) <= {LARGEST} THEN data END '

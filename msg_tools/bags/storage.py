@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from msg_tools.bags.bag_metadata import BagError, reason
-from msg_tools.files.budget import Budget, BudgetError
+from msg_tools.files.budget import BudgetError
 
 # Bytes of a message or a chunk: the largest images that are read have 2**26 pixels, uncompressed.
 LARGEST = 2**28
@@ -22,7 +21,7 @@ class Channel(NamedTuple):
         topic: as written, with or without a leading slash.
         msgtype: as written; '' if the file does not contain it.
         encoding: 'cdr' for ROS 2.
-        definition_encoding: 'ros2msg', 'ros2idl', or '' when there is no definition.
+        definition_encoding: 'ros2msg' for the text of a .msg file; '' when there is no definition.
         definition: text of the message definition.
     """
 
@@ -39,33 +38,6 @@ class StoredMessage(NamedTuple):
     log_time: int
     channel: Channel | None
     data: bytes
-
-
-class BagFile(Protocol):
-    """A file of a bag.
-
-    Attributes:
-        name: for messages to the user.
-        counts: number of messages of each channel.
-        start: log time of the first message, ns; `NEVER`: there is none.
-        cut_off: whether its end is missing.
-    """
-
-    name: str
-    counts: Counter[Channel]
-    start: int
-    cut_off: bool
-
-    def messages(self, topics: Collection[str], budget: Budget) -> Iterator[StoredMessage]:
-        """Messages of some topics by log time, then by place in the file; marks between them.
-
-        Args:
-            budget: of one pass over the bag.
-
-        Raises:
-            BagError: where the file is damaged, after the messages before the damage; where it
-                takes more than the budget.
-        """
 
 
 @contextmanager

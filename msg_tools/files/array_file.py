@@ -89,8 +89,6 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, largest: int) -> N
         if read_head is None:
             raise ValueError(f'the array {name} has an unknown version')
         shape, _, dtype = read_head(file)
-        if dtype.hasobject:
-            raise ValueError(f'the array {name} holds Python objects')
         if dtype.kind not in _KINDS:
             raise ValueError(f'the array {name} holds {str(dtype)[:40]}, wanted numbers or texts')
         # Numbers of one byte become larger ones.

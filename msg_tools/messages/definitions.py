@@ -1,8 +1,8 @@
-"""Reads message definitions from outside, in the languages .msg and .idl of ROS 2.
+"""Reads message definitions from outside, in the language .msg of ROS 2.
 
-Only what CDR needs is read: names and types of fields. Constants, defaults, comments and
-annotations are passed over. The time is linear in the length of the text, and what is too large is
-refused before code is generated from it.
+Only what CDR needs is read: names and types of fields. Constants, defaults and comments are passed
+over. The time is linear in the length of the text, and what is too large is refused before code is
+generated from it.
 """
 
 from __future__ import annotations
@@ -24,22 +24,8 @@ Types = dict[str, list[tuple[str, Any]]]
 _NAME = r'[A-Za-z][A-Za-z0-9_]*'
 _TYPE_NAME = re.compile(rf'{_NAME}(/{_NAME})+')
 _MSG_FIELD = re.compile(
-    rf'((?:{_NAME}/){{0,2}}{_NAME})(?:<=([0-9]+))?(?:\[(<=)?([0-9]*)\])?[ \t]+'
+    rf'((?:{_NAME}/){{0,2}}{_NAME})(?:<=([0-9]{{1,18}}))?(?:\[(<=)?([0-9]{{0,18}})\])?[ \t]+'
     rf'({_NAME})[ \t]*(=?)'
-)
-# Stands before each of the IDL files that a bag strings together.
-_IDL_HEADER = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
-# Space, comments, preprocessor lines, strings and annotations are no tokens.
-_STRING = r'"(?:[^"\\]|\\.)*(?:"|\\?\Z)'
-_IDL_TOKEN = re.compile(
-    rf'\s+|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)|{_STRING}|@\w+\s*(?:\((?:[^()"]|{_STRING})*\))?|'
-    r'([\w:.]+|.)',
-    re.DOTALL | re.ASCII,
-)
-_IDL_FIELD = re.compile(
-    rf'(sequence < )?([\w:]+(?: [a-z]+)*?)(?: < (\w+) >)?(?:(?: , (\w+))? >)? ({_NAME})'
-    r'(?: \[ (\w+) \])?',
-    re.ASCII,
 )
 # The field that ROS 2 gives a message without fields.
 _NO_FIELDS = 'structure_needs_at_least_one_member', (Nodetype.BASE, ('uint8', 0))
@@ -48,37 +34,32 @@ _ALIASES = {
     'duration': 'builtin_interfaces/msg/Duration',
     'Header': 'std_msgs/msg/Header',
 }
-_IDL_NUMBERS = {
-    'boolean': 'bool',
-    'octet': 'byte',
-    'short': 'int16',
-    'long': 'int32',
-    'long long': 'int64',
-    'unsigned short': 'uint16',
-    'unsigned long': 'uint32',
-    'unsigned long long': 'uint64',
-    'float': 'float32',
-    'double': 'float64',
-}
 
 
-def types_of_definition(text: str, encoding: str, msgtype: str) -> Types:
+def types_of_definition(text: str, msgtype: str) -> Types:
     """Types of a definition, with those of the nested types that stand behind it.
 
     Args:
-        encoding: 'ros2msg' or 'ros2idl'; of others nothing is read.
-        msgtype: the type of a .msg definition, with its package.
+        msgtype: with its package.
 
     Raises:
         ValueError: the text is too long, or can not be understood; one line.
     """
     if len(text) > MAX_BYTES:
-        raise ValueError(f'more than {MAX_BYTES} characters')
+        raise ValueError(f'its definition has more than {MAX_BYTES} characters')
     types: Types = {}
-    if encoding == 'ros2idl':
-        types = _types_of_idl(_IDL_HEADER.sub('', text))
-    elif encoding == 'ros2msg':
-        types = _types_of_msg(text, msgtype)
+    fields = types[msgtype] = []
+    for number, line in enumerate(map(str.strip, text.split('\n')), 1):
+        if line.startswith('MSG: '):
+            msgtype = _full_name(line[5:].strip(), msgtype)
+            fields = types[msgtype] = []
+        elif line.strip('=') and line[0] not in '#@':
+            match = _MSG_FIELD.match(line)
+            if match is None:
+                raise ValueError(f'line {number} of its definition is no field')
+            kind, longest, bounded, count, name, constant = match.groups()
+            if not constant:
+                fields.append((name, _described(kind, msgtype, longest, bounded, count)))
     return {name: fields or [_NO_FIELDS] for name, fields in types.items()}
 
 
@@ -158,75 +139,6 @@ def extent_of(
     return Extent(1, 4, density, one.levels)
 
 
-def _types_of_msg(text: str, msgtype: str) -> Types:
-    types: Types = {}
-    fields = types[msgtype] = []
-    for number, line in enumerate(map(str.strip, text.split('\n')), 1):
-        if line.startswith('MSG: '):
-            msgtype = _full_name(line[5:].strip(), msgtype)
-            fields = types[msgtype] = []
-        elif line.strip('=') and line[0] not in '#@':
-            match = _MSG_FIELD.match(line)
-            if match is None:
-                raise ValueError(f'line {number} is no field')
-            kind, longest, most, count, name, constant = match.groups()
-            if not constant:
-                sequence = count is not None and (most or not count)
-                fields.append((name, _described(kind, msgtype, longest, count, bool(sequence))))
-    return types
-
-
-def _types_of_idl(text: str) -> Types:
-    """Modules, structures and names of types and constants, as the generators of ROS write them."""
-    types: Types = {}
-    named: dict[str, Any] = {}
-    lengths: dict[str, str] = {}
-    scope: list[str] = []
-    words: list[str] = []
-    for token in filter(None, _IDL_TOKEN.findall(text)):
-        if token not in '{};':
-            words.append(token)
-            continue
-        owner = '/'.join(scope)
-        if token == '{':
-            if len(words) != 2 or words[0] not in ('module', 'struct'):
-                raise ValueError(f'{" ".join(words)[:60]!r}')
-            scope.append(words[1])
-            if words[0] == 'struct':
-                types['/'.join(scope)] = []
-        elif len(words) > 3 and words[0] == 'const':
-            lengths[words[-3]] = words[-1]
-        elif words and words[0] == 'typedef':
-            name, kind = _idl_field(words[1:], f'{owner}/', named, lengths)
-            named[name] = kind
-        elif words and owner in types:
-            types[owner].append(_idl_field(words, owner, named, lengths))
-        elif words or (token == '}' and not scope):
-            raise ValueError(f'{" ".join(words)[:60]!r}')
-        if token == '}':
-            scope.pop()
-        words = []
-    if words or scope:
-        raise ValueError('its end is missing')
-    return types
-
-
-def _idl_field(
-    words: list[str], owner: str, named: Mapping[str, Any], lengths: Mapping[str, str]
-) -> tuple[str, Any]:
-    """Name and description of a field, or of a type that is given a name."""
-    match = _IDL_FIELD.fullmatch(' '.join(words[:12]))
-    if match is None or len(words) > 12:
-        raise ValueError(f'{" ".join(words)[:60]!r}')
-    sequence, kind, longest, most, name, count = match.groups()
-    if kind in named and not sequence and not count:
-        return name, named[kind]
-    kind = _IDL_NUMBERS.get(kind, kind.replace('::', '/').lstrip('/'))
-    count = most or '' if sequence else count
-    count, longest = (lengths.get(each, each) if each else each for each in (count, longest))
-    return name, _described(kind, owner, longest, count, bool(sequence))
-
-
 def _full_name(name: str, owner: str) -> str:
     """Name of a type in full, as `rosbags` has it, where it stands in a field of another type."""
     *package, last = _ALIASES.get(name, name).split('/')
@@ -237,13 +149,14 @@ def _full_name(name: str, owner: str) -> str:
 
 
 def _described(
-    kind: str, owner: str, longest: str | None, count: str | None, sequence: bool
+    kind: str, owner: str, longest: str | None, bounded: str | None, count: str | None
 ) -> Any:
     """Description of a field of a type.
 
     Args:
         longest: number of characters that a string may have.
-        count: length of an array, or longest one of a sequence; None: a single value.
+        bounded: whether the count is that of the longest sequence.
+        count: length of an array; empty: a sequence; None: a single value.
     """
     if kind == 'string' or kind in SIZEMAP:
         one: Any = Nodetype.BASE, (kind, int(longest or 0))
@@ -251,4 +164,5 @@ def _described(
         one = Nodetype.NAME, _full_name(kind, owner)
     if count is None:
         return one
+    sequence = bounded or not count
     return Nodetype.SEQUENCE if sequence else Nodetype.ARRAY, (one, int(count or 0))

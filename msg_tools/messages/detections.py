@@ -153,13 +153,9 @@ def people_of_boxes(message: Any) -> list[DetectedPerson]:
         size = np.array([detection.bbox.size_x, detection.bbox.size_y], dtype=np.float64)
         middle = np.array([centre.x, centre.y], dtype=np.float64)
         numbers = [*middle.tolist(), *size.tolist()]
-        if not (np.isfinite(numbers).all() and (size > 0).all()):
+        if not ((size > 0).all() and np.abs(numbers).max() <= FARTHEST_PIXEL):
             raise MessageError(
-                f'detection {detection.id!r} has the centre and size {numbers}, wanted a box of px'
-            )
-        if max(map(abs, numbers)) > FARTHEST_PIXEL:
-            raise MessageError(
-                f'detection {detection.id!r} has the centre and size {numbers}, wanted numbers '
+                f'detection {detection.id!r} has the centre and size {numbers}, wanted a box '
                 f'within {FARTHEST_PIXEL:g} px'
             )
         left, top = (middle - 0.5 * size).tolist()

@@ -16,7 +16,7 @@ from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import ReferenceHuman
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools.messages.detections import SKELETON_2D
-from msg_tools.messages.headers import header_message
+from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.message_error import Array
 from msg_tools.messages.message_types import MessageFactory
@@ -155,12 +155,8 @@ def cropped_message(messages: MessageFactory, image: Any, region: Array) -> Any:
     left, top = np.floor(region[:2]).astype(int)
     right, bottom = np.ceil(region[2:]).astype(int)
     picture = decode_image(image)[top:bottom, left:right]
-    stamp = image.header.stamp
-    message = image_message(messages, np.ascontiguousarray(picture), 0, str(image.header.frame_id))
-    message.header.stamp = messages.create(
-        'builtin_interfaces/msg/Time', sec=int(stamp.sec), nanosec=int(stamp.nanosec)
-    )
-    return message
+    stamp, frame_id = time_ns(image.header.stamp), str(image.header.frame_id)
+    return image_message(messages, np.ascontiguousarray(picture), stamp, frame_id)
 
 
 def human_joint_states(

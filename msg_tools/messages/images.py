@@ -118,7 +118,10 @@ def decode_image(message: Any) -> Picture:
     """
     if hasattr(message, 'encoding'):
         return _decode_raw(message)
-    return _decode_compressed(message)
+    form = str(message.format)
+    if 'compressedDepth' in form:
+        raise ImageError(f'compressed image has format {form!r}: depth, wanted a picture')
+    return decode_picture(_bytes_of(message.data).tobytes(), f'format {form!r}')
 
 
 def _decode_raw(message: Any) -> Picture:
@@ -201,13 +204,6 @@ def decode_mask(message: Any) -> Mask:
     return picture > 0
 
 
-def _decode_compressed(message: Any) -> Picture:
-    form = str(message.format)
-    if 'compressedDepth' in form:
-        raise ImageError(f'compressed image has format {form!r}: depth, wanted a picture')
-    return decode_picture(_bytes_of(message.data).tobytes(), f'format {form!r}')
-
-
 def decode_picture(
     content: bytes, form: str = 'unknown format', colours: int = cv2.IMREAD_COLOR
 ) -> Picture:
@@ -241,13 +237,25 @@ def decode_picture(
         raise ImageError(
             f'compressed image of {len(content)} bytes can not have a size of {width}x{height}'
         )
-    flags = colours | cv2.IMREAD_IGNORE_ORIENTATION
+    image = decoded(content, colours | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.shape[:2] != (height, width):
+        raise ImageError(f'compressed image of {len(content)} bytes and {form} is damaged')
+    return image
+
+
+def decoded(content: bytes, flags: int = cv2.IMREAD_COLOR) -> Picture:
+    """The picture that OpenCV finds in a file of any format.
+
+    Raises:
+        ImageError: another format, or a damaged file.
+    """
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     except cv2.error as error:
-        raise ImageError(f'compressed image can not be decoded: {error.err}') from error
-    if image is None or image.shape[:2] != (height, width):
-        raise ImageError(f'compressed image of {len(content)} bytes and {form} is damaged')
+        raise ImageError(f'the image can not be decoded: {error.err}') from error
+    if image is None:
+        raise ImageError('not an image that OpenCV can read, or it is damaged')
+    _check_size(image.shape[1], image.shape[0])
     return np.array(image, dtype=np.uint8, order='C')
 
 

@@ -69,7 +69,7 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
 
     Args:
         msgtype: for example 'sensor_msgs/msg/Image'.
-        encoding: 'ros2msg', 'ros2idl', or '' when there is no definition.
+        encoding: 'ros2msg'; for known types, another or '' leads to the known definition.
         definition: text of the definition, with those of the nested types.
 
     Returns:
@@ -78,18 +78,19 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
     Raises:
         ValueError: the type is not known and the definition can not be understood.
     """
-    if not msgtype:
-        raise ValueError('the bag does not name the type')
     known = typestore()
+    ours = msgtype in known.fielddefs
     types: Types = {}
-    if definition.strip() or msgtype not in known.fielddefs:
+    if encoding == 'ros2msg' and (definition.strip() or not ours):
         try:
-            types = types_of_definition(definition, encoding, msgtype)
-        except ValueError as error:
-            if msgtype not in known.fielddefs:
-                raise ValueError(f'its {encoding} definition can not be parsed: {error}') from error
-    if msgtype not in types and msgtype not in known.fielddefs:
-        raise ValueError('the type is not known, and the bag does not define it')
+            types = types_of_definition(definition, msgtype)
+        except ValueError:
+            if not ours:
+                raise
+    if not types and not ours:
+        raise ValueError(
+            f"the type is not known, and its definition is {encoding[:20]!r}, wanted 'ros2msg'"
+        )
     changed: Any = {
         name: ([], types[name]) for name in types if not _same_fields(name, types, known)
     }
@@ -105,7 +106,7 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
         own.register(changed)
     except Exception as error:
         # The generator of code does not say what it may raise.
-        raise ValueError(f'its {encoding} definition can not be used') from error
+        raise ValueError('its definition can not be used') from error
     return own
 
 
@@ -114,10 +115,9 @@ def _same_fields(name: str, types: Types, known: Typestore) -> bool:
 
     Names are compared without case: the first ROS 2 releases wrote D, K, R, P in CameraInfo.
     """
-    if name not in known.fielddefs:
-        return False
+    ours: Any = known.fielddefs.get(name, ((), ()))[1]
     return [(field.lower(), kind) for field, kind in types[name]] == [
-        (field.lower(), kind) for field, kind in known.fielddefs[name][1]
+        (field.lower(), kind) for field, kind in ours
     ]
 
 
@@ -146,12 +146,6 @@ class RosbagsMessages:
         Raises:
             TypeError: a field that the type does not have.
         """
-        plain = _plain_class(msgtype)
-        if plain is not None and len(fields) == plain[1]:
-            try:
-                return plain[0](**fields)
-            except TypeError:
-                pass  # a wrong name: the error is raised below
         defaults = _defaults(msgtype)
         unknown = fields.keys() - defaults.keys()
         if unknown:
@@ -265,15 +259,6 @@ def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
     if msgtype == 'geometry_msgs/msg/Quaternion':
         result['w'] = (lambda: 1.0), None
     return result
-
-
-@cache
-def _plain_class(msgtype: str) -> tuple[type, int] | None:
-    """Class and number of fields of a type without arrays of numbers, such as a point."""
-    defaults = _defaults(msgtype)
-    if any(dtype is not None for _, dtype in defaults.values()):
-        return None
-    return typestore().types[msgtype], len(defaults)
 
 
 def _list_default(element: Callable[[], Any], count: int) -> Callable[[], list[Any]]:

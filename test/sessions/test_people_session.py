@@ -268,7 +268,7 @@ def test_boxes_start_tracks(session, monkeypatch, small_camera):
     detections[0].bbox.size_x = 0.0
     header = header_message(small_camera.messages, small_camera.stamp(1), 'lens')
     (fault,) = one.take(DETECTIONS, SimpleNamespace(header=header, detections=detections)).faults
-    assert 'wanted a box of px' in fault
+    assert 'wanted a box within 1e+06 px' in fault
 
 
 def test_an_empty_scene_is_learned_until_somebody_comes(session, small_camera):

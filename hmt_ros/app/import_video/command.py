@@ -10,7 +10,7 @@ import argparse
 import math
 from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -78,40 +78,6 @@ examples:
 
 exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 """
-
-
-@dataclass(frozen=True)
-class ImportOptions:
-    """Arguments of the command, see its help."""
-
-    source: Path
-    output: Path
-    overwrite: bool = False
-    quiet: bool = False
-    fps: float | None = None
-    start: float = 0.0
-    end: float = math.inf
-    every: int = 1
-    first_stamp: int = START_NS
-    first_number: int = 0
-    jpeg_quality: int = 90
-    fov: float | None = None
-    vertical_fov: float | None = None
-    camera: Path | None = None
-    keypoints: Path | None = None
-    detector: str | None = None
-    person: Choice = Choice()  # noqa: RUF009 - frozen
-    scheme: str = AUTO
-    keypoints_size: tuple[int, int] | None = None
-    mirror: bool = False
-    masks: Path | None = None
-    detector_masks: bool = False
-
-    @classmethod
-    def of(cls, arguments: argparse.Namespace, output: Path) -> ImportOptions:
-        """The options in the arguments of a command, with a folder for the bag."""
-        names = [x.name for x in fields(cls) if x.name != 'output']
-        return cls(output=output, **{name: getattr(arguments, name) for name in names})
 
 
 @dataclass
@@ -278,14 +244,17 @@ def person_choice(text: str) -> Choice:
 
 def _import(arguments: argparse.Namespace) -> int:
     tell = partial(tell_user, 'import-video')
-    imported = import_video(ImportOptions.of(arguments, arguments.output), tell)
+    imported = import_video(arguments, tell)
     if not arguments.quiet:
         say(f'{arguments.output}: {imported}')
     return 0
 
 
-def import_video(options: ImportOptions, tell: Tell) -> Imported:
+def import_video(options: argparse.Namespace, tell: Tell) -> Imported:
     """Writes a video into a new bag, completely or not at all.
+
+    Args:
+        options: arguments of the command.
 
     Raises:
         ValueError: bad input.
@@ -341,7 +310,7 @@ Seer = Callable[[Frame, int], tuple[Keypoints | None, Mask | None]]
 
 
 def _seer(
-    options: ImportOptions,
+    options: argparse.Namespace,
     source: FrameSource,
     found: FoundPersons | None,
     masks: Masks | None,
@@ -416,7 +385,7 @@ def _same_size(
 
 
 def camera_of(
-    options: ImportOptions | argparse.Namespace,
+    options: argparse.Namespace,
     size: tuple[int, int],
     tell: Tell,
     aspect: float = 1.0,
@@ -429,7 +398,7 @@ def camera_of(
 
 def _write(
     bag: BagWriter,
-    options: ImportOptions,
+    options: argparse.Namespace,
     frames: Iterable[Frame],
     see: Seer,
     lifts: bool,
@@ -470,7 +439,7 @@ def _write(
 
 
 def _check_ends(
-    options: ImportOptions,
+    options: argparse.Namespace,
     source: FrameSource,
     found: FoundPersons | None,
     masks: Masks | None,
@@ -506,7 +475,7 @@ def _check_ends(
 
 
 def _check_keypoints(
-    options: ImportOptions, result: Imported, found: FoundPersons, tell: Tell
+    options: argparse.Namespace, result: Imported, found: FoundPersons, tell: Tell
 ) -> None:
     """Raises ValueError where keypoints are not those of the images."""
     if not result.with_keypoints and any(found.persons()):

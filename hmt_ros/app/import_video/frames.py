@@ -23,7 +23,7 @@ from msg_tools.files.display_matrix import (
 )
 from msg_tools.files.video_file import check_size, open_video
 from msg_tools.messages.headers import SECOND_NS
-from msg_tools.messages.images import MAX_PIXELS, ImageError, decode_picture
+from msg_tools.messages.images import decode_picture, decoded
 
 IMAGE_SUFFIXES = ('.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.webp', '.ppm', '.pgm')
 LARGEST_IMAGE_FILE = 2**28  # bytes
@@ -287,23 +287,11 @@ def _upright(content: bytes) -> tuple[Image, bytes | None]:
         as_stored = decode_picture(content, 'jpeg')
         if b'Exif\0' not in content[:_EXIF_WITHIN]:
             return as_stored, content
-        image = _decoded(content)
+        image = decoded(content)
         same = image.shape == as_stored.shape and np.array_equal(image, as_stored)
         return image, content if same else None
     png = content.startswith(b'\x89PNG')
-    return decode_picture(content) if png else _decoded(content), None
-
-
-def _decoded(content: bytes) -> Image:
-    try:
-        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error as error:
-        raise ImageError(f'the image can not be decoded: {error.err}') from error
-    if image is None:
-        raise ImageError('not an image that OpenCV can read')
-    if image.shape[0] * image.shape[1] > MAX_PIXELS:
-        raise ImageError(f'the image has more than {MAX_PIXELS} pixels')
-    return np.asarray(image, dtype=np.uint8)
+    return decode_picture(content) if png else decoded(content), None
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
-from msg_tools.files.mp4_boxes import Data, boxes, mapped
+from msg_tools.files.mp4_boxes import Data, boxes, boxes_at, mapped
 
 KEY = b'com.apple.quicktime.camera.focal_length.35mm_equivalent'
 # Width of a picture on 35 mm film, mm; focal lengths that lenses have, in its terms, mm.
@@ -27,28 +28,27 @@ def told_fov(path: Path) -> float | None:
     """The field of view, degrees, along the longer side of the images; None: it is not told."""
     with mapped(path) as data:
         try:
-            focal = next(_focal_lengths(data, 0, len(data)), math.nan)
-        except (ValueError, struct.error, RecursionError):
+            focal = next(_focal_lengths(data), math.nan)
+        except (ValueError, struct.error):
             return None
     low, high = FOCAL_LENGTHS
     return math.degrees(2.0 * math.atan(0.5 * FILM / focal)) if low <= focal <= high else None
 
 
-def _focal_lengths(data: Data, start: int, end: int) -> Iterator[float]:
-    """Values of the key in the boxes of a part of a file."""
-    for kind, first, last in boxes(data, start, end):
-        if kind in (b'moov', b'trak'):
-            yield from _focal_lengths(data, first, last)
-        elif kind == b'meta':
-            # In MP4 files a version stands before the boxes.
-            first += 0 if data[first + 4 : first + 8] == b'hdlr' else 4
-            inner = {name: (a, b) for name, a, b in boxes(data, first, last)}
-            first, last = inner.get(b'keys', (0, 0))
-            names = [data[a:b] for _, a, b in boxes(data, first + 8, last)]
-            for number, a, b in boxes(data, *inner.get(b'ilst', (0, 0))):
-                at = int.from_bytes(number, 'big')
-                if names[at - 1 : at] == [KEY]:
-                    yield from (_number(data[c:d]) for _, c, d in boxes(data, a, b))
+def _focal_lengths(data: Data) -> Iterator[float]:
+    """Values of the key in a file."""
+    whole = 0, len(data)
+    of_track = boxes_at(data, *whole, b'moov', b'trak', b'meta')
+    for first, last in chain(boxes_at(data, *whole, b'moov', b'meta'), of_track):
+        # In MP4 files a version stands before the boxes.
+        first += 0 if data[first + 4 : first + 8] == b'hdlr' else 4
+        inner = {name: (a, b) for name, a, b in boxes(data, first, last)}
+        first, last = inner.get(b'keys', (0, 0))
+        names = [data[a:b] for _, a, b in boxes(data, first + 8, last)]
+        for number, a, b in boxes(data, *inner.get(b'ilst', (0, 0))):
+            at = int.from_bytes(number, 'big')
+            if names[at - 1 : at] == [KEY]:
+                yield from (_number(data[c:d]) for _, c, d in boxes(data, a, b))
 
 
 def _number(value: bytes) -> float:

@@ -273,18 +273,12 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
     beside = _named(bag, f'{namespace}/camera_info'.lstrip('/'), kinds)
     if beside is not None:
         return beside
-    if not _with_messages(bag, kinds):
+    if not bag.topics_of(*kinds):
         raise BagError(
             f'{bag.path} has images on {image.name}, but no camera_info: without the calibration '
             'of the camera images do not determine positions in space'
         )
     return _the_only(bag, kinds, '--camera-info-topic')
-
-
-def _with_messages(bag: BagReader, kinds: tuple[str, ...]) -> list[Topic]:
-    return [
-        topic for topic in bag.topics.values() if topic.msgtype in kinds and topic.message_count
-    ]
 
 
 def _in_namespace(
@@ -297,7 +291,7 @@ def _in_namespace(
 
 def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
     """The topic with a name and with messages of one of the types."""
-    found = (topic for topic in _with_messages(bag, kinds) if topic.name.lstrip('/') == name)
+    found = (topic for topic in bag.topics_of(*kinds) if topic.name.lstrip('/') == name)
     return next(found, None)
 
 
@@ -305,10 +299,9 @@ def _the_only(
     bag: BagReader, kinds: tuple[str, ...], option: str, besides: tuple[str, ...] = ()
 ) -> Topic:
     """The only topic of some types, except those of some names and the drawings of the tracker."""
-    every = _with_messages(bag, kinds)
     found = [
         topic
-        for topic in every
+        for topic in bag.topics_of(*kinds)
         if topic.name.lstrip('/') not in besides and not topic.name.endswith(OVERLAY)
     ]
     if len(found) == 1:

@@ -11,7 +11,7 @@ from pathlib import Path
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.evaluate import chosen_topics, score_bag
 from hmt_ros.app.progress import Progress, say, show_progress
-from hmt_ros.app.recorded_bodies import body_topics, read_grounds
+from hmt_ros.app.recorded_bodies import BODY, read_grounds
 from hmt_ros.app.report.detector import read_detector
 from hmt_ros.app.report.images import FilmStrip, ImageSource, film_strip, image_source
 from hmt_ros.app.report.mixtures import RecordedMixtures, read_mixtures
@@ -141,7 +141,8 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
     truth = read_truth(options.truth) if options.truth else recorded_truth(options.bag)
     with BagReader(options.bag) as bag:
         topics = chosen_topics(bag, options.topics)
-        total = bag.message_count({*topics, *body_topics(bag)}) * (1 if truth is None else 2)
+        counted = {*topics, *(x.name for x in bag.topics_of(BODY))}
+        total = bag.message_count(counted) * (1 if truth is None else 2)
         first = next(bag.messages(topics[:1]), None)
     frame = '' if first is None else first.message.header.frame_id
     grounds = read_grounds(options.bag, topics[0], frame)

@@ -84,18 +84,10 @@ def image_source(
     path = out if images is None else images
     with BagReader(path) as bag:
         if images is None and image_topic is None:
-            found = [
-                topic.name
-                for topic in bag.topics.values()
-                if topic.msgtype in (IMAGE_TYPE, COMPRESSED_TYPE) and topic.message_count
-            ]
+            found = [topic.name for topic in bag.topics_of(IMAGE_TYPE, COMPRESSED_TYPE)]
             drawn = [name for name in found if name.endswith(OVERLAY)]
             recorded = [name for name in found if name not in drawn]
-            calibrated = any(
-                topic.msgtype == CAMERA_INFO_TYPE and topic.message_count
-                for topic in bag.topics.values()
-            )
-            if not recorded or not calibrated:
+            if not recorded or not bag.topics_of(CAMERA_INFO_TYPE):
                 return ImageSource(path, drawn[0], None) if drawn else None
             if len(recorded) == 1:
                 image_topic = recorded[0]

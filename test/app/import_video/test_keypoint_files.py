@@ -256,10 +256,6 @@ LAYOUTS = {
             {'frame_id': i + 1, 'instances': [instance(i, bbox_score=0.8)]} for i in range(3)
         ],
     },
-    'mmpose test': [
-        {'preds': [rows(number=i)], 'boxes': [[1, 2, 3, 4, 5, 0.8]], 'image_paths': [f'a/{i}.jpg']}
-        for i in range(3)
-    ],
     'mmpose before 1': {
         str(i): [{'bbox': [1, 2, 3, 4, 0.8], 'keypoints': rows(number=i)}] for i in range(3)
     },

@@ -119,7 +119,7 @@ IMAGE, INFO = ('image', image(0)), ('camera_info', info(0))
         ),
         pytest.param(
             [INFO, ('keypoints', keypoints(0, [np.nan, 1.0])), IMAGE],
-            'keypoint head lies at (nan, 1.0), wanted numbers, or NaN',
+            'keypoint head lies at (nan, 1.0), wanted numbers within',
             id='nan in keypoints',
         ),
         pytest.param(
@@ -194,7 +194,7 @@ def test_folders_and_files_that_are_no_bags(tmp_path, capsys):
     (tmp_path / 'folder').mkdir()
     assert 'has no metadata.yaml' in fails(tmp_path / 'folder', tmp_path, capsys)
     (tmp_path / 'folder' / 'metadata.yaml').write_text('a: [')
-    assert 'is not YAML' in fails(tmp_path / 'folder', tmp_path, capsys)
+    assert 'not YAML' in fails(tmp_path / 'folder', tmp_path, capsys)
 
 
 @pytest.mark.skipif(

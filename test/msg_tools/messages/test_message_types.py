@@ -59,39 +59,14 @@ def test_only_what_differs_is_taken_from_a_definition():
     assert store.fielddefs['hmt_msgs/msg/Body'] == typestore().fielddefs['hmt_msgs/msg/Body']
 
 
-def test_definition_in_idl():
-    definition = """================================================================================
-IDL: my_msgs/msg/X
-module my_msgs {
-  module msg {
-    struct X {
-      my_msgs::msg::Y value;
-    };
-  };
-};
-================================================================================
-IDL: my_msgs/msg/Y
-module my_msgs {
-  module msg {
-    struct Y {
-      double number;
-    };
-  };
-};
-"""
-    store = typestore_of_definition('my_msgs/msg/X', 'ros2idl', definition)
-    assert [name for name, _ in store.fielddefs['my_msgs/msg/X'][1]] == ['value']
-    assert [name for name, _ in store.fielddefs['my_msgs/msg/Y'][1]] == ['number']
-
-
 @pytest.mark.parametrize(
     ('msgtype', 'encoding', 'definition', 'error'),
     [
-        ('', 'ros2msg', 'int32 x', 'does not name the type'),
-        ('my_msgs/msg/X', '', '', 'the bag does not define it'),
-        ('my_msgs/msg/X', 'ros2msg', '?', 'can not be parsed'),
-        ('my_msgs/msg/X', 'ros2idl', 'struct', 'can not be parsed'),
-        ('my_msgs/msg/X', 'protobuf', '\x01\x02', 'the bag does not define it'),
+        ('', 'ros2msg', 'int32 x', "its definition has a type named ''"),
+        ('my_msgs/msg/X', '', '', "its definition is '', wanted 'ros2msg'"),
+        ('my_msgs/msg/X', 'ros2msg', '?', 'line 1 of its definition is no field'),
+        ('my_msgs/msg/X', 'ros2idl', 'struct', "its definition is 'ros2idl', wanted 'ros2msg'"),
+        ('my_msgs/msg/X', 'protobuf', '\x01\x02', "its definition is 'protobuf'"),
     ],
 )
 def test_types_that_can_not_be_known(msgtype, encoding, definition, error):

@@ -6,7 +6,6 @@ Their layouts differ in how frames hold persons, and in the names of what a pers
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -117,8 +116,6 @@ def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
             own = _get(entry, _FRAME, label)
             if isinstance(entry, list):
                 yield i, entry
-            elif isinstance(_get(entry, ('preds',)), list):
-                yield from _predictions(entry)
             elif isinstance(_get(entry, _PERSONS), list):
                 yield i if own is None else own, _get(entry, _PERSONS)
             else:
@@ -144,17 +141,6 @@ def _frames_of_object(content: dict[str, Any], label: Any) -> Iterator[Labelled]
                 for frame, entry in value.items():
                     if _get(entry, _POINTS) is not None:
                         yield frame, [{'track_id': name, **entry}]
-
-
-def _predictions(entry: dict[str, Any]) -> Iterator[Labelled]:
-    """Frames of a batch as the test of MMPose wrote them before version 1."""
-    paths, boxes = entry.get('image_paths'), entry.get('boxes')
-    if not isinstance(paths, list) or len(paths) != len(entry['preds']):
-        raise ValueError('preds and image_paths of MMPose do not fit each other')
-    for i, (path, points) in enumerate(zip(paths, entry['preds'], strict=True)):
-        box = boxes[i] if isinstance(boxes, list) and i < len(boxes) else None
-        score = box[-1] if isinstance(box, list) and box else None
-        yield Path(str(path)).name, [{'keypoints': points, 'score': score}]
 
 
 def person_in(

@@ -24,7 +24,6 @@ from msg_tools.files.error_line import error_line
 from msg_tools.files.plain_json import read_plain_json
 
 _FARTHEST = 1e5  # px; no image is so large
-_LONGEST = 240  # characters of an error
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,7 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
                 twice = next(x for x, other in pairwise(sorted(names)) if x == other)
                 raise ValueError(f'two keypoints are called {twice}')
     except (ValueError, RecursionError) as error:
-        text = ''.join(x if x.isprintable() else '?' for x in error_line(error))
-        raise ValueError(f'{path}: {text[:_LONGEST]}') from error
+        raise ValueError(f'{path}: {error_line(error)}') from error
     return found
 
 
