@@ -119,7 +119,8 @@ def check_weights(weights: Array, what: str) -> None:
     if not np.isfinite(weights).all() or (weights < 0).any():
         worst = weights[~(weights >= 0) | ~np.isfinite(weights)][0]
         raise MessageError(f'{what} has the weight {worst}, wanted numbers from 0 to 1', 'weights')
-    total = float(weights.sum())
+    with np.errstate(over='ignore'):
+        total = float(weights.sum())
     if abs(total - 1.0) > WEIGHT_TOLERANCE:
         raise MessageError(f'{what} has weights that sum to {total:.9g}, wanted 1', 'weights')
 

@@ -62,6 +62,7 @@ def test_without_covariances(messages):
     ('changes', 'error'),
     [
         ({'weights': np.array([0.4, 0.4])}, r'weights that sum to 0.8, wanted 1'),
+        ({'weights': np.array([1e308, 1e308])}, r'weights that sum to inf, wanted 1'),
         ({'means': np.zeros((2, 4, 3))}, r'means has shape \(2, 4, 3\), wanted \(2, 5, 3\)'),
         ({'stamps_ns': (1, 2, 2, 3, 4)}, r'stamps do not increase'),
         ({'stamps_ns': ()}, r'2 components of 0 poses, wanted one at least'),
