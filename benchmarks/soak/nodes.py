@@ -16,7 +16,7 @@ from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.mutations import damaged
 from benchmarks.soak.hostile import write_video
 from benchmarks.soak.hostile_operator import ANSWER, files_in_parameters, floods, stray_stamps
-from benchmarks.soak.outcome import Amount, Outcome
+from benchmarks.soak.outcome import Amount, Outcome, place
 from benchmarks.soak.scenes import STEP_NS, scenes, stamped
 from benchmarks.soak.watched_node import PATIENCE, SHORT, Silent, Watched
 from hmt_ros.app.replay.live_node import NodeProcess
@@ -387,25 +387,32 @@ def alone(name: str, amount: Amount) -> Outcome:
 def nodes(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
     """Every case with every node; a node goes from case to case while it lives."""
     chosen = [scenes()['smoother_node']] if quick else [*scenes().values()]
-    seconds = amount.seconds / (len(chosen) * len(CASES) + len(_ALONE))
+    by_themselves = () if quick else _ALONE
+    end = time.monotonic() + amount.seconds
+    left = len(chosen) * len(CASES) + len(by_themselves)
     for scene in chosen:
         with ExitStack() as running:
             watched: Watched | None = None
             for done, case, share in CASES:
                 outcome = Outcome(scene.title, done)
-                part = Amount(max(1, round(amount.times * share)), seconds)
                 try:
                     if watched is None:
                         watched = running.enter_context(Watched(scene))
                         watched.warm_up()
+                    # What one case takes too much, and each start, is taken from all that follow.
+                    seconds = max(end - time.monotonic(), 0.0) / left
+                    part = Amount(max(1, round(amount.times * share)), seconds)
                     _do(case, watched, part, outcome)
-                except (LiveNodeError, Silent, TimeoutError) as error:
-                    outcome.fault(error_line(error))
+                except Exception as error:  # noqa: BLE001 - told, and other cases follow
+                    known = isinstance(error, LiveNodeError | Silent | TimeoutError)
+                    outcome.fault(error_line(error) if known else place(error))
                     running.close()
                     watched = None
+                left -= 1
                 yield outcome
-    for name in () if quick else _ALONE:
-        yield alone(name, Amount(amount.times, seconds))
+    for name in by_themselves:
+        yield alone(name, Amount(amount.times, max(end - time.monotonic(), 0.0) / left))
+        left -= 1
 
 
 def _do(case: Case, watched: Watched, part: Amount, outcome: Outcome) -> None:
@@ -413,6 +420,7 @@ def _do(case: Case, watched: Watched, part: Amount, outcome: Outcome) -> None:
     process, said = watched.node.process.pid, len(watched.traces())
     forget_peak(process)
     before = resident_memory(process)
+    watched.limit(part.seconds)
     case(watched, part, outcome)
     watched.check_alive()
     if watched.node.process.pid == process:
