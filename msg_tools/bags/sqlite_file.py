@@ -92,12 +92,15 @@ def _connected(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _is_table(database: sqlite3.Connection, name: str) -> bool:
-    """Whether a name is that of a table, all columns of which are stored."""
-    kinds = database.execute(
-        "SELECT type FROM pragma_table_list(?) WHERE schema = 'main'", (name,)
-    ).fetchall()
+    """Whether a name is that of a table, all columns of which are stored.
+
+    What SQLite itself tells of tables and views it gets by expanding views, which may not end.
+    """
+    query = "SELECT 1 FROM sqlite_schema WHERE name = ? AND sql LIKE 'CREATE TABLE%'"
+    if database.execute(query, (name,)).fetchone() is None:
+        return False
     computed = database.execute('SELECT 1 FROM pragma_table_xinfo(?) WHERE hidden', (name,))
-    return kinds == [('table',)] and computed.fetchone() is None
+    return computed.fetchone() is None
 
 
 def _rows(
