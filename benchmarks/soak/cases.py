@@ -24,8 +24,8 @@ MINUTES = 10.0
 # Each case: what does it, how often in full and with --quick, and its share of the time.
 CASES: dict[str, tuple[Callable[..., Iterator[Outcome]], int, int, float]] = {
     'hostile': (hostile, 100_000, 1, 0.3),
-    'messages': (messages, 100_000, 30, 0.25),
-    'nodes': (nodes, 200, 2, 0.35),
+    'messages': (messages, 100_000, 30, 0.15),
+    'nodes': (nodes, 200, 2, 0.45),
     'files': (files, 3000, 10, 0.10),
 }
 
