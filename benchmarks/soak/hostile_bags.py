@@ -36,9 +36,7 @@ _DEFINITIONS = {
     'itself': 'A x\nA[] y\nA[3] z',
     'each_other': _types('B x', {'B': 'A y'}),
     'fields': '\n'.join(f'uint8 x{i}' for i in range(100_000)),
-    'constants': '\n'.join(f'int64 X{i}={i}' for i in range(100_000)),
     'types': _types('uint8 x', {f'B{i}': 'uint8 x' for i in range(30_000)}),
-    'long_name': f'uint8 {"x" * 100_000}',
     'python_names': 'uint8 __class__\nuint8 self\nuint8 lambda\nuint8 __dict__\nuint8 None',
     'code': 'uint8 x #\n__import__("os").system("touch ../kept/pwned")\nuint8 y',
     'code_default': "string x \"\\\"); __import__('os').system('touch ../kept/pwned') #\"",
@@ -338,19 +336,13 @@ _DOUBLED = 'CREATE VIEW v{1} AS SELECT * FROM v{0} UNION ALL SELECT * FROM v{0}'
 # In the place of the messages, or of their topics, something that a reader need only select.
 _MESSAGES_AS = {
     'endless': _COUNT.format('') + _ROW,
-    'view_1e7': _COUNT.format(' LIMIT 10000000') + _ROW,
     'joins': "SELECT a.x AS id, 1 AS topic_id, a.x AS timestamp, x'00' AS data "
     'FROM n a, n b, n c, n d WHERE a.x + b.x + c.x + d.x < 0',
     'blobs': 'SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, zeroblob(999999999) AS data',
-    'concatenated': 'SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, '
-    "replace(hex(zeroblob(100000000)), '0', '0000') AS data",
     'nested_views': 'SELECT * FROM v39',
     'itself': 'SELECT * FROM messages',
 }
-_TOPICS_AS = {
-    'topics_endless': _COUNT.format('') + _TOPIC_ROW,
-    'topics_1e6': _COUNT.format(' LIMIT 1000000') + _TOPIC_ROW,
-}
+_ENDLESS_TOPICS = f'CREATE VIEW topics AS {_COUNT.format("")} {_TOPIC_ROW}'
 _BEFORE = {
     'joins': ('CREATE TABLE n(x)', f'INSERT INTO n {_COUNT.format(" LIMIT 3000")} x FROM c'),
     'nested_views': (
@@ -386,16 +378,6 @@ _STATEMENTS: dict[str, Sequence[str]] = {
         "'string[1000000000] x', '')",
         'INSERT INTO messages VALUES(1, 1, 1, zeroblob(64)), (2, 2, 2, zeroblob(64))',
     ),
-    'metadata': (
-        'CREATE TABLE metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER, metadata TEXT)',
-        f"INSERT INTO metadata VALUES(1, 9, '{ALIASES}')",
-    ),
-    'triggers': (
-        'CREATE TABLE x(a CHECK (a < 1))',
-        'CREATE TRIGGER t AFTER INSERT ON x BEGIN INSERT INTO x VALUES(NEW.a - 1); END',
-        "CREATE INDEX i ON messages(replace(hex(data), '0', '0000'))",
-    ),
-    'tables': tuple(f'CREATE TABLE t{i}(x)' for i in range(2000)),
     'columns': (
         'DROP TABLE messages',
         f'CREATE TABLE messages({", ".join(f"c{i}" for i in range(2000))})',
@@ -409,8 +391,7 @@ def databases() -> Iterator[Hostile]:
         name: (*_TOPICS, *_BEFORE.get(name, ()), f'CREATE VIEW messages AS {text}')
         for name, text in _MESSAGES_AS.items()
     }
-    for name, text in _TOPICS_AS.items():
-        found[name] = (_MESSAGES, f'CREATE VIEW topics AS {text}')
+    found['topics_endless'] = (_MESSAGES, _ENDLESS_TOPICS)
     for name, more in _STATEMENTS.items():
         found[name] = (*_TOPICS, _MESSAGES, *more)
     for name, qos in YAML_BOMBS.items():
