@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -110,7 +111,8 @@ def files_in_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> N
     usual_values = dict(zip(names, watched.get(names), strict=True))
     # The working folder and the home are where a node may read by default.
     with TemporaryDirectory(prefix='.hmt_ros.', dir=Path.home()) as folder:
-        given = [(name, value) for value in _odd_values(Path(folder)) for name in names]
+        values = list(islice(_odd_values(Path(folder)), amount.times))
+        given = [(name, value) for value in values for name in names]
         fed = _Fed(watched)
         usual = fed.usual_gap(_while(amount))
         for number in Amount(min(len(given), amount.times), amount.seconds).counted():
