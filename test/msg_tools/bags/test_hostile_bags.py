@@ -301,12 +301,20 @@ def database(path, *statements):
     return path
 
 
+DOUBLED_VIEWS = [
+    f'CREATE VIEW v{i} AS SELECT * FROM v{i - 1} UNION ALL SELECT * FROM v{i - 1}'
+    for i in range(1, 40)
+]
+
+
 @pytest.mark.parametrize(
     ('statements', 'error'),
     [
         ([TOPICS, f'CREATE VIEW messages AS {NUMBERS.format(-1)} SELECT i FROM n'], 'no tables'),
         ([MESSAGES, f'CREATE VIEW topics AS {NUMBERS.format(-1)} SELECT i FROM n'], 'no tables'),
         ([TOPICS, 'CREATE VIRTUAL TABLE messages USING fts4(topic_id, timestamp)'], 'no tables'),
+        # SQLite itself would expand 2**40 views to tell of them.
+        ([TOPICS, 'CREATE VIEW v0 AS SELECT 1 AS x', *DOUBLED_VIEWS], 'no tables'),
         (
             [
                 TOPICS,
