@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,16 @@ from benchmarks.soak.files import files
 from benchmarks.soak.hostile import hostile
 from benchmarks.soak.messages import messages
 from benchmarks.soak.nodes import nodes
-from benchmarks.soak.outcome import MOST_GROWTH, Amount, Outcome
+from benchmarks.soak.outcome import Amount, Outcome, place
 
 MINUTES = 10.0
 
 # Each case: what does it, how often in full and with --quick, and its share of the time.
 CASES: dict[str, tuple[Callable[..., Iterator[Outcome]], int, int, float]] = {
     'hostile': (hostile, 100_000, 1, 0.3),
-    'messages': (messages, 100_000, 60, 0.25),
-    'nodes': (nodes, 200, 2, 0.35),
-    'files': (files, 3000, 30, 0.10),
+    'messages': (messages, 100_000, 30, 0.15),
+    'nodes': (nodes, 200, 2, 0.45),
+    'files': (files, 3000, 10, 0.10),
 }
 
 
@@ -59,9 +60,10 @@ def measure(
         amount = Amount(seldom if quick else often, 60.0 * minutes * share / shares)
         found = []
         options = {'given': given} if name == 'hostile' else {}
-        for outcome in case(amount, quick=quick, **options):
-            found.append(_entry(outcome))
-            tqdm.write(f'  {outcome.of}: {outcome.done}: {outcome.told()}', file=sys.stderr)
+        for outcome in _to_its_end(name, case(amount, quick=quick, **options)):
+            told = outcome.told()
+            found.append({**asdict(outcome), 'told': told, 'met': outcome.met})
+            tqdm.write(f'  {outcome.of}: {outcome.done}: {told}', file=sys.stderr)
         return found
 
     stages = {name: functools.partial(done, name) for name in CASES}
@@ -78,28 +80,16 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     rows = [['of', 'what was done', 'times', 'refused', 'lost', 'memory', 'stays', '']]
     for name in CASES:
         for entry in result.get(name, []):
-            growth = entry['growth_mb']
-            rows.append(
-                [
-                    entry['of'], entry['done'], str(entry['times']), str(entry['refused']),
-                    str(entry['lost']), '' if growth is None else f'{growth:+.0f} MB',
-                    '' if growth is None else f'{entry["kept_mb"]:+.0f} MB', entry['told'],
-                ]
-            )  # fmt: skip
+            memory = [entry['growth_mb'], entry['kept_mb']]
+            said = ['' if entry['growth_mb'] is None else f'{x:+.0f} MB' for x in memory]
+            counts = [str(entry[name]) for name in ('of', 'done', 'times', 'refused', 'lost')]
+            rows.append([*counts, *said, entry['told']])
     return table(rows, left=2, markdown=markdown)
 
 
-def _entry(outcome: Outcome) -> dict[str, Any]:
-    return {
-        'of': outcome.of,
-        'done': outcome.done,
-        'times': outcome.times,
-        'refused': outcome.refused,
-        'lost': outcome.lost,
-        'growth_mb': outcome.growth_mb,
-        'kept_mb': outcome.kept_mb,
-        'most_growth_mb': MOST_GROWTH,
-        'faults': outcome.faults,
-        'told': outcome.told(),
-        'met': outcome.met,
-    }
+def _to_its_end(name: str, outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
+    """The outcomes of a stage; its own failure is one of them, and others follow."""
+    try:
+        yield from outcomes
+    except Exception as error:  # noqa: BLE001
+        yield Outcome(name, 'the stage itself', faults=[place(error)])

@@ -19,7 +19,7 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NoReturn
@@ -38,6 +38,8 @@ from msg_tools import BagWriter
 # What a command may need: seconds of the processor, and of the clock where others use it, bytes,
 # characters in a line, and lines: warnings may come before the error.
 SECONDS, WALL_SECONDS, MEMORY, CHARACTERS, LINES = 5.0, 40.0, 1e9, 300, 3
+# What a child of this process, which has the modules loaded, does not need of it, s.
+_START = 1.5
 # One run of so many is in an interpreter of its own.
 _ALONE = 20
 _LOOKS = 0.02  # s between two looks at a child
@@ -97,6 +99,9 @@ class _Run:
 def hostile(amount: Amount, *, quick: bool = False, given: Path | None = None) -> Iterator[Outcome]:
     """Every kind of hostile file, or the files of a folder, through what reads it."""
     cv2.setNumThreads(1)
+    for program in ('hmt_ros', 'hmt_learning'):
+        for module, _ in importlib.import_module(f'{program}.app').COMMANDS.values():
+            importlib.import_module(module)
     with TemporaryDirectory(prefix='hmt_ros.') as name:
         folder = Path(name)
         good = folder / 'good'
@@ -198,7 +203,7 @@ def _read_one(
         environment['MPLCONFIGDIR'] = str(good / 'matplotlib')
         before = _there(case)
         start = (_spawned if alone else _forked)(_filled(words, given), case / 'work', environment)
-        run = _finished(start, SECONDS if alone else SECONDS - _start_seconds())
+        run = _finished(start, SECONDS if alone else SECONDS - _START)
         made = sorted(_there(case) ^ before)
         allowed = {str(case / 'work' / x) for x in ('out', 'out.npz') if run.code == 0}
         left = [
@@ -339,14 +344,3 @@ def _wrong(run: _Run) -> Iterator[str]:
         yield f'says control characters {sorted(strange)[:3]}'
     if run.code == 1 and not run.stopped and not 1 <= len(lines) <= LINES:
         yield f'says {len(lines)} lines: {" | ".join(lines)[:120]}'
-
-
-@cache
-def _start_seconds() -> float:
-    """Time of the processor until a command begins, which a child of this process does not need."""
-    for program in ('hmt_ros', 'hmt_learning'):
-        for module, _ in importlib.import_module(f'{program}.app').COMMANDS.values():
-            importlib.import_module(module)
-    with TemporaryDirectory(prefix='hmt_ros.') as name:
-        started = _spawned(('hmt_ros', 'replay', '--help'), Path(name), {})
-        return _finished(started, WALL_SECONDS).seconds

@@ -9,7 +9,7 @@ import pickle
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,56 +21,26 @@ from benchmarks.soak.hostile_bags import YAML_BOMBS, bag_folders, bags, compress
 from benchmarks.soak.hostile_file import CONTROL, DEEP, DIGITS, Hostile
 from benchmarks.soak.scenes import CLIP
 
-# What stands in the place of a value.
-_VALUES = (
-    '1e999',
-    '-1e999',
-    '.nan',
-    DIGITS,
-    f'-{DIGITS[:5000]}',
-    '1e-320',
-    '[]',
-    '{}',
-    'null',
-    '[[1]]',
-    '"' + 'x' * 100_000 + '"',
-    DEEP,
-    '{[1]: 2}',
-    '{a: b}',
-    '"\\e[2J\\u202e\\n"',
-    '"\\ud800"',
-    '!!binary "/w=="',
-    '!!timestamp 2024-01-01',
-    '0x' + 'f' * 10_000,
-    '1' + ':59' * 5000,
-    '/etc/passwd',
-    '/dev/zero',
-    '../../kept/canary',
-    '.',
-    '1_0_0',
-    'yes',
-    '!!set {a, b}',
-)
+# What stands in the place of a value: words, and what is long or holds spaces.
+_WORDS = """
+1e999 -1e999 .nan 1e-320 [] {} null [[1]] 0xffffffffffffffffffffff /etc/passwd
+/dev/zero ../../kept/canary . 1_0_0 yes  "\\e[2J\\u202e\\n" "\\ud800"
+"""
+_LONG = (DIGITS, DEEP, f'"{"x" * 100_000}"', '1' + ':59' * 5000, '!!binary "/w=="')
+_VALUES = (*_WORDS.split(), *_LONG, '{a: b}', '{[1]: 2}', '!!timestamp 2024-01-01', '!!set {a, b}')
 _CALIBRATION = """\
 %YAML:1.0
 ---
 image_width: 640
 image_height: 480
-camera_matrix: !!opencv-matrix
-   rows: {rows}
-   cols: {cols}
-   dt: {dt}
-   data: [ {data} ]
-distortion_coefficients: !!opencv-matrix
-   rows: 1
-   cols: {count}
-   dt: d
-   data: [ {distortion} ]
+camera_matrix: !!opencv-matrix {{rows: {rows}, cols: {cols}, dt: {dt}, data: [{data}]}}
+distortion_coefficients: !!opencv-matrix {{rows: 1, cols: {count}, dt: d, data: [{distortion}]}}
 """
 _MATRIX = '600., 0., 320., 0., 600., 240., 0., 0., 1.'
 _ENTITIES = '<?xml version="1.0"?>\n<!DOCTYPE a [<!ENTITY a0 "xxxxxxxxxx">' + ''.join(
     f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 10)
 )
+_OF_OPENCV = 'type_id="opencv-matrix"'
 _XML = '<?xml version="1.0"?>\n<opencv_storage>{}</opencv_storage>\n'
 
 
@@ -103,27 +73,20 @@ def _yaml() -> Iterator[Hostile]:
     """Documents, and those that commands read with one strange value each."""
     documents = {
         **YAML_BOMBS,
-        'list_flat': '[' + '1, ' * 270_000 + '1]',
         'list_lists': '[' + '[], ' * 200_000 + '1]',
         'block_deep': ''.join(f'{" " * i}a:\n' for i in range(1400)),
         'documents': '---\na: 1\n' * 100_000,
         'scalar': 'a: ' + 'x' * 1_000_000,
-        'comment': '#' * 1_000_000 + '\na: 1',
-        'keys': ''.join(f'k{i}: 1\n' for i in range(80_000)),
+        'keys': ''.join(f'k{i}: &a{i} 1\n' for i in range(60_000)),
         'doubled': 'a: 1\n' * 100_000,
         'unhashable': '? [1]\n: 2\n? {a: 1}\n: 3\n',
         'keys_strange': f'{DIGITS[:5000]}: 1\nnull: 2\n1.5: 3\n"\\e[2J\\n": 4\n~: 5\n',
         'omap': '!!omap [a: 1]\n',
         'sexagesimal': 'a: 1' + ':59' * 200_000,
-        'anchors': ''.join(f'k{i}: &a{i} 1\n' for i in range(50_000)),
         'directive': '%YAML 9.9\n%TAG ! tag:x,2000:\n---\na: !x 1\n',
-        'quotes': 'a: "' + '\\n' * 300_000 + '"\n',
         'flow_unclosed': '[' * 500_000,
         'question': '? ' * 5000 + 'a',
-        'indicator': 'a: |\n' + ' x\n' * 300_000,
-        'empty': '',
         'nothing': '---\n...\n',
-        'text': 'just text',
         'bytes': '\ufeff\x85\u2028a: 1',
     }
     for name, text in documents.items():
@@ -142,239 +105,184 @@ def _yaml() -> Iterator[Hostile]:
                 changed = list(lines)
                 changed[at] = f'{changed[at].partition(":")[0]}: {value}'
                 yield Hostile(f'{name}_{number}_{at}.yaml', '\n'.join(changed))
-    segments = '\n'.join(
-        f'  - {{name: s{i}, parent: s{i - 1}, length: thigh, dofs: [[a{i}, x, -9, 9, 0, 9]]}}'
-        for i in range(20_000)
-    )
-    yield Hostile(
-        'body_segments.yaml', f'name: x\nlengths: {{thigh: [1, 1]}}\nsegments:\n{segments}'
-    )
+    one = '  - {{name: s{0}, parent: s{1}, length: a, dofs: [[a{0}, x, -9, 9, 0, 9]]}}\n'
+    segments = ''.join(one.format(i, i - 1) for i in range(20_000))
+    head = 'name: x\nlengths: {a: [1, 1]}\nsegments:\n'
+    yield Hostile('body_segments.yaml', head + segments)
     dofs = ', '.join(f'[a{i}, x, -9, 9, 0, 9]' for i in range(20_000))
     yield Hostile('body_dofs.yaml', f'name: x\nsegments:\n  - {{name: a, dofs: [{dofs}]}}\n')
 
 
 def _calibrations() -> Iterator[Hostile]:
-    usual = {
-        'rows': '3',
-        'cols': '3',
-        'dt': 'd',
-        'data': _MATRIX,
-        'count': '5',
-        'distortion': '0., 0., 0., 0., 0.',
-    }
+    usual = {'rows': '3', 'cols': '3', 'dt': 'd', 'data': _MATRIX}
+    usual |= {'count': '5', 'distortion': '0., 0., 0., 0., 0.'}
     changes: dict[str, dict[str, str]] = {
         'rows': {'rows': '1000000000', 'cols': '1000000000'},
         'negative': {'rows': '-3', 'cols': '-3'},
         'digits': {'rows': DIGITS[:10_000]},
         'dt': {'dt': '"100000000d"'},
         'dt_strange': {'dt': '"3(2i"'},
-        'dt_long': {'dt': 'd' * 10_000},
         'dt_many': {'dt': '"' + '9d' * 1000 + '"'},
         'data_short': {'data': '1.'},
         'data_text': {'data': '"x", [], {}'},
         'data_nan': {'data': '.Nan, .Inf, -.Inf, 0, 0, 0, 0, 0, 0'},
         'data_digits': {'data': f'{DIGITS[:10_000]}, {_MATRIX}'},
-        'data_deep': {'data': DEEP[:4000] + ']' * 4000},
+        'data_deep': {'data': '[' * 4000 + ']' * 4000},
         'coefficients': {'count': '100000', 'distortion': '0., ' * 99_999 + '0.'},
         'coefficients_huge': {'distortion': '1e300, 1e300, 1e300, 1e300, 1e300'},
         'focal': {'data': '1e-300, 0., 1e300, 0., -1., 0., 0., 0., 0.'},
     }
     for name, change in changes.items():
-        text = _CALIBRATION.format(**(usual | change))
-        yield Hostile(f'opencv_{name}.yaml', text)
-        yield Hostile(f'opencv_{name}.xml', text)
         found = usual | change
-        matrix = ''.join(f'<{k}>{found[k].replace(",", " ")}</{k}>' for k in ('rows', 'cols', 'dt'))
-        inside = f'<K type_id="opencv-matrix">{matrix}<data>{found["data"]}</data></K>'
-        yield Hostile(f'opencv_xml_{name}.xml', _XML.format(inside))
-        listed = {k: found[k] for k in ('rows', 'cols', 'dt')}
-        document = {'camera_matrix': {'type_id': 'opencv-matrix', **listed, 'data': [1.0]}}
-        yield Hostile(f'opencv_json_{name}.json', json.dumps(document))
+        sizes = {k: found[k] for k in ('rows', 'cols', 'dt')}
+        yield Hostile(f'opencv_{name}.yaml', _CALIBRATION.format(**found))
+        parts = {**sizes, 'data': found['data'].replace(',', ' ')}
+        inside = ''.join(f'<{k}>{text}</{k}>' for k, text in parts.items())
+        yield Hostile(f'opencv_{name}.xml', _XML.format(f'<K {_OF_OPENCV}>{inside}</K>'))
+        document = {'camera_matrix': {'type_id': 'opencv-matrix', **sizes, 'data': [1.0]}}
+        yield Hostile(f'opencv_{name}.json', json.dumps(document))
+    head = '%YAML:1.0\n---\n'
     for depth in (30, 1000, 20_000):
-        yield Hostile(f'deep_{depth}.xml', f'%YAML:1.0\n---\na: {"[" * depth}{"]" * depth}\n')
-        yield Hostile(
-            f'deep_maps_{depth}.xml', f'%YAML:1.0\n---\na: {"{a: " * depth}1{"}" * depth}\n'
-        )
-        yield Hostile(f'deep_xml_{depth}.xml', _XML.format('<a>' * depth + '</a>' * depth))
-        nested = '{"a": ' * depth + '1' + '}' * depth
-        yield Hostile(f'deep_{depth}.json', nested)
-        yield Hostile(f'deep_lists_{depth}.json', '{"K": ' + '[' * depth + ']' * depth + '}')
+        lists, dots = '[' * depth + ']' * depth, '.'.join('a' * depth)
         block = ''.join(f'{" " * i}a:\n' for i in range(min(depth, 1300)))
-        yield Hostile(f'deep_block_{depth}.xml', f'%YAML:1.0\n---\n{block}')
-        yield Hostile(f'deep_{depth}.toml', f'a = {"[" * depth}{"]" * depth}\n')
-        yield Hostile(f'deep_tables_{depth}.toml', f'a = {"{a = " * depth}1{"}" * depth}\n')
-        yield Hostile(f'deep_keys_{depth}.toml', f'{".".join("a" * depth)} = 1\n')
-        yield Hostile(f'deep_heads_{depth}.toml', f'[{".".join("a" * depth)}]\nmatrix = 1\n')
-    data = f'<data>{_MATRIX}</data>'
-    yield Hostile('entities.xml', f'{_ENTITIES}]>\n<opencv_storage><K>&a9;</K></opencv_storage>')
-    external = '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
-    yield Hostile(
-        'external.xml',
-        f'<?xml version="1.0"?>{external}<opencv_storage><K>&x;</K></opencv_storage>',
-    )
-    yield Hostile('types.xml', _XML.format(f'<K type_id="opencv-sparse-matrix">{data}</K>'))
-    yield Hostile('graph.xml', _XML.format('<K type_id="opencv-graph"><flags>1</flags></K>'))
-    yield Hostile(
-        'base64.xml', _XML.format('<K type_id="binary">$base64$' + 'A' * 900_000 + '</K>')
-    )
-    yield Hostile('base64.yaml', '%YAML:1.0\n---\nK: !!binary |\n  $base64$' + 'A' * 900_000 + '\n')
-    yield Hostile('keys.xml', _XML.format(''.join(f'<a{i}>1</a{i}>' for i in range(50_000))))
+        for name, text in {
+            'lists.xml': f'{head}a: {lists}\n',
+            'maps.xml': f'{head}a: {"{a: " * depth}1{"}" * depth}\n',
+            'block.xml': head + block,
+            'parts.xml': _XML.format('<a>' * depth + '</a>' * depth),
+            'lists.json': f'{{"K": {lists}}}',
+            'maps.json': '{"a": ' * depth + '1' + '}' * depth,
+            'lists.toml': f'a = {lists}\n',
+            'tables.toml': f'a = {"{a = " * depth}1{"}" * depth}\n',
+            'keys.toml': f'{dots} = 1\n',
+            'heads.toml': f'[{dots}]\nmatrix = 1\n',
+        }.items():
+            yield Hostile(f'deep_{depth}_{name}', text)
+    entity = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
+    inside = '<opencv_storage><K>&{};</K></opencv_storage>'
+    base64 = '$base64$' + 'A' * 900_000
+    for name, text in {
+        'entities.xml': f'{_ENTITIES}]>\n{inside.format("a9")}',
+        'external.xml': entity + inside.format('x'),
+        'types.xml': _XML.format(f'<K type_id="opencv-sparse-matrix"><data>{_MATRIX}</data></K>'),
+        'graph.xml': _XML.format('<K type_id="opencv-graph"><flags>1</flags></K>'),
+        'base64.xml': _XML.format(f'<K type_id="binary">{base64}</K>'),
+        'base64.yaml': f'{head}K: !!binary |\n  {base64}\n',
+        'keys.xml': _XML.format(''.join(f'<a{i}>1</a{i}>' for i in range(50_000))),
+    }.items():
+        yield Hostile(name, text)
     ros = 'image_width: 640\nimage_height: 480\ncamera_matrix: {rows: 3, cols: 3, data: [%s]}\n'
     yield Hostile('ros_digits.yaml', ros % DIGITS[:10_000])
     yield Hostile('ros_long.yaml', ros % ('0, ' * 200_000))
     plain = f'k: [{_MATRIX}]\nd: [{"0., " * 100_000}0.]\nwidth: 640\nheight: 480\n'
     yield Hostile('ros_coefficients.yaml', plain)
-    for value in _VALUES:
-        name = f'{len(value)}_{zlib.crc32(value.encode()):x}'
+    for name, value in enumerate(_VALUES):
         yield Hostile(f'ros_{name}.yaml', f'k: [{_MATRIX}]\nd: {value}\nwidth: {value}\n')
         yield Hostile(f'model_{name}.yaml', f'k: [{_MATRIX}]\nd: [0.]\ndistortion_model: {value}\n')
         yield Hostile(f'toml_{name}.toml', f'[cam]\nmatrix = {value}\nname = "{CONTROL[1:4]}"\n')
     yield Hostile('digits.toml', f'[cam]\nmatrix = [[{DIGITS[:100_000]}, 0, 1]]\n')
-    yield Hostile('cameras.toml', ''.join(f'[cam{i}]\nmatrix = [[1]]\n' for i in range(30_000)))
-    yield Hostile(
-        'cameras_control.toml', ''.join(f'["\\u001b[2J{i}"]\nmatrix = [[1]]\n' for i in range(99))
-    )
+    for i, head in enumerate(('[cam%d]\n', '["\\u001b[2J%d"]\n')):
+        yield Hostile(
+            f'cameras_{i}.toml', ''.join(f'{head % k}matrix = [[1]]\n' for k in range(30_000))
+        )
     yield Hostile('names.yaml', ''.join(f'"{i}\\e[2J\\n":\n  K: [1]\n' for i in range(20_000)))
 
 
 def _json() -> Iterator[Hostile]:
     person = [float(x) for i in range(17) for x in (100 + i, 100 + 2 * i, 0.9)]
     annotation = {'image_id': 0, 'keypoints': person, 'score': 1.0, 'category_id': 1}
-    strange: tuple[Any, ...] = (
-        None,
-        True,
-        [1],
-        {'a': 1},
-        'x',
-        1e308,
-        -1,
-        2**63,
-        10**4000,
-        [[[]]],
-        '\x1b[2J\n',
-        '\ud800',
-        float('nan'),
-        float('inf'),
-        'x' * 100_000,
-        [10**400] * 51,
-        10**12,
-    )
+    strange: list[Any] = [None, True, [1], {'a': 1}, 'x', '\x1b[2J\n', '\ud800', 'x' * 100_000]
+    strange += [1e308, -1, 10**12, 2**63, 10**4000, float('nan'), float('inf')]
+    strange += [[[[]]], [10**400] * 51]
+    usual = {
+        'images': [{'id': 0, 'file_name': 'x_0.png'}],
+        'annotations': [annotation],
+        'categories': [{'id': 1, 'keypoints': []}],
+    }
     for number, value in enumerate(strange):
-        for key in annotation:
-            found = [annotation, {**annotation, key: value}]
-            yield Hostile(f'results_{key}_{number}.json', partial(_dumped, found))
-        document = {
-            'images': [{'id': value, 'file_name': value}],
-            'annotations': [{**annotation, 'image_id': value}],
-            'categories': [{'id': 1, 'keypoints': value}],
-        }
-        yield Hostile(f'coco_{number}.json', partial(_dumped, document))
-        for key in document:
-            usual = {'images': [{'id': 0, 'file_name': 'x_0.png'}], 'annotations': [annotation]}
-            yield Hostile(f'coco_{key}_{number}.json', partial(_dumped, {**usual, key: value}))
-        people = {'people': [{'pose_keypoints_2d': value, 'person_id': value}], 'version': value}
-        yield Hostile(f'openpose_{number}.json', partial(_dumped, people))
-        mmpose = {
-            'meta_info': value,
-            'instance_info': [
-                {
-                    'frame_id': value,
-                    'instances': [
-                        {'keypoints': [[1, 2]] * 17, 'keypoint_scores': value, 'bbox': value}
-                    ],
-                }
-            ],
-        }
-        yield Hostile(f'mmpose_{number}.json', partial(_dumped, mmpose))
-        boxes = [[{'name': value, 'box': value, 'keypoints': {'x': value, 'y': value}}]]
-        yield Hostile(f'ultralytics_{number}.json', partial(_dumped, boxes))
+        instance = {'keypoints': [[1, 2]] * 17, 'keypoint_scores': value, 'bbox': value}
+        frames = [{'frame_id': value, 'instances': [instance]}]
+        people = [{'pose_keypoints_2d': value, 'person_id': value}]
+        for name, document in {
+            **{f'results_{key}': [annotation, {**annotation, key: value}] for key in annotation},
+            **{f'coco_{key}': {**usual, key: value} for key in usual},
+            'coco_image': {**usual, 'images': [{'id': value, 'file_name': value}]},
+            'coco_category': {**usual, 'categories': [{'id': 1, 'keypoints': value}]},
+            'openpose': {'people': people, 'version': value},
+            'mmpose': {'meta_info': value, 'instance_info': frames},
+            'ultralytics': [[{'name': value, 'box': value, 'keypoints': {'x': value, 'y': value}}]],
+        }.items():
+            yield Hostile(f'{name}_{number}.json', partial(_dumped, document))
     far = [{**annotation, 'image_id': i * 10**9} for i in range(3)]
     names = [{**annotation, 'image_id': f'{"x" * 9000}{i}'} for i in range(2000)]
-    yield Hostile('frames_far.json', partial(_dumped, far))
-    yield Hostile('frames_names.json', partial(_dumped, names))
-    yield Hostile('persons.json', lambda: _dumped([annotation] * 20_000))
-    yield Hostile('deep.json', DEEP)
-    yield Hostile('deep_maps.json', '{"a":' * 100_000 + '1' + '}' * 100_000)
-    yield Hostile('empty_lists.json', '[' + '[],' * 1_000_000 + '[]]')
-    yield Hostile('empty_maps.json', '[' + '{},' * 1_000_000 + '{}]')
-    yield Hostile('numbers.json', '[' + '1,' * 3_000_000 + '1]')
-    yield Hostile('digits.json', f'[{DIGITS}]')
-    yield Hostile('exponent.json', '[1e999999999, 1' + '0' * 100_000 + '.0]')
-    yield Hostile('keys.json', '{' + ','.join(f'"{i}":1' for i in range(300_000)) + '}')
-    yield Hostile('doubled.json', '{' + '"a":1,' * 300_000 + '"a":1}')
-    yield Hostile('text.json', '"' + '\\u001b' * 300_000 + '"')
+    for name, content in {
+        'frames_far': partial(_dumped, far),
+        'frames_names': partial(_dumped, names),
+        'persons': partial(_dumped, [annotation] * 20_000),
+        'deep': DEEP,
+        'deep_maps': '{"a":' * 100_000 + '1' + '}' * 100_000,
+        'empty_lists': '[' + '[],' * 1_000_000 + '[]]',
+        'empty_maps': '[' + '{},' * 1_000_000 + '{}]',
+        'numbers': '[' + '1,' * 3_000_000 + '1]',
+        'digits': f'[{DIGITS}]',
+        'exponent': '[1e999999999, 1' + '0' * 100_000 + '.0]',
+        'keys': lambda: '{' + ','.join(f'"{i}":1' for i in range(300_000)) + '}',
+        'doubled': '{' + '"a":1,' * 300_000 + '"a":1}',
+        'text': '"' + '\\u001b' * 300_000 + '"',
+    }.items():
+        yield Hostile(f'{name}.json', content)
 
 
 def _dumped(document: Any) -> str:
-    return json.dumps(document) if _short(document) else json.dumps(str(document)[:100])
-
-
-def _short(document: Any) -> bool:
-    """Python itself does not write an integer of so many digits."""
+    """JSON; Python itself does not write an integer of so many digits."""
     try:
-        json.dumps(document)
+        return json.dumps(document)
     except ValueError:
-        return False
-    return True
+        return json.dumps(str(document)[:100])
 
 
 def _tables() -> Iterator[Hostile]:
     head = 'frame,left_hip_u,left_hip_v,left_hip_confidence,nose_u,nose_v,nose_confidence\n'
     rows = '0,1,2,1,3,4,1\n1,1,2,1,3,4,1\n'
-    for number, value in enumerate(
-        (
-            '1000000000',
-            str(2**63),
-            DIGITS,
-            '-1',
-            'nan',
-            '1e308',
-            '1e999',
-            '\x1b[2J',
-            '"a\nb"',
-            '0x1',
-            '\u0663',
-            '1_0',
-            'x' * 200_000,
-        )
-    ):
-        yield Hostile(f'frame_{number}.csv', f'{head}{rows}{value},1,2,1,3,4,1\n')
-        yield Hostile(f'value_{number}.csv', f'{head}{rows}2,{value},2,1,3,4,{value}\n')
-        yield Hostile(f'name_{number}.csv', f'frame,{value}_u,{value}_v\n0,1,2\n')
-        yield Hostile(f'time_{number}.csv', f'time_s,a_u,a_v\n{value},1,2\n')
-        yield Hostile(f'stamp_{number}.csv', f'stamp_ns,person,a_u,a_v\n{value},{value},1,2\n')
-        yield Hostile(f'long_{number}.csv', f'frame,name,u,v,confidence\n{value},{value},1,2,1\n')
-        yield Hostile(f'people_{number}.csv', f'file,subject\n{value},{value}\nx,y\n')
-        trc = (
-            'PathFileType\t4\t(X/Y/Z)\tx.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\t'
-            f'OrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n{value}\t{value}\t{value}\t{value}\tm\t'
-            f'{value}\t1\t{value}\nFrame#\tTime\tLHip\t\t\n\t\tX1\tY1\tZ1\n\n1\t{value}\t1\t2\t0\n'
-        )
-        yield Hostile(f'{number}.trc', trc)
+    values = ['1000000000', str(2**63), DIGITS, '-1', 'nan', '1e308', '1e999']
+    values += ['\x1b[2J', '"a\nb"', '0x1', '\u0663', '1_0', 'x' * 200_000]
+    for number, value in enumerate(values):
+        for name, text in {
+            'frame': f'{head}{rows}{value},1,2,1,3,4,1\n',
+            'value': f'{head}{rows}2,{value},2,1,3,4,{value}\n',
+            'name': f'frame,{value}_u,{value}_v\n0,1,2\n',
+            'time': f'time_s,a_u,a_v\n{value},1,2\n',
+            'stamp': f'stamp_ns,person,a_u,a_v\n{value},{value},1,2\n',
+            'long': f'frame,name,u,v,confidence\n{value},{value},1,2,1\n',
+            'people': f'file,subject\n{value},{value}\nx,y\n',
+        }.items():
+            yield Hostile(f'{name}_{number}.csv', text)
+        yield Hostile(f'{number}.trc', _TRC.replace('?', value))
     columns = ','.join(f'k{i}_u,k{i}_v' for i in range(50_000))
-    yield Hostile('columns.csv', f'frame,{columns}\n0{",1" * 100_000}\n')
-    yield Hostile('rows.csv', lambda: head + '1,1,2,1,3,4,1\n' * 300_000)
-    yield Hostile(
-        'frames.csv', lambda: head + ''.join(f'{i}000,1,2,1,3,4,1\n' for i in range(99_999))
-    )
-    yield Hostile(
-        'persons.csv',
-        lambda: 'frame,person,a_u,a_v\n' + ''.join(f'0,p{i},1,2\n' for i in range(99_999)),
-    )
-    yield Hostile(
-        'names.csv', lambda: 'frame,name,u,v\n' + ''.join(f'0,n{i},1,2\n' for i in range(99_999))
-    )
-    yield Hostile('quote.csv', head + '"' + 'x' * 1_000_000)
-    yield Hostile('quotes.csv', head + '""' * 500_000)
-    yield Hostile('nul.csv', head + '\0' * 1000)
-    yield Hostile('lines.csv', '\n' * 1_000_000)
-    yield Hostile('commas.csv', ',' * 1_000_000)
-    yield Hostile('tabs.trc', '\t' * 1_000_000 + '\n' * 9)
-    yield Hostile(
-        'deeplabcut.csv',
-        'scorer,a,a,a\nbodyparts,nose,nose,nose\ncoords,x,y,likelihood\n'
-        + f'{DIGITS[:20]},1,2,1\n',
-    )
+    every = range(99_999)
+    for name, text in {
+        'columns.csv': f'frame,{columns}\n0{",1" * 100_000}\n',
+        'rows.csv': head + '1,1,2,1,3,4,1\n' * 300_000,
+        'frames.csv': head + ''.join(f'{i}000,1,2,1,3,4,1\n' for i in every),
+        'persons.csv': 'frame,person,a_u,a_v\n' + ''.join(f'0,p{i},1,2\n' for i in every),
+        'names.csv': 'frame,name,u,v\n' + ''.join(f'0,n{i},1,2\n' for i in every),
+        'quote.csv': head + '"' + 'x' * 1_000_000,
+        'quotes.csv': head + '""' * 500_000,
+        'nul.csv': head + '\0' * 1000,
+        'lines.csv': '\n' * 1_000_000,
+        'commas.csv': ',' * 1_000_000,
+        'tabs.trc': '\t' * 1_000_000 + '\n' * 9,
+        'deeplabcut.csv': 'scorer,a,a,a\nbodyparts,nose,nose,nose\ncoords,x,y,likelihood\n'
+        f'{DIGITS[:20]},1,2,1\n',
+    }.items():
+        yield Hostile(name, text)
+
+
+_TRC = (
+    'PathFileType\t4\t(X/Y/Z)\tx.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\t'
+    'OrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n?\t?\t?\t?\tm\t?\t1\t?\n'
+    'Frame#\tTime\tLHip\t\t\n\t\tX1\tY1\tZ1\n\n1\t?\t1\t2\t0\n'
+)
 
 
 def _npy(head: str | Mapping[str, Any], content: bytes = b'abc', version: int = 1) -> bytes:
@@ -416,24 +324,18 @@ def _pickles() -> dict[str, bytes]:
 def _arrays() -> Iterator[Hostile]:
     """Archives of arrays under the names that commands look for."""
     usual = {'descr': '<f8', 'fortran_order': False, 'shape': (3, 6, 2)}
+    shapes = [(2**40, 2), (2**62, 0, 2), (2**33, 2**33, 2), (-3, 6, -2), (1,) * 200]
+    types: list[Any] = ['<U1000000000', '|V2147483647', '|O', '<M8[as]']
+    types += [[('x', '<f8', (2**30, 2**30))], [(f'f{i}', '<f8') for i in range(3000)]]
     heads: dict[str, str | dict[str, Any]] = {
-        'shape': {**usual, 'shape': (2**40, 2)},
-        'shape_zero': {**usual, 'shape': (2**62, 0, 2)},
-        'shape_overflow': {**usual, 'shape': (2**33, 2**33, 2)},
-        'shape_negative': {**usual, 'shape': (-3, 6, -2)},
-        'shape_dimensions': {**usual, 'shape': (1,) * 200},
-        'shape_digits': str({**usual, 'shape': 'X'}).replace("'X'", f'({DIGITS[:9000]},)'),
-        'text': {**usual, 'descr': '<U1000000000'},
-        'void': {**usual, 'descr': '|V2147483647'},
-        'void_zero': {**usual, 'descr': '|V0', 'shape': (2**40,)},
-        'text_zero': {**usual, 'descr': '<U0', 'shape': (2**40,)},
-        'fields': {**usual, 'descr': [(f'f{i}', '<f8') for i in range(3000)]},
-        'subarray': {**usual, 'descr': [('x', '<f8', (2**30, 2**30))]},
-        'objects': {**usual, 'descr': '|O'},
-        'dates': {**usual, 'descr': '<M8[as]'},
+        **{f'shape_{i}': {**usual, 'shape': shape} for i, shape in enumerate(shapes)},
+        **{f'type_{i}': {**usual, 'descr': kind} for i, kind in enumerate(types)},
+        'void': {**usual, 'descr': '|V0', 'shape': (2**40,)},
+        'text': {**usual, 'descr': '<U0', 'shape': (2**40,)},
+        'digits': str(usual).replace('3, 6', DIGITS[:9000]),
         'code': '__import__("os").system("touch ../kept/pwned")',
         'deep': '(' * 5000 + ')' * 5000,
-        'deep_minus': "{'descr': '<f8', 'fortran_order': False, 'shape': (" + '-' * 9000 + '1,)}',
+        'deep_minus': str(usual).replace('3, 6', '-' * 9000 + '1'),
         'long': {**usual, 'x' * 60_000: 1},
     }
     for name, head in heads.items():
@@ -476,7 +378,7 @@ _WANTED = ('pixels', 'stamps', 'joints', 'joint_names', 'positions_2d', 'format'
 
 def _zip(members: Mapping[str, bytes], zeros: int = 0) -> bytes:
     target = io.BytesIO()
-    with zipfile.ZipFile(target, 'w', zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(target, 'w', zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, content in members.items():
             with archive.open(f'{name}.npy', 'w', force_zip64=True) as member:
                 member.write(content)
@@ -510,18 +412,18 @@ def _models() -> Iterator[Hostile]:
             arrays = dict(archive)
         for key, values in arrays.items():
             changed: dict[str, Any] = {}
-            if values.dtype.kind == 'f':
+            if values.dtype.kind in 'fiu':
+                most = {'f': 6e4}.get(values.dtype.kind, 2**62)
                 changed = {
                     'zero': np.zeros_like(values),
-                    'large': np.full_like(values, 6e4),
+                    'large': np.full_like(values, most),
                     'negative': -np.abs(values) - 1,
-                    'nan': np.full_like(values, np.nan),
-                    'tiny': np.full_like(values, 1e-7),
                 }
-            elif values.dtype.kind in 'iu':
-                changed = {'negative': -values, 'large': values * 0 + 2**62, 'zero': values * 0}
             elif key.endswith('parameters'):
                 changed = dict(_changed_parameters(str(values)))
+            if values.dtype.kind == 'f':
+                changed['nan'] = np.full_like(values, np.nan)
+                changed['tiny'] = np.full_like(values, 1e-7)
             for how, value in changed.items():
                 file = f'{name}_{key.replace("/", ".")}_{how}.npz'
                 content = partial(_saved, {**arrays, key: value})
@@ -555,87 +457,65 @@ def _zeros(size: int) -> bytes:
     return b''.join(press.compress(bytes(2**20)) for _ in range(size // 2**20)) + press.flush()
 
 
-def _claimed_images() -> Iterator[tuple[str, Callable[[], bytes]]]:
-    """Images that claim to be large, by suffix."""
+def _claimed_images() -> Iterator[tuple[str, bytes]]:
+    """Images that claim to be large, by suffix; each claims it in the words of its format."""
     for side in (20_000, 60_000, 2**31 - 1):
-        little, big = struct.pack('<II', side, side), struct.pack('>HH', side % 65536, 65000)
+        square, short = struct.pack('<II', side, side), struct.pack('>HH', side % 65536, 65000)
         content = _zeros(2**20 if side > 20_000 else side * (side + 1))
-        yield f'{side}.png', partial(_png, side, side, content)
-        yield f'colour_{side}.png', partial(_png, side, side, _zeros(2**20), b'', 2)
-        jpeg = b'\xff\xd8\xff\xc0\x00\x11\x08' + big + b'\x03\x01\x22\x00\x02\x11\x01\x03\x11\x01'
-        scan = (
-            b'\xff\xda\x00\x0c\x03\x01\x00\x02\x11\x03\x11\x00\x3f\x00' + bytes(2000) + b'\xff\xd9'
-        )
-        yield f'{side}.jpg', partial(bytes, jpeg + scan)
-        bmp = struct.pack('<IIIIHHIIIIII', 10**6, 0, 54, 40, 0, 0, 0, 0, 0, 0, 0, 0)
-        bmp = bmp[:16] + little + struct.pack('<HHIIIIII', 1, 24, 0, 0, 0, 0, 0, 0)
-        yield f'{side}.bmp', partial(bytes, b'BM' + bmp + bytes(1000))
-        yield f'rle_{side}.bmp', partial(bytes, b'BM' + bmp[:28] + b'\1\0\x08\0\1' + bytes(999))
-        for kind in (b'P5', b'P2', b'P6', b'P4', b'P3'):
-            text = kind + f' {side} {side} 255\n'.encode() + bytes(100)
-            yield f'{kind.decode()}_{side}.pgm', partial(bytes, text)
-        yield (
-            f'{side}.hdr',
-            partial(
-                bytes,
-                f'#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {side} +X {side}\n'.encode() + bytes(99),
-            ),
-        )
-        gif = b'GIF89a' + struct.pack('<HH', 65535, 65535) + b'\xf0\0\0' + bytes(6)
-        yield (
-            f'{side}.gif',
-            partial(bytes, gif + (b',' + bytes(4) + b'\xff\xff\xff\xff\0\2\2D\1\0') * 999 + b';'),
-        )
-        yield f'{side}.tif', partial(_tiff, side)
-        yield f'tiles_{side}.tif', partial(_tiff, side, tiled=True)
-        webp = b'VP8X' + struct.pack('<I', 10) + bytes(4) + b'\xfe\xff\xff\xfe\xff\0'
-        yield (
-            f'{side}.webp',
-            partial(bytes, b'RIFF' + struct.pack('<I', len(webp) + 4) + b'WEBP' + webp),
-        )
+        jpeg = b'\xff\xd8\xff\xc0\x00\x11\x08' + short + b'\3\1\x22\0\2\x11\1\3\x11\1'
+        jpeg += b'\xff\xda\x00\x0c\x03\x01\x00\x02\x11\x03\x11\x00\x3f\x00'
+        bmp = b'BM' + struct.pack('<IIII', 10**6, 0, 54, 40) + square
         j2k = struct.pack('>HHIIIIIIII', 47, 0, side, side, 0, 0, side, side, 0, 0)
-        yield (
-            f'{side}.jp2',
-            partial(bytes, b'\xff\x4f\xff\x51' + j2k + b'\0\3' + b'\7\1\1' * 3 + bytes(99)),
-        )
+        for kind in ('P5', 'P3'):
+            yield f'{kind}_{side}.pgm', f'{kind} {side} {side} 255\n'.encode() + bytes(100)
+        yield f'{side}.png', _png(side, side, content)
+        yield f'colour_{side}.png', _png(side, side, content[: 2**20], colour=2)
+        yield f'{side}.jpg', jpeg + bytes(2000) + b'\xff\xd9'
+        yield f'{side}.bmp', bmp + struct.pack('<HHI', 1, 24, 0) + bytes(1000)
+        yield f'rle_{side}.bmp', bmp + struct.pack('<HHI', 1, 8, 1) + bytes(1000)
+        head = f'#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {side} +X {side}\n'
+        yield f'{side}.hdr', head.encode() + bytes(99)
+        strips = {273: 200, 278: side, 279: 99}
+        yield f'{side}.tif', _tiff({256: side, 257: side, **strips})
+        tiles = {322: side, 323: side, 324: 200, 325: 99}
+        yield f'tiles_{side}.tif', _tiff({256: side, 257: side, **tiles})
+        yield f'{side}.jp2', b'\xff\x4f\xff\x51' + j2k + b'\0\3' + b'\7\1\1' * 3 + bytes(99)
+    gif = b'GIF89a\xff\xff\xff\xff\xf0\0\0' + bytes(6)
+    yield 'frames.gif', gif + (b',' + bytes(4) + b'\xff\xff\xff\xff\0\2\2D\1\0') * 999 + b';'
+    webp = b'WEBPVP8X\x0a\0\0\0' + bytes(4) + b'\xfe\xff\xff\xfe\xff\0'
+    yield 'side.webp', b'RIFF' + struct.pack('<I', len(webp)) + webp
 
 
-def _tiff(side: int, *, tiled: bool = False) -> bytes:
-    tags = [(256, side), (257, side), (258, 8), (259, 8), (262, 1), (277, 1)]
-    tags += (
-        [(322, side), (323, side), (324, 200), (325, 99)]
-        if tiled
-        else [(273, 200), (278, side), (279, 99)]
-    )
-    directory = struct.pack('<H', len(tags)) + b''.join(
-        struct.pack('<HHII', tag, 4, 1, value) for tag, value in tags
-    )
-    return (b'II*\0\x08\0\0\0' + directory + bytes(4)).ljust(200, b'\0') + zlib.compress(
-        bytes(9999)
-    )
+def _tiff(tags: Mapping[int, int]) -> bytes:
+    tags = dict(sorted({**tags, 258: 8, 259: 8, 262: 1, 277: 1}.items()))
+    rows = (struct.pack('<HHII', tag, 4, 1, value) for tag, value in tags.items())
+    directory = struct.pack('<H', len(tags)) + b''.join(rows) + bytes(4)
+    return (b'II*\0\x08\0\0\0' + directory).ljust(200, b'\0') + zlib.compress(bytes(9999))
 
 
 def _images() -> Iterator[Hostile]:
     """Pictures, and the same in folders of frames and of masks."""
-    found = dict(_claimed_images())
     text = _part(b'zTXt', b'a\0\0' + zlib.compress(bytes(2**26)))
     profile = _part(b'iCCP', b'a\0\0' + zlib.compress(bytes(2**26)))
     pixel = zlib.compress(bytes(64 * 65))
-    found['texts.png'] = lambda: _png(64, 64, pixel, text * 100)
-    found['profile.png'] = lambda: _png(64, 64, pixel, profile)
-    found['parts.png'] = lambda: _png(64, 64, pixel, _part(b'tEXt', b'a\0b') * 200_000)
-    found['longer.png'] = lambda: _png(64, 64, _zeros(2**30))
-    found['strange_name\x1b[2J.png'] = lambda: _png(2**20, 64, pixel)
-    for name, make in found.items():
-        yield Hostile(name, make)
+    found = {
+        **dict(_claimed_images()),
+        'texts.png': _png(64, 64, pixel, text * 100),
+        'profile.png': _png(64, 64, pixel, profile),
+        'parts.png': _png(64, 64, pixel, _part(b'tEXt', b'a\0b') * 200_000),
+        'longer.png': _png(64, 64, _zeros(2**30)),
+        'strange_name\x1b[2J.png': _png(2**20, 64, pixel),
+    }
+    for name, content in found.items():
+        yield Hostile(name, content)
         if name.endswith(('.png', '.jpg', '.tif')):
-            yield Hostile(f'folder_{name}', write=partial(_write_frames, name, make))
+            yield Hostile(f'folder_{name}', write=partial(_write_frames, name, content))
 
 
-def _write_frames(name: str, make: Callable[[], bytes], folder: Path) -> None:
+def _write_frames(name: str, content: bytes, folder: Path) -> None:
     folder.mkdir()
     for number in range(2):
-        (folder / f'{number}_{name}').write_bytes(make())
+        (folder / f'{number}_{name}').write_bytes(content)
 
 
 def _box(kind: bytes, content: bytes, size: int | None = None) -> bytes:
@@ -658,6 +538,7 @@ def _videos(good: Path) -> Iterator[Hostile]:
     nested = b''
     for _ in range(3000):
         nested = _box(b'moov', nested)
+    itself = '#EXTM3U\n#EXT-X-TARGETDURATION:1\n' + '#EXTINF:1,\nlist.m3u8\n' * 20_000
     for name, content in {
         'nested': file + nested,
         'boxes': file + _box(b'free', b'') * 500_000,
@@ -666,16 +547,14 @@ def _videos(good: Path) -> Iterator[Hostile]:
         'one': file + _box(b'moov', struct.pack('>Q', 2**63), 1),
         'small': file + _box(b'moov', b'', 4),
         'long': file + _box(b'moov', bytes(100), 2**31),
+        'list': itself.encode(),
         'playlist': b'#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n#EXTINF:1,\nhttp://127.0.0.1:9/x\n',
         'concat': b'ffconcat version 1.0\nfile /etc/passwd\nfile ../kept/canary\n' * 100,
         'sdp': b'v=0\no=- 0 0 IN IP4 127.0.0.1\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 9 RTP/AVP 96\n',
         'subtitles': b'1\n00:00:00,000 --> 99:00:00,000\n\x1b[2Jx\n' * 10_000,
     }.items():
-        yield Hostile(f'{name}.mp4', content)
-        yield Hostile(f'{name}.mkv', content)
-    playlist = '#EXTM3U\n#EXT-X-TARGETDURATION:1\n' + '#EXTINF:1,\nx.ts\n' * 50_000
-    yield Hostile('many.m3u8', playlist)
-    yield Hostile('itself.m3u8', '#EXTM3U\n#EXTINF:1,\nitself.m3u8\n' * 100)
+        for suffix in ('.mp4', '.mkv', '.m3u8')[: 3 if 'list' in name else 2]:
+            yield Hostile(f'{name}{suffix}', content)
 
 
 def _motions() -> Iterator[Hostile]:
@@ -683,30 +562,26 @@ def _motions() -> Iterator[Hostile]:
     channels = 'Xposition Yposition Zposition Zrotation Xrotation Yrotation'
     root = f'HIERARCHY\nROOT Hips\n{{\nOFFSET 0 0 0\nCHANNELS 6 {channels}\n'
     motion = 'MOTION\nFrames: %s\nFrame Time: %s\n'
+    row = '0 0 0 0 0 0\n'
     for depth in (500, 20_000):
         deep = ''.join(joint % i for i in range(depth)) + '}\n' * depth
-        yield Hostile(
-            f'deep_{depth}.bvh', f'{root}{deep}}}\n{motion % (1, 0.03)}' + '0 ' * (6 + 3 * depth)
-        )
+        numbers = '0 ' * (6 + 3 * depth)
+        yield Hostile(f'deep_{depth}.bvh', f'{root}{deep}}}\n{motion % (1, 0.03)}{numbers}')
     flat = ''.join(joint % i + '}\n' for i in range(20_000))
     yield Hostile('joints.bvh', f'{root}{flat}}}\n{motion % (1, 0.03)}' + '0 ' * 60_006)
     for number, value in enumerate(('1000000000000', '-1', DIGITS, 'nan', '1e-320', '\x1b[2J', '')):
-        row = '0 0 0 0 0 0\n'
-        yield Hostile(f'frames_{number}.bvh', f'{root}}}\n{motion % (value, 0.03)}{row}')
-        yield Hostile(f'time_{number}.bvh', f'{root}}}\n{motion % (2, value)}{row * 2}')
-        yield Hostile(f'value_{number}.bvh', f'{root}}}\n{motion % (1, 0.03)}0 0 0 0 0 {value}\n')
-        yield Hostile(
-            f'name_{number}.bvh', f'{root.replace("Hips", value)}}}\n{motion % (1, 0.03)}{row}'
-        )
-        yield Hostile(
-            f'channels_{number}.bvh',
-            root.replace('S 6', f'S {value}') + '}\n' + motion % (1, 1) + row,
-        )
-        yield Hostile(
-            f'{number}.amc', f':FULLY-SPECIFIED\n:DEGREES\n{value}\nroot {value} 0 0 0 0 0\n'
-        )
+        for name, text in {
+            'frames': f'{root}}}\n{motion % (value, 0.03)}{row}',
+            'time': f'{root}}}\n{motion % (2, value)}{row * 2}',
+            'value': f'{root}}}\n{motion % (1, 0.03)}0 0 0 0 0 {value}\n',
+            'name': f'{root.replace("Hips", value)}}}\n{motion % (1, 0.03)}{row}',
+            'channels': f'{root.replace("S 6", f"S {value}")}}}\n{motion % (1, 1)}{row}',
+        }.items():
+            yield Hostile(f'{name}_{number}.bvh', text)
+        amc = f':FULLY-SPECIFIED\n:DEGREES\n{value}\nroot {value} 0 0 0 0 0\n'
+        yield Hostile(f'{number}.amc', amc)
     yield Hostile('numbers.bvh', f'{root}}}\n{motion % (1, 0.03)}' + '0 ' * 2_000_000)
-    yield Hostile('rows.bvh', f'{root}}}\n{motion % (300_000, 0.03)}' + '0 0 0 0 0 0\n' * 300_000)
+    yield Hostile('rows.bvh', f'{root}}}\n{motion % (300_000, 0.03)}' + row * 300_000)
 
 
 _SUFFIXES = '.mcap .db3 .zstd .yaml .xml .json .toml .npz .csv .trc .png .jpg .mp4 .avi .bvh .amc'
@@ -714,20 +589,24 @@ _SUFFIXES = '.mcap .db3 .zstd .yaml .xml .json .toml .npz .csv .trc .png .jpg .m
 
 def _no_files() -> Iterator[Hostile]:
     """What stands in the place of a file and is none."""
+    links = {'zeros': '/dev/zero', 'random': '/dev/urandom', 'memory': '/proc/self/mem'}
     for suffix in _SUFFIXES.split():
+        for name, target in links.items():
+            yield Hostile(f'{name}{suffix}', write=partial(_link, target))
+        yield Hostile(f'circle{suffix}', write=partial(_link, f'circle{suffix}'))
         yield Hostile(f'pipe{suffix}', write=os.mkfifo)
-        yield Hostile(f'zeros{suffix}', write=lambda path: path.symlink_to('/dev/zero'))
-        yield Hostile(f'random{suffix}', write=lambda path: path.symlink_to('/dev/urandom'))
         yield Hostile(f'directory{suffix}', write=Path.mkdir)
-        yield Hostile(f'memory{suffix}', write=lambda path: path.symlink_to('/proc/self/mem'))
-        yield Hostile(f'circle{suffix}', write=lambda path: path.symlink_to(path))
         yield Hostile(f'sparse{suffix}', write=_write_sparse)
         yield Hostile(f'empty{suffix}', b'')
         yield Hostile(f'control\x1b[2J\n{suffix}', b'x')
         yield Hostile(f'{"x" * 240}{suffix}', b'x')
     yield Hostile('folder_pipes', write=_write_pipes)
-    yield Hostile('folder_links', write=lambda path: path.symlink_to('/proc/self/root'))
+    yield Hostile('folder_links', write=partial(_link, '/proc/self/root'))
     yield Hostile('folder_many', write=_write_many)
+
+
+def _link(target: str, path: Path) -> None:
+    path.symlink_to(target)
 
 
 def _write_sparse(path: Path) -> None:
@@ -752,9 +631,9 @@ def _outputs() -> Iterator[Hostile]:
     """Places of outputs that lead elsewhere: links to a folder, and to a file, of somebody else."""
     # A folder on the way to an output may be a link.
     over = ('written over',)
-    yield Hostile('link.out', write=lambda path: path.symlink_to('../kept'), routes=over)
-    yield Hostile('linked_file.out', write=lambda path: path.symlink_to('../kept/canary'))
-    yield Hostile('nowhere.out', write=lambda path: path.symlink_to('../kept/new'))
+    yield Hostile('link.out', write=partial(_link, '../kept'), routes=over)
+    yield Hostile('linked_file.out', write=partial(_link, '../kept/canary'))
+    yield Hostile('nowhere.out', write=partial(_link, '../kept/new'))
     yield Hostile('folder.out', write=_write_linked)
     yield Hostile('file.out', b'alive')
     yield Hostile('pipe.out', write=os.mkfifo)

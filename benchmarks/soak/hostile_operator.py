@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,7 +27,7 @@ from benchmarks.soak.scenes import STEP_NS, stamped
 from benchmarks.soak.watched_node import Watched
 from hmt_ros.app.replay.player import LiveNodeError
 from hmt_ros.sessions.declared_parameters import declared_parameters
-from hmt_ros.sessions.image_inputs import KEYPOINTS
+from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK
 
 # Longest time without an answer to a call, and longer than usual without one to an image, s.
 ANSWER, GAP = 1.0, 0.5
@@ -39,7 +40,7 @@ _PASSWORDS = Path('/etc/passwd')
 
 def _while(amount: Amount) -> float:
     """How long something is done, s."""
-    return min(_FLOOD, 0.02 * amount.times, amount.seconds / 4)
+    return min(_FLOOD, max(0.3, 0.02 * amount.times), amount.seconds / 4)
 
 
 class _Fed:
@@ -51,6 +52,8 @@ class _Fed:
 
     def __init__(self, watched: Watched) -> None:
         self.watched = watched
+        # The client of its service has to be known to the node before time is taken.
+        watched.begin_to_set()
         self.begin()
 
     def begin(self) -> None:
@@ -106,11 +109,12 @@ def files_in_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> N
         if isinstance(parameter.default, str) and parameter.name in scene.session.CHECKED
     ]
     usual_values = dict(zip(names, watched.get(names), strict=True))
-    fed = _Fed(watched)
-    usual = fed.usual_gap(_while(amount))
     # The working folder and the home are where a node may read by default.
     with TemporaryDirectory(prefix='.hmt_ros.', dir=Path.home()) as folder:
-        given = [(name, value) for value in _odd_values(Path(folder)) for name in names]
+        values = list(islice(_odd_values(Path(folder)), amount.times))
+        given = [(name, value) for value in values for name in names]
+        fed = _Fed(watched)
+        usual = fed.usual_gap(_while(amount))
         for number in Amount(min(len(given), amount.times), amount.seconds).counted():
             name, value = given[number]
             done, why = _set(fed, name, value, outcome)
@@ -152,48 +156,42 @@ def _look_for_content(text: str, value: str, where: str, outcome: Outcome) -> No
 
 def _odd_values(folder: Path) -> Iterator[str]:
     """Names of files, of no files, and of what never ends; the worst last."""
-    texts: dict[str, Hostile] = {
-        'key.yaml': Hostile('', f'keypoints: {{{_TOKEN}: [1, 2]}}\nstamp_ns: {_TOKEN}\n'),
-        'value.yaml': Hostile('', f'stamp_ns: {_TOKEN}\nsigma_px: 1\nkeypoints: {{}}\n'),
-        'name.yaml': Hostile('', f'name: {_TOKEN}\nsegments: [{{name: {_TOKEN}, parent: x}}]\n'),
-        'extra.yaml': Hostile('', f'{_TOKEN}: 1\n'),
-        'text.yaml': Hostile('', f'{_TOKEN} {_TOKEN}: [{_TOKEN}\n'),
-        'tag.yaml': Hostile('', f'!{_TOKEN} 1\n'),
-        'alias.yaml': Hostile('', f'*{_TOKEN}\n'),
-        'list.yaml': Hostile('', '- 1\n' * 250_000),
-        'lists.yaml': Hostile('', '[' + '[],' * 300_000 + '1]'),
-        'digits.yaml': Hostile('', f'stamp_ns: {DIGITS}'),
-        'deep.yaml': Hostile('', DEEP),
-        'bomb.yaml': Hostile('', YAML_BOMBS['aliases']),
-        'x.json': Hostile('', f'{{"{_TOKEN}": [1]}}'),
-        'deep.npz': Hostile('', DEEP),
-        'bomb.npz': Hostile('', partial(zeros_archive, 600_000_000)),
-        'text.npz': Hostile('', f'PK{_TOKEN}'),
-        'x.png': Hostile('', _TOKEN),
-        'sparse.yaml': Hostile('', write=lambda path: os.truncate(os.open(path, 65), 2**33)),
-        'circle.yaml': Hostile('', write=lambda path: path.symlink_to(path)),
-        'link.yaml': Hostile('', write=lambda path: path.symlink_to(_PASSWORDS)),
-        'folder': Hostile('', write=Path.mkdir),
-        'zeros.yaml': Hostile('', write=lambda path: path.symlink_to('/dev/zero')),
-        'pipe.yaml': Hostile('', write=os.mkfifo),
+    texts = {
+        'key.yaml': f'keypoints: {{{_TOKEN}: [1, 2]}}\nstamp_ns: {_TOKEN}\n',
+        'value.yaml': f'stamp_ns: {_TOKEN}\nsigma_px: 1\nkeypoints: {{}}\n',
+        'name.yaml': f'name: {_TOKEN}\nsegments: [{{name: {_TOKEN}, parent: x}}]\n',
+        'extra.yaml': f'{_TOKEN}: 1\n',
+        'text.yaml': f'{_TOKEN} {_TOKEN}: [{_TOKEN}\n',
+        'tag.yaml': f'!{_TOKEN} 1\n',
+        'alias.yaml': f'*{_TOKEN}\n',
+        'list.yaml': '- 1\n' * 250_000,
+        'lists.yaml': '[' + '[],' * 300_000 + '1]',
+        'digits.yaml': f'stamp_ns: {DIGITS}',
+        'deep.yaml': DEEP,
+        'bomb.yaml': YAML_BOMBS['aliases'],
+        'x.json': f'{{"{_TOKEN}": [1]}}',
+        'deep.npz': DEEP,
+        'text.npz': f'PK{_TOKEN}',
+        'x.png': _TOKEN,
+        'bomb.npz': partial(zeros_archive, 600_000_000),
     }
-    yield from (
-        '/etc/passwd',
-        '/etc/shadow',
-        '/etc/hostname',
-        '/proc/self/environ',
-        '/proc/self/mem',
-    )
-    yield from (
-        '../../../../etc/passwd',
-        '~root/.bashrc',
-        CONTROL,
-        '/x' * 50_000,
-        '/proc/self/fd/0',
-    )
-    for name, file in texts.items():
-        file.make(folder / name)
-        yield str(folder / name)
+    # What is no file of its own, whose end may never come.
+    places: dict[str, Callable[[Path], object]] = {
+        'sparse.yaml': lambda path: os.truncate(os.open(path, os.O_WRONLY | os.O_CREAT), 2**33),
+        'circle.yaml': lambda path: path.symlink_to(path),
+        'link.yaml': lambda path: path.symlink_to(_PASSWORDS),
+        'folder': Path.mkdir,
+        'zeros.yaml': lambda path: path.symlink_to('/dev/zero'),
+        'pipe.yaml': os.mkfifo,
+    }
+    yield from ('/etc/passwd', '/etc/shadow', '/etc/hostname', '../../../../etc/passwd')
+    yield from ('/proc/self/environ', '/proc/self/mem', '/proc/self/fd/0', '~root/.bashrc')
+    yield from (CONTROL, '/x' * 50_000)
+    files = [Hostile(name, content) for name, content in texts.items()]
+    files += [Hostile(name, write=write) for name, write in places.items()]
+    for file in files:
+        file.make(folder / file.name)
+        yield str(folder / file.name)
 
 
 def floods(watched: Watched, amount: Amount, outcome: Outcome) -> None:
@@ -239,25 +237,32 @@ def floods(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 def stray_stamps(watched: Watched, amount: Amount, outcome: Outcome) -> None:
     """Stamps that cannot be, in messages of every source, and a clock that is set back."""
     scene, counted = watched.scene, watched.scene.session.COUNTED
-    keypoints = KEYPOINTS in scene.others
-    if keypoints:
-        watched.set(use_keypoints=True)
-    # Its stamps begin anew, too.
-    watched.anew()
-    watched.set(reset_on_time_jump=False)
+    inputs = [source for source in (KEYPOINTS, MASK) if source in scene.others]
+    watched.set(**{f'use_{source}': True for source in inputs})
 
     def refused(count: int, shift_ns: int = 0) -> int:
         found = 0
         for _ in range(count):
             stamp = scene.stamp(watched.index) + shift_ns
             watched.index += 1
-            if keypoints:
-                watched.send(KEYPOINTS, stamped(scene.others[KEYPOINTS], stamp))
+            for source in inputs:
+                watched.send(source, stamped(scene.others[source], stamp))
             found += bool(watched.send(counted, stamped(scene.message(0), stamp)).faults)
         return found
 
+    def begin() -> None:
+        watched.set(reset_on_time_jump=True)
+        watched.anew()
+        watched.set(reset_on_time_jump=False)
+
+    begin()
     refused(3)
-    sources = [source for source in (*scene.others, counted) if _head(_any_message(scene, source))]
+    # A source whose messages have no stamp can not be given one.
+    sources = [
+        source
+        for source in (*scene.others, counted)
+        if any(hasattr(_any_message(scene, source), x) for x in ('header', 'transforms'))
+    ]
     strays = ((0, 4_294_967_295), (3600, 0), (-3600, 0), (10**8, 0), (-(10**8), 10**9))
     given = [(source, stray) for stray in strays for source in sources]
     for number in Amount(min(len(given), amount.times), amount.seconds / 2).counted():
@@ -270,30 +275,20 @@ def stray_stamps(watched: Watched, amount: Amount, outcome: Outcome) -> None:
             outcome.lost += lost
             what = f'{seconds:+} s and {nanoseconds} ns'
             outcome.fault(f'{lost} of 5 images are refused after a {source} of {what}')
-            watched.set(reset_on_time_jump=True)
-            watched.anew()
-            watched.set(reset_on_time_jump=False)
+            begin()
     for back in (600, 2):
         refused(3)
         outcome.times += 1
         lost = refused(30, -back * 10**9)
         if lost > 10**9 // STEP_NS:
             outcome.fault(f'{lost} of 30 images are refused after a clock went back by {back} s')
-        watched.set(reset_on_time_jump=True)
-        watched.anew()
-        watched.set(reset_on_time_jump=False)
-    watched.set(reset_on_time_jump=True, **({'use_keypoints': False} if keypoints else {}))
+        begin()
+    watched.set(reset_on_time_jump=True, **{f'use_{source}': False for source in inputs})
     watched.anew()
 
 
 def _any_message(scene: Any, source: str) -> Any:
     return scene.others.get(source) or scene.message(0)
-
-
-def _head(message: Any) -> Any:
-    return (
-        message.transforms[0] if hasattr(message, 'transforms') else getattr(message, 'header', 0)
-    )
 
 
 def _with_stamp(message: Any, seconds: int, nanoseconds: int) -> Any:

@@ -16,7 +16,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS, PREDICTION
+from hmt_ros.sessions.image_inputs import DETECTIONS, IMAGE_TYPE, KEYPOINTS, MASK, PREDICTION
 from hmt_ros.sessions.people_session import PeopleSession
 from hmt_ros.sessions.session import Session
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
@@ -139,16 +139,18 @@ def _filter() -> Scene:
         {
             **_CAMERA,
             KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),
+            MASK: ('mask', IMAGE_TYPE),
             PREDICTION: ('pose_prediction', 'hmt_msgs/msg/PoseMixture'),
             **{source: (f'/{source}', TRANSFORMS_TYPE) for source in TRANSFORMS},
         },
-        (*_CAMERA_TOPICS, '/keypoints'),
+        (*_CAMERA_TOPICS, '/keypoints', '/mask'),
         # A static transform keeps no image waiting.
         ((CAMERA_INFO, info), (TF_STATIC, _transform('world', frame, 0))),
         images,
         {
             CAMERA_INFO: info,
             KEYPOINTS: _keypoints(start),
+            MASK: _mask(images[0]),
             PREDICTION: _mixture(0, MixtureKind.PREDICTION),
             TF_STATIC: _transform('world', frame, 0),
             TF: _transform('world', 'robot', start),
@@ -254,3 +256,11 @@ def _keypoints(stamp_ns: int) -> Any:
         u=np.linspace(200.0, 240.0, len(names)),
         v=np.linspace(100.0, 200.0, len(names)),
     )
+
+
+def _mask(image: Any) -> Any:
+    """A person in the middle of an image."""
+    mask = np.zeros(decode_image(image).shape[:2], np.uint8)
+    mask[mask.shape[0] // 4 : -8, mask.shape[1] // 3 : -mask.shape[1] // 3] = 255
+    stamp, frame = time_ns(image.header.stamp), str(image.header.frame_id)
+    return image_message(RosbagsMessages(), mask, stamp, frame)

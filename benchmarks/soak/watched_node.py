@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -15,18 +16,37 @@ from hmt_ros.sessions.handled import Handled
 
 OURS = '/hmt_ros/'
 # How long one message may take, s.
-PATIENCE = 60.0
+PATIENCE = 30.0
+# How long a node may take to start, kernels included, and a case beyond its time, s.
+_START, _OVERTIME = 300.0, 90.0
 # How long a valid message is waited for that may have been sent too early, s.
 SHORT = 2.0
 # Messages of a topic that wait for this process. While it is late it publishes on without
 # listening: answers beyond these would be lost here, though the node has given them.
 _QUEUE = 1000
+# Good answers in a row after which a session has begun: more than have to agree on a clock.
+_AGREEING = 4
 # Messages before memory is compared: kernels are compiled, buffers have grown.
 _WARM = 8
 
 
 class Silent(Exception):
     """Nothing was heard in time."""
+
+
+class _Limited:
+    """An executor in which nothing is waited for when time is over; all waits of a case spin it."""
+
+    def __init__(self, executor: Any, end: float) -> None:
+        self._executor = executor
+        self.end = end
+
+    def spin_once(self, timeout_sec: float) -> None:
+        if time.monotonic() > self.end:
+            raise LiveNodeError(
+                'something is waited for in vain, until the time of the case is over'
+            )
+        self._executor.spin_once(timeout_sec=timeout_sec)
 
 
 class Watched:
@@ -39,7 +59,12 @@ class Watched:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._opened = ExitStack()
+        self._end = math.inf
         self.restart()
+
+    def limit(self, seconds: float) -> None:
+        """Begins a case, whose waits end so much later at the latest, and some time beyond."""
+        self._end = self.player.executor.end = time.monotonic() + seconds + _OVERTIME
 
     def restart(self) -> None:
         """Starts it, in a domain of its own; ends the one that ran before."""
@@ -49,6 +74,8 @@ class Watched:
         scene = self.scene
         with ExitStack() as opened:
             self.player = Player(opened)
+            start = time.monotonic() + _START
+            self.player.executor = _Limited(self.player.executor, start)
             self.player.reliable.depth = _QUEUE
             for msgtype in (kind for _, kind in scene.inputs.values()):
                 self.player.classes.setdefault(msgtype, message_class(msgtype))
@@ -73,6 +100,7 @@ class Watched:
                 process.start()
             self.node.wait_until_active()
             self.node.wait_for_subscribers(tuple(scene.session.TOPICS), 1)
+            self.player.executor.end = self._end
             self._opened = opened.pop_all()
 
     def __enter__(self) -> Watched:
@@ -99,21 +127,24 @@ class Watched:
         return self.send(self.scene.session.COUNTED, self.scene.message(self.index - 1))
 
     def anew(self) -> None:
-        """Valid messages from the first on, until one is used: a session has begun."""
-        self.index = 0
+        """Valid messages from the first on, until some in a row are used: a session has begun.
+
+        The first ones after a step back of the clock wait until others agree with them.
+        """
+        self.index = good = 0
         end = time.monotonic() + PATIENCE
-        while time.monotonic() < end:
+        while good < _AGREEING:
+            if time.monotonic() > end:
+                raise LiveNodeError(f'the {self.node.title} uses no message any more')
             for source, message in self.scene.prelude:
                 self.node.publish(source, message)
             self.node.publish(self.scene.session.COUNTED, self.scene.message(self.index))
             self.index += 1
             with suppress(Silent):
-                while True:
-                    handled = self.answer(SHORT)
-                    if handled.source == self.scene.session.COUNTED and not handled.faults:
-                        self.settle()
-                        return
-        raise LiveNodeError(f'the {self.node.title} uses no message any more')
+                while (handled := self.answer(SHORT)).source != self.scene.session.COUNTED:
+                    pass
+                good = 0 if handled.faults else good + 1
+        self.settle()
 
     def answer(self, seconds: float) -> Handled:
         """What became of a message.

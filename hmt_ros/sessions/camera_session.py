@@ -58,6 +58,8 @@ CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 
 # Images that may wait for other inputs: half a second of a usual camera.
 MOST_INCOMPLETE = 16
+# Bytes of the images that may wait.
+MOST_BYTES = 2**29
 _LARGEST_PICTURE_FILE = 2**28  # bytes
 # Least time by which a later input may be later, to end the wait of an image, s.
 _LATER = 1.0
@@ -337,7 +339,9 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _drop_incomplete_images(self) -> None:
         most = max(self.parameters.queue_size, MOST_INCOMPLETE)
-        while len(self._waiting) > most:
+        size = sum(one.image.nbytes for one in self._waiting)
+        while len(self._waiting) > most or (size > MOST_BYTES and len(self._waiting) > 1):
+            size -= self._waiting[0].image.nbytes
             stamp = self._waiting.popleft().stamp_ns
             self._dropped.append(stamp)
             if self._camera is None:
@@ -354,7 +358,7 @@ class CameraSession(Session[CameraParameters, State]):
                     f'no {name}',
                     name,
                     f'image of {stamp} ns is dropped: no {name} of its stamp has come, and '
-                    f'{most} newer images wait',
+                    f'{len(self._waiting)} newer images wait',
                 )
 
     def _estimate_next(self, camera: Camera) -> None:

@@ -36,7 +36,7 @@ from msg_tools.bags.mcap_file import MAGIC as _MCAP_MAGIC
 from msg_tools.bags.mcap_file import McapFile
 from msg_tools.bags.sqlite_file import MAGIC as _SQLITE_MAGIC
 from msg_tools.bags.sqlite_file import SqliteFile
-from msg_tools.bags.storage import LARGEST, Channel, StoredMessage, faults_told
+from msg_tools.bags.storage import LARGEST, MAX_TOPICS, Channel, StoredMessage, faults_told
 from msg_tools.files.budget import Budget, BudgetError
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.message_types import typestore, typestore_of_definition
@@ -141,7 +141,11 @@ class BagReader(AbstractContextManager['BagReader']):
         self._size = sum(file.stat().st_size for file in paths)
         budget = Budget(self._size)
         try:
-            self._files = [self._open_file(file, budget) for file in paths]
+            self._files: list[SqliteFile | McapFile] = []
+            for each in paths:
+                self._files.append(self._open_file(each, budget))
+                if sum(len(one.counts) for one in self._files) > MAX_TOPICS:
+                    raise BagError(f'{self.path} has more than {MAX_TOPICS} topics in its files')
         except BaseException:
             self.close()
             raise

@@ -13,7 +13,14 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from msg_tools.bags.storage import LARGEST, NEVER, Channel, StoredMessage, faults_told
+from msg_tools.bags.storage import (
+    LARGEST,
+    MAX_TOPICS,
+    NEVER,
+    Channel,
+    StoredMessage,
+    faults_told,
+)
 from msg_tools.files.budget import Budget, BudgetError
 from msg_tools.messages.definitions import MAX_BYTES
 
@@ -22,7 +29,6 @@ MAGIC = b'SQLite format 3\x00'
 # Steps of the virtual machine of SQLite for a file, and more for each of its bytes: a row, which
 # has more than ten bytes, takes about thirty. Bytes that SQLite may take in the whole process.
 _STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE, _MEMORY = 10**7, 4, 10**5, 2**29
-_MAX_TOPICS = 2**16  # as in an MCAP file
 
 
 class SqliteFile:
@@ -58,8 +64,8 @@ class SqliteFile:
                 definition = definitions.get(msgtype, ('', ''))
                 self._channels[key] = Channel(topic, msgtype, encoding, *definition)
                 self.counts[self._channels[key]] += 0
-                if len(self._channels) > _MAX_TOPICS:
-                    raise BudgetError(f'it has more than {_MAX_TOPICS} topics')
+                if len(self._channels) > MAX_TOPICS:
+                    raise BudgetError(f'it has more than {MAX_TOPICS} topics')
             query = 'SELECT topic_id, count(*), min(timestamp) FROM messages GROUP BY topic_id'
             for key, count, start in _rows(database, query, (int, int, int), budget):
                 if key in self._channels:
@@ -101,12 +107,15 @@ def _mentions(database: sqlite3.Connection, word: str) -> bool:
 
 
 def _is_table(database: sqlite3.Connection, name: str) -> bool:
-    """Whether a name is that of a table, all columns of which are stored."""
-    kinds = database.execute(
-        "SELECT type FROM pragma_table_list(?) WHERE schema = 'main'", (name,)
-    ).fetchall()
+    """Whether a name is that of a table, all columns of which are stored.
+
+    What SQLite itself tells of tables and views it gets by expanding views, which may not end.
+    """
+    query = "SELECT 1 FROM sqlite_schema WHERE name = ? AND sql LIKE 'CREATE TABLE%'"
+    if database.execute(query, (name,)).fetchone() is None:
+        return False
     computed = database.execute('SELECT 1 FROM pragma_table_xinfo(?) WHERE hidden', (name,))
-    return kinds == [('table',)] and computed.fetchone() is None
+    return computed.fetchone() is None
 
 
 def _rows(

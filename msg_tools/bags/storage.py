@@ -12,6 +12,7 @@ from msg_tools.files.budget import BudgetError
 # Bytes of a message or a chunk: the largest images that are read have 2**26 pixels, uncompressed.
 LARGEST = 2**28
 NEVER = 2**64  # later than any log time
+MAX_TOPICS = 2**16  # of a bag, those of each file counted; a file of MCAP has no more
 
 
 class Channel(NamedTuple):

@@ -51,7 +51,7 @@ _JPEG_PIXELS_PER_BYTE = 512
 _PNG_PIXELS_PER_BYTE = 8 * 1032
 # Pixels that any file may have, and more for each of its bytes: a few small files of one colour
 # must not keep a reader for minutes.
-FREE_PIXELS, _PIXELS_PER_BYTE = 2**24, 100
+FREE_PIXELS, _PIXELS_PER_BYTE = 2**24, 16
 # Four channels of 16 bits that deflate does not compress; what follows would be inflated, too.
 _PNG_BYTES_PER_PIXEL, _PNG_BYTES = 9, 10_000
 

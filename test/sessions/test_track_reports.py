@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from hmt_ros.sessions import camera_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, CAMERA_MOVED, IMAGE, MOST_INCOMPLETE
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
@@ -128,6 +129,16 @@ def test_what_a_dropped_image_waited_for_is_known(stub_tracker, subject_file, sm
     one.count_dropped(3)
     assert one.state.held_up == ''
     assert one.state.counts['dropped'] == 1 + 2 + 3
+
+
+def test_images_that_wait_have_a_limit_of_bytes(
+    monkeypatch, stub_tracker, subject_file, small_camera
+):
+    one = TrackingSession(FilterParameters(subject_file=str(subject_file)), lambda output: None)
+    monkeypatch.setattr(camera_session, 'MOST_BYTES', 0)
+    for index in range(3):
+        one.take(IMAGE, small_camera.image(index))
+    assert one.state.counts['dropped'] == 2  # the newest still waits
 
 
 def test_what_is_needed_follows_the_parameters(stub_tracker, subject_file, small_camera):

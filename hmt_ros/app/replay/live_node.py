@@ -185,7 +185,7 @@ class LiveNode:
         for topic, stamp in handled.published:
             if topic not in self._arrived:
                 continue  # of a person, whose topics come and go
-            data = self._next(self._arrived[topic], START_SECONDS, f'{topic} of {stamp} ns')
+            data = self._next(self._arrived[topic], patience, f'{topic} of {stamp} ns')
             # DDS may pad a message to a multiple of four bytes.
             self._write(topic, stamp, canonical(data, self._topics[topic].msgtype))
         return handled

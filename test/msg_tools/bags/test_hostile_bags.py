@@ -14,7 +14,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex, Statistics
 
 from msg_tools import BagError, BagReader
-from msg_tools.bags import mcap_file, sqlite_file
+from msg_tools.bags import bag_reader, mcap_file, sqlite_file
 from msg_tools.messages import cdr
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -234,6 +234,15 @@ def test_the_files_of_a_folder_share_one_budget(tmp_path):
     assert 'is refused: it unpacks to more than' in error_of(tmp_path, peak=2**23)
 
 
+def test_the_topics_of_all_files_of_a_folder_are_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(bag_reader, 'MAX_TOPICS', 1)
+    for name in ('a.mcap', 'b.mcap'):
+        (tmp_path / name).write_bytes(MAGIC + HEADER + described() + END)
+    text = 'rosbag2_bagfile_information: {relative_file_paths: [a.mcap, b.mcap]}'
+    (tmp_path / 'metadata.yaml').write_text(text)
+    assert 'has more than 1 topics in its files' in error_of(tmp_path)
+
+
 def test_a_compressed_message(tmp_path):
     path = tmp_path / 'message.mcap'
     packed = zstandard.compress(b'\x00\x01\x00\x00' + ZEROS * 20)
@@ -337,7 +346,7 @@ def database(path, *statements):
     ],
 )
 def test_databases_that_are_no_bags(tmp_path, monkeypatch, statements, error):
-    monkeypatch.setattr(sqlite_file, '_MAX_TOPICS', 1000)
+    monkeypatch.setattr(sqlite_file, 'MAX_TOPICS', 1000)
     line = error_of(database(tmp_path / 'file.db3', *statements), peak=2**26)
     assert error in line
 
