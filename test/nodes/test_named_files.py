@@ -102,26 +102,30 @@ def test_no_content_of_a_file_of_the_launch_is_told(node_of, name, tmp_path):
     assert not [token for token in TOKENS if token in one.logged]
 
 
-def test_files_elsewhere_are_refused_whether_or_not_they_exist(node_of, subject_file, tmp_path):
+def test_files_elsewhere_are_refused_whether_or_not_they_exist(
+    node_of, subject_file, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
     inside = tmp_path / 'allowed'
     inside.mkdir()
-    (inside / 'link.yaml').symlink_to(subject_file)
-    one = node_of('filter_node', file_folders=str(inside), background_file=str(subject_file))
+    (inside / 'good.yaml').write_bytes(subject_file.read_bytes())
+    (tmp_path / 'outside.yaml').write_bytes(subject_file.read_bytes())
+    (inside / 'link.yaml').symlink_to(tmp_path / 'outside.yaml')
+    one = node_of('filter_node', file_folders='allowed', background_file='outside.yaml')
     reasons = set()
-    for path in (subject_file, tmp_path / 'not_there', inside / 'link.yaml', inside / '../x'):
-        good, reason = one.set(subject_file=str(path))
+    for path in ('outside.yaml', 'not_there', 'allowed/link.yaml', 'allowed/../x'):
+        good, reason = one.set(subject_file=path)
         assert not good
-        reasons.add(reason.replace(str(path), 'PATH'))
+        reasons.add(reason.replace(path, 'PATH'))
     assert reasons == {
-        f'subject_file: PATH lies in no folder of file_folders, which are {inside}: move it '
+        'subject_file: PATH lies in no folder of file_folders, which are allowed: move it '
         'there, or name it at launch'
     }
     # Named at launch: read, though it is no picture.
     good, reason = one.set(subject_file='')
-    assert f'background_file: {subject_file}: not a PNG or JPEG image' in reason
+    assert 'background_file: outside.yaml: not a PNG or JPEG image' in reason
     assert one.set(background_file='')[0]
-    (inside / 'good.yaml').write_bytes(subject_file.read_bytes())
-    assert one.set(subject_file=str(inside / 'good.yaml')) == (True, '')
+    assert one.set(subject_file='allowed/good.yaml') == (True, '')
 
 
 def test_usual_folders(tmp_path, monkeypatch):
