@@ -57,7 +57,7 @@ class _Fed:
         self.begin()
 
     def begin(self) -> None:
-        """Counts anew."""
+        """Counts from zero."""
         self._sent = False
         self._last = time.monotonic()
         self.gap = 0.0
@@ -231,7 +231,7 @@ def floods(watched: Watched, amount: Amount, outcome: Outcome) -> None:
             raise LiveNodeError(f'after a flood of {what} no call is answered')
         if (late := time.monotonic() - begin) > ANSWER + 10 * GAP:
             outcome.fault(f'after a flood of {what} a call is answered after {late:.1f} s')
-    watched.anew()
+    watched.begin_again()
 
 
 def stray_stamps(watched: Watched, amount: Amount, outcome: Outcome) -> None:
@@ -252,7 +252,7 @@ def stray_stamps(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
     def begin() -> None:
         watched.set(reset_on_time_jump=True)
-        watched.anew()
+        watched.begin_again()
         watched.set(reset_on_time_jump=False)
 
     begin()
@@ -284,7 +284,7 @@ def stray_stamps(watched: Watched, amount: Amount, outcome: Outcome) -> None:
             outcome.fault(f'{lost} of 30 images are refused after a clock went back by {back} s')
         begin()
     watched.set(reset_on_time_jump=True, **{f'use_{source}': False for source in inputs})
-    watched.anew()
+    watched.begin_again()
 
 
 def _any_message(scene: Any, source: str) -> Any:

@@ -59,11 +59,11 @@ def transitions(watched: Watched, amount: Amount, outcome: Outcome) -> None:
             outcome.fault(f'transition {transition} leads to {found}, wanted {state}')
             state = found
         if state == 3 and transition == _ACTIVATE and rng.random() < 0.3:
-            watched.anew()
+            watched.begin_again()
     while state != 3:
         watched.change({1: _CONFIGURE, 2: _ACTIVATE}[state])
         state = watched.state()
-    watched.anew()
+    watched.begin_again()
 
 
 def killed(watched: Watched, amount: Amount, outcome: Outcome) -> None:
@@ -83,7 +83,7 @@ def killed(watched: Watched, amount: Amount, outcome: Outcome) -> None:
             outcome.lost += not _has_come(watched)
         outcome.times += 1
         watched.restart()
-        watched.anew()
+        watched.begin_again()
 
 
 def _has_come(watched: Watched) -> bool:
@@ -191,7 +191,7 @@ def jumping_clock(watched: Watched, amount: Amount, outcome: Outcome) -> None:
     watched.values()
     watched.player.node.destroy_publisher(clock)
     watched.set(reset_on_time_jump=True, use_sim_time=False)
-    watched.anew()
+    watched.begin_again()
 
 
 def overload(watched: Watched, amount: Amount, outcome: Outcome) -> None:
@@ -271,7 +271,7 @@ def damaged_bytes(watched: Watched, amount: Amount, outcome: Outcome) -> None:
             outcome.fault(f'no answer to damaged bytes on {source}')
             continue
         outcome.refused += bool(handled.faults)
-    watched.anew()
+    watched.begin_again()
 
 
 def _asked(watched: Watched, rng: np.random.Generator) -> bool:
@@ -404,7 +404,7 @@ def nodes(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
     for scene in chosen:
         with ExitStack() as running:
             watched: Watched | None = None
-            # The last one starts a node anew, which takes seconds of the processor.
+            # The last one starts a node again, which takes seconds of the processor.
             for done, case, share in CASES[: -1 if quick else None]:
                 outcome = Outcome(scene.title, done)
                 try:

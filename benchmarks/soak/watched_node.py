@@ -126,7 +126,7 @@ class Watched:
         self.index += 1
         return self.send(self.scene.session.COUNTED, self.scene.message(self.index - 1))
 
-    def anew(self) -> None:
+    def begin_again(self) -> None:
         """Valid messages from the first on, until some in a row are used: a session has begun.
 
         The first ones after a step back of the clock wait until others agree with them.
