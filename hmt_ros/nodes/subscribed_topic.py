@@ -20,8 +20,8 @@ from msg_tools.messages.message_types import register_definitions
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-# For `~/handled`: a client that waits for each answer must not miss the answers to a burst. A turn of
-# the thread that estimates answers 100 dropped messages, and all that waited.
+# For `~/handled`: a client that waits for each answer must not miss the answers to a burst. A turn
+# of the thread that estimates answers 100 dropped messages, and all that waited.
 ANSWERS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     depth=1,
