@@ -222,6 +222,7 @@ setup(
         'PyYAML',
         'matplotlib',
         'pillow',
+        'lz4',
         'mcap',
         'rosbags',
         'tqdm',

@@ -112,8 +112,8 @@ def parameter_file_text(node: str, settings: Any, like: str = '', others: Any = 
     """A parameter file with all parameters, each under a comment that describes it.
 
     Args:
-        like: name of a node whose parameters this one has, too, and whose file lists those that
-            are the same; '': there is none.
+        like: name of the node whose file lists the parameters that both share; '' if no node
+            shares them.
         others: settings of that node.
     """
     from hmt_ros.sessions.declared_parameters import EFFECTS, declared_parameters

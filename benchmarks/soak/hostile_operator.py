@@ -101,7 +101,7 @@ class _Fed:
 
 
 def files_in_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Odd files as values of all parameters that name one: no content is told, nothing waits."""
+    """Odd files as values of file parameters: reasons repeat no content, and calls do not wait."""
     scene = watched.scene
     names = [
         parameter.name
@@ -175,7 +175,7 @@ def _odd_values(folder: Path) -> Iterator[str]:
         'x.png': _TOKEN,
         'bomb.npz': partial(zeros_archive, 600_000_000),
     }
-    # What is no file of its own, whose end may never come.
+    # Links, pipes, devices, folders and sparse files: reading one may never end.
     places: dict[str, Callable[[Path], object]] = {
         'sparse.yaml': lambda path: os.truncate(os.open(path, os.O_WRONLY | os.O_CREAT), 2**33),
         'circle.yaml': lambda path: path.symlink_to(path),

@@ -45,7 +45,7 @@ def last_resort(
         if signal.getsignal(number) is signal.SIG_DFL:
             # As an exception, the signal has what is unfinished removed.
             signal.signal(number, lambda seen, _: sys.exit(SIGNALLED + seen))
-    # What an error held goes while lines are told, with what its finalisers say.
+    # The finalisers of what an error held run, and may print, while stderr is still redirected.
     with nullcontext() if debug else _told_in_lines(program):
         try:
             try:

@@ -142,9 +142,11 @@ class BagReader(AbstractContextManager['BagReader']):
         budget = Budget(self._size)
         try:
             self._files: list[SqliteFile | McapFile] = []
+            topics = 0
             for each in paths:
                 self._files.append(self._open_file(each, budget))
-                if sum(len(one.counts) for one in self._files) > MAX_TOPICS:
+                topics += len(self._files[-1].counts)
+                if topics > MAX_TOPICS:
                     raise BagError(f'{self.path} has more than {MAX_TOPICS} topics in its files')
         except BaseException:
             self.close()

@@ -107,15 +107,9 @@ def _mentions(database: sqlite3.Connection, word: str) -> bool:
 
 
 def _is_table(database: sqlite3.Connection, name: str) -> bool:
-    """Whether a name is that of a table, all columns of which are stored.
-
-    What SQLite itself tells of tables and views it gets by expanding views, which may not end.
-    """
-    query = "SELECT 1 FROM sqlite_schema WHERE name = ? AND sql LIKE 'CREATE TABLE%'"
-    if database.execute(query, (name,)).fetchone() is None:
-        return False
-    computed = database.execute('SELECT 1 FROM pragma_table_xinfo(?) WHERE hidden', (name,))
-    return computed.fetchone() is None
+    """Whether a name is that of a table with stored columns only, in a schema without views."""
+    columns = database.execute('SELECT hidden FROM pragma_table_xinfo(?)', (name,)).fetchall()
+    return bool(columns) and not any(hidden for (hidden,) in columns)
 
 
 def _rows(

@@ -168,7 +168,7 @@ def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
         ('a.json', '{', 'not JSON'),
         ('a.json', {'people': []}, 'entry 0 has no image_id or no keypoints: a file for each fr'),
         ('a.json', {'annotations': []}, 'no list images'),
-        ('a.json', [1], 'entry 0 is no object'),
+        ('a.json', [1], 'entry 0 is not an object'),
         ('a.json', {'a': 1}, 'no known layout of JSON; wanted a list of'),
         ('a.json', [{'keypoints': []}], 'entry 0 has no image_id or no keypoints'),
         ('a.json', [{'image_id': 0, 'keypoints': [1, 2]}], 'entry 0 has 2 numbers'),

@@ -83,7 +83,7 @@ def _annotations(found: FoundPersons, content: dict[str, Any]) -> tuple[Any, lis
     for image in _list(content, 'images'):
         name = image.get('file_name') or image.get('id')
         if not (isinstance(image.get('id'), (int, str)) and isinstance(name, (int, str))):
-            raise ValueError('an image has no id, or a file_name that is no text')
+            raise ValueError('an image has no id, or its file_name is not text')
         labels[str(image['id'])] = name
         found.size = image_size_of(image.get('width'), image.get('height')) or found.size
     categories = _get(content, ('categories',))
@@ -112,7 +112,7 @@ def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
         for i, entry in enumerate(content):
             entry = load_plain_json(entry) if isinstance(entry, str) else entry
             if not isinstance(entry, (dict, list)):
-                raise ValueError(f'entry {i} is no object')
+                raise ValueError(f'entry {i} is not an object')
             own = _get(entry, _FRAME, label)
             if isinstance(entry, list):
                 yield i, entry
