@@ -33,7 +33,7 @@ def test_every_benchmark_has_its_page():
     assert set(pages) == {*BENCHMARKS}
     for name, text in pages.items():
         assert text.startswith(f'# {name}: {BENCHMARKS[name]}\n'), name
-        assert f'python -m benchmarks {name}\n' in text
+        assert f'\npython -m benchmarks {name}' in text, name
 
 
 def test_command_line(capsys):
