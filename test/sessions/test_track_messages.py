@@ -54,6 +54,11 @@ def track(body):
             values=np.array([-2.5, -1.5]),
             errors=CueErrors(0.25, 0.125),
             shape_covariance=0.01 * np.eye(body.dimension),
+            identities=np.array([3, 1]),
+            posterior_weights=np.array([0.25, 0.75]),
+            origins=np.array([[0.5, 0.25, 0.25], [0.0, 0.0, 1.0]]),
+            ancestors=np.array([1, 4, 2]),
+            ancestry_stamp=STAMP - 1,
         ),
         point_estimate=poses[1],
         ground=Ground(np.array([0.0, -0.8, -0.6]), 0.05, 1.5, 0.1),
@@ -127,6 +132,14 @@ def test_mixtures(track, body):
     shape = track.tracker.estimate.likelihood.shape_covariance.reshape(-1)
     assert np.array_equal(likelihood.shape_covariance, shape)
     assert len(posterior.shape_covariance) == 0
+    # So is the chain of the modes, about which its components are.
+    of_posterior, of_likelihood = (pose_mixture_of(x) for x in (posterior, likelihood))
+    assert of_likelihood.identities.tolist() == [3, 1]
+    assert of_likelihood.posterior_weights.tolist() == [0.25, 0.75]
+    assert of_likelihood.ancestry.tolist() == [[0.5, 0.25, 0.25], [0.0, 0.0, 1.0]]
+    assert of_likelihood.ancestry_ids.tolist() == [1, 4, 2]
+    assert of_likelihood.ancestry_stamp_ns == STAMP - 1
+    assert (of_posterior.posterior_weights, of_posterior.ancestry) == (None, None)
     # The posterior tells what the cues are believed.
     assert (posterior.cue_names, list(posterior.cue_probabilities)) == (
         ['depth', 'track'],
@@ -211,6 +224,11 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
             values=np.zeros(2),
             errors=CueErrors(0.25, 0.125),
             shape_covariance=np.zeros((body.dimension, body.dimension)),
+            identities=np.arange(1, 3),
+            posterior_weights=np.full(2, 0.5),
+            origins=np.empty((2, 0)),
+            ancestors=np.empty(0, dtype=int),
+            ancestry_stamp=None,
         ),
         point_estimate=poses[1],
     )
