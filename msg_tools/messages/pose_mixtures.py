@@ -202,13 +202,16 @@ class PoseMixture:
 
     def _check_chain(self, ancestry_ids: NDArray[np.uint32]) -> None:
         """Raises MessageError where posterior weights and ancestry are no probabilities."""
+        assert self.identities is not None
         if len(self.weights) and self.posterior_weights is not None:
             check_weights(self.posterior_weights, 'mixture: posterior')
             check_once(self.identities, 'mixture')
-        if len(ancestry_ids) and self.ancestry is None:
-            raise MessageError('mixture has ancestry_ids, and no ancestry')
+        if not len(ancestry_ids):
+            return
         check_once(ancestry_ids, 'mixture: ancestry')
-        for k, row in enumerate(self.ancestry if len(ancestry_ids) else ()):
+        if self.ancestry is None:
+            raise MessageError('mixture has ancestry_ids, and no ancestry')
+        for k, row in enumerate(self.ancestry):
             check_weights(row, f'mixture: ancestry of component {k}')
 
     @classmethod
@@ -462,7 +465,7 @@ def _existence(message: Any, state: TrackState) -> float:
     return math.nan if state is TrackState.UNKNOWN and value == 0.0 else value
 
 
-def _errors(message: Any) -> dict[str, float]:
+def _errors(message: Any) -> dict[str, Any]:
     """The error model; none where a publisher leaves it alone, and so 0."""
     if message.error_share == 0.0:
         return {}
