@@ -215,5 +215,5 @@ def no_likelihood(dimension: int) -> Likelihood:
     nothing = GaussianMixture(np.empty(0), np.empty((0, dimension)), square[None][:0])
     none, nobody = np.empty(0), np.empty(0, dtype=np.intp)
     return Likelihood(
-        nothing, none, ERRORS['image'], square, nobody, none, nobody, none[:, None], nobody, None
+        nothing, none, ERRORS['image'], square, nobody, none, nobody, square[:0, :0], nobody, None
     )
