@@ -277,6 +277,11 @@ def _likelihood(track: TrackedImage) -> PoseMixture:
         error_time=found.errors.time,
         shape_covariance=shape,
         reason=tracker.estimate.reason,
+        identities=found.identities,
+        posterior_weights=found.posterior_weights,
+        ancestry=found.origins,
+        ancestry_stamp_ns=found.ancestry_stamp or 0,
+        ancestry_ids=found.ancestors,
     )
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.error_model import (
     LIFTED_AS_KEYPOINTS,
@@ -53,12 +53,25 @@ class Likelihood:
         values: (K,) log likelihoods of the image at its means, nats.
         errors: how its errors last, all cues together.
         shape_covariance: (d, d) J P J' at the heaviest mode of the posterior.
+        modes: (K,) of the posterior, in the order of the components, which are about one each.
+        posterior_weights: (K,) of these modes, given all images so far; they sum to 1.
+        identities: (K,) of these modes, see `Identities`.
+        origins: (K, M) probability that each continues component m of the likelihood of the image
+            before; M is 0 where the modes begin. See `LaggedWeights`.
+        ancestors: (M,) identities of those components.
+        ancestry_stamp: of the image before, ns; None: the modes begin.
     """
 
     mixture: GaussianMixture
     values: Array
     errors: CueErrors
     shape_covariance: Array
+    modes: Index
+    posterior_weights: Array
+    identities: Index
+    origins: Array
+    ancestors: Index
+    ancestry_stamp: int | None
 
 
 def posterior_modes(
@@ -122,7 +135,11 @@ def posterior_modes(
 
 
 def likelihood_modes(
-    modes: Modes, posterior: Posterior, observation: Observation, shape: ShapeEstimate
+    modes: Modes,
+    posterior: Posterior,
+    observation: Observation,
+    shape: ShapeEstimate,
+    before: tuple[int | None, Likelihood],
 ) -> Likelihood:
     """The modes of the likelihood alone, without information from the images before.
 
@@ -136,6 +153,7 @@ def likelihood_modes(
         posterior: of the image.
         observation: of the image.
         shape: of the person, as far as it is known.
+        before: stamp, ns, and likelihood of the image before; without meaning where modes begin.
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation, LIFTED_AS_KEYPOINTS)
@@ -147,12 +165,27 @@ def likelihood_modes(
     means = np.clip(poses + step, body.lower, body.upper)
     volumes = 0.5 * np.linalg.slogdet(covariances)[1]
     weights = np.exp(at_least(normalised(volumes - fit.energy.value), MIN_LOG_WEIGHT))
-    mixture = GaussianMixture(weights, means, covariances).sorted()
+    order = np.argsort(-weights, kind='stable')
+    mixture = GaussianMixture(weights, means, covariances)[order]
     seen = PoseEnergy(posterior.likelihood, posterior.likelihood.seen(observation))
     values = -seen.energy(mixture.means, derivatives=Derivatives.NONE).value
     gives_way = covariances[:1] * (fit.free[:1, :, None] & fit.free[:1, None, :])
     unknown = shape.considered(posterior.likelihood, observation, poses[:1], gives_way)[0]
-    return Likelihood(mixture, values, _errors(fit, covariances, weights), unknown)
+    stamp, ancestral = before
+    follows = modes.origins.shape[1] > 0
+    columns = slice(None if follows else 0)
+    return Likelihood(
+        mixture,
+        values,
+        _errors(fit, covariances, weights),
+        unknown,
+        modes=order,
+        posterior_weights=modes.mixture.weights[order],
+        identities=modes.identities[order],
+        origins=modes.origins[order][:, ancestral.modes[columns]],
+        ancestors=ancestral.identities[columns],
+        ancestry_stamp=stamp if follows else None,
+    )
 
 
 def _errors(fit: ImageFit, covariances: Array, weights: Array) -> CueErrors:

@@ -213,4 +213,7 @@ def no_likelihood(dimension: int) -> Likelihood:
     """The likelihood over poses of d variables before the first image: it says nothing."""
     square = np.zeros((dimension, dimension))
     nothing = GaussianMixture(np.empty(0), np.empty((0, dimension)), square[None][:0])
-    return Likelihood(nothing, np.empty(0), ERRORS['image'], square)
+    none, nobody = np.empty(0), np.empty(0, dtype=np.intp)
+    return Likelihood(
+        nothing, none, ERRORS['image'], square, nobody, none, nobody, square[:0, :0], nobody, None
+    )

@@ -478,13 +478,16 @@ class Tracker:
             observation: that the modes were fitted to; None: they were not.
         """
         state, track = self._state, self._track
+        before, modes = state.stamp, track.modes
         state.stamp, foreseen = stamp, state.begun and observation is None
         if foreseen:
             track.point.expect(track.person, track.dynamics, state.age(stamp))
             observation = Observation()
+            # The modes are kept as they are.
+            modes = replace(modes, origins=np.eye(len(modes)))
         if observation is not None:
             self._likelihood = likelihood_modes(
-                track.modes, track.posterior, observation, track.shape
+                modes, track.posterior, observation, track.shape, (before, self._likelihood)
             )
         self.estimate = self._estimate(foreseen=foreseen)
         if observation is None:

@@ -39,7 +39,7 @@ from msg_tools.bags.sqlite_file import SqliteFile
 from msg_tools.bags.storage import LARGEST, MAX_TOPICS, Channel, StoredMessage, faults_told
 from msg_tools.files.budget import Budget, BudgetError
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.message_types import typestore, typestore_of_definition
+from msg_tools.messages.message_types import adopted, typestore_of_definition
 
 _log = logging.getLogger(__name__)
 
@@ -292,12 +292,11 @@ class BagReader(AbstractContextManager['BagReader']):
                     channel.definition_encoding,
                     channel.definition,
                 )
-            if store is not typestore() and stored.msgtype.startswith(_OURS):
-                raise ValueError('it was recorded with another definition of this type')
             # Bags with the compression mode "message". No CDR message starts like this.
             if data[:4] == _ZSTD_MAGIC:
                 data = b''.join(_decompressed(data, budget, LARGEST))
-            return deserialise(data, stored.msgtype, store, budget)
+            message = deserialise(data, stored.msgtype, store, budget)
+            return adopted(message, store) if stored.msgtype.startswith(_OURS) else message
         except Exception as error:
             # Bytes from outside meet generated code here, which does not say what it may raise.
             raise BagError(

@@ -99,6 +99,13 @@ def identities_of(values: NDArray[Any] | None, count: int, what: str) -> NDArray
     return result
 
 
+def check_once(identities: NDArray[Any], what: str) -> None:
+    """Raises MessageError where an identity other than 0, no identity, is there twice."""
+    known, counts = np.unique(identities[identities > 0], return_counts=True)
+    if (counts > 1).any():
+        raise MessageError(f'{what} has the identity {known[counts > 1][0]} twice', 'identities')
+
+
 def constant_of(kind: type[Constant], value: Any, fault: str) -> Constant:
     """The constant of a message that a value is.
 

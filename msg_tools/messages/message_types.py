@@ -121,6 +121,30 @@ def _same_fields(name: str, types: Types, known: Typestore) -> bool:
     ]
 
 
+def adopted(value: Any, types: Typestore) -> Any:
+    """A message of an older definition of its type as one of `typestore()`.
+
+    Fields that it does not have are zero or empty.
+
+    Args:
+        value: the message, or the value of one of its fields.
+        types: by which it was read.
+
+    Raises:
+        ValueError: a field that the type of `typestore()` does not have.
+    """
+    if isinstance(value, list):
+        return [adopted(item, types) for item in value]
+    msgtype = getattr(value, '__msgtype__', None)
+    if msgtype is None or types is typestore():
+        return value
+    fields, known = types.fielddefs[msgtype][1], typestore().fielddefs[msgtype][1]
+    if any(field not in known for field in fields):
+        raise ValueError('it was recorded with another definition of this type')
+    values = {name: adopted(getattr(value, name), types) for name, _ in fields}
+    return RosbagsMessages().create(msgtype, **values)
+
+
 _POINT = 'geometry_msgs/msg/Point'
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body
 from hmt_ros.body.mirror import relevelled
 from hmt_ros.inference import GaussianMixture
-from msg_tools.messages.headers import header_message, time_ns
+from msg_tools.messages.headers import header_message, time_message, time_ns
 from msg_tools.messages.message_error import (
     Array,
     MessageError,
@@ -26,11 +26,13 @@ from msg_tools.messages.message_error import (
     check_covariances,
     check_finite,
     check_names,
+    check_once,
     check_weights,
     complete_mixture,
     constant_of,
     flat,
     freeze_arrays,
+    identities_of,
     lengths_of,
     named_numbers,
     names_of,
@@ -41,7 +43,8 @@ from msg_tools.messages.message_types import MessageFactory
 POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 # No node publishes more components; a message with millions would block its reader.
 MAX_COMPONENTS = 1024
-# Arrays of the joints of each component that may be unknown.
+# Arrays that only a likelihood has, and those of joints; they may be unknown.
+OF_LIKELIHOODS = ('shape_covariance', 'posterior_weights', 'ancestry')
 OF_JOINTS = ('joint_covariances', 'joint_covariances_relative', 'joint_velocities')
 
 
@@ -104,6 +107,12 @@ class PoseMixture:
         shape_covariance: (d, d) of the errors shared by poses of all images, as the lengths and
             the flesh of the person are not known exactly, beside a likelihood; None: unknown.
         reason: what is missing where the pose is not known; '' where nothing is.
+        posterior_weights: (K,) of the components, given all images so far, beside a likelihood of
+            the filter; they sum to 1. None: unknown.
+        ancestry: (K, M) probability that each component continues component m of the likelihood of
+            the image before; each row sums to 1. M = 0: the modes begin. None: unknown.
+        ancestry_stamp_ns: of that likelihood; 0: unknown, or there is none.
+        ancestry_ids: (M,) its identities; None: none.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -134,10 +143,17 @@ class PoseMixture:
     cue_probabilities: Mapping[str, float] = field(default_factory=dict)
     shape_covariance: Array | None = None
     reason: str = ''
+    posterior_weights: Array | None = None
+    ancestry: Array | None = None
+    ancestry_stamp_ns: int = 0
+    ancestry_ids: NDArray[np.uint32] | None = None
 
     def __post_init__(self) -> None:
         complete_mixture(self, 'mixture')
         components, d, joints = len(self.weights), len(self.dof_names), len(self.joint_names)
+        ancestors = 0 if self.ancestry_ids is None else len(self.ancestry_ids)
+        ids = identities_of(self.ancestry_ids, ancestors, 'mixture: ancestry')
+        object.__setattr__(self, 'ancestry_ids', ids)
         shapes = {
             'weights': (components,),
             'means': (components, d),
@@ -149,13 +165,15 @@ class PoseMixture:
             'log_likelihoods': (components,),
             'degrees_of_freedom': (components,),
             'shape_covariance': (d, d),
+            'posterior_weights': (components,),
+            'ancestry': (components, ancestors),
         }
         if self.log_likelihoods is None:
             object.__setattr__(self, 'log_likelihoods', np.full(components, np.nan))
         if self.degrees_of_freedom is None:
             object.__setattr__(self, 'degrees_of_freedom', np.zeros(components))
         freeze_arrays(
-            self, shapes, 'mixture', optional=('covariances', 'shape_covariance', *OF_JOINTS)
+            self, shapes, 'mixture', optional=('covariances', *OF_LIKELIHOODS, *OF_JOINTS)
         )
         check_finite(self.means, 'mixture: mean')
         for name in ('joint_positions', *OF_JOINTS):
@@ -163,6 +181,7 @@ class PoseMixture:
                 check_finite(values, f'mixture: {name}')
         if components:
             check_weights(self.weights, 'mixture')
+        self._check_chain(ids)
         for cue, probability in self.cue_probabilities.items():
             if not 0.0 <= probability <= 1.0:
                 raise MessageError(
@@ -180,6 +199,20 @@ class PoseMixture:
             check_covariances(self.covariances, 'mixture')
         if self.shape_covariance is not None:
             check_covariances(self.shape_covariance, 'the shape', singular=True)
+
+    def _check_chain(self, ancestry_ids: NDArray[np.uint32]) -> None:
+        """Raises MessageError where posterior weights and ancestry are no probabilities."""
+        assert self.identities is not None
+        if len(self.weights) and self.posterior_weights is not None:
+            check_weights(self.posterior_weights, 'mixture: posterior')
+            check_once(self.identities, 'mixture')
+        if not len(ancestry_ids):
+            return
+        check_once(ancestry_ids, 'mixture: ancestry')
+        if self.ancestry is None:
+            raise MessageError('mixture has ancestry_ids, and no ancestry')
+        for k, row in enumerate(self.ancestry):
+            check_weights(row, f'mixture: ancestry of component {k}')
 
     @classmethod
     def of_body(
@@ -202,6 +235,10 @@ class PoseMixture:
         cue_probabilities: Mapping[str, float] | None = None,
         shape_covariance: Array | None = None,
         reason: str = '',
+        posterior_weights: Array | None = None,
+        ancestry: Array | None = None,
+        ancestry_stamp_ns: int = 0,
+        ancestry_ids: NDArray[Any] | None = None,
     ) -> PoseMixture:
         """A mixture over the poses of a body at its present lengths.
 
@@ -216,8 +253,8 @@ class PoseMixture:
                 are measured against the camera, whatever the level of the body.
             joint_positions: (K, J, 3) m, of the means; None: computed here.
             kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
-                existence_probability, error_share, error_time, shape_covariance, reason: see the
-                attributes.
+                existence_probability, error_share, error_time, shape_covariance, reason,
+                posterior_weights, ancestry, ancestry_stamp_ns, ancestry_ids: see the attributes.
             velocities: (K, d) of the poses, per second; None: unknown.
             cue_probabilities: see the attributes; None: unknown.
 
@@ -265,6 +302,10 @@ class PoseMixture:
             cue_probabilities=cue_probabilities or {},
             shape_covariance=shape_covariance,
             reason=reason,
+            posterior_weights=posterior_weights,
+            ancestry=ancestry,
+            ancestry_stamp_ns=ancestry_stamp_ns,
+            ancestry_ids=ancestry_ids,
         )
 
     @cached_property
@@ -300,7 +341,9 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
     assert content.log_likelihoods is not None
     assert content.degrees_of_freedom is not None
     assert content.identities is not None
-    shape = content.shape_covariance
+    shape, weights = content.shape_covariance, content.posterior_weights
+    if weights is None:
+        weights = np.zeros(len(content.weights))
     components = [
         messages.create(
             'hmt_msgs/msg/PoseComponent',
@@ -314,6 +357,8 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
             joint_covariances=flat(content.joint_covariances, k),
             joint_covariances_relative=flat(content.joint_covariances_relative, k),
             joint_velocities=flat(content.joint_velocities, k),
+            posterior_weight=float(weights[k]),
+            ancestry=flat(content.ancestry, k),
         )
         for k in np.argsort(-content.weights, kind='stable')
     ]
@@ -336,6 +381,8 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
         segment_names=list(content.segment_lengths),
         segment_lengths=np.array(list(content.segment_lengths.values()), dtype=np.float64),
         reason=content.reason,
+        ancestry_stamp=time_message(messages, content.ancestry_stamp_ns),
+        ancestry_ids=content.ancestry_ids,
     )
 
 
@@ -408,6 +455,7 @@ def pose_mixture_of(
         shape_covariance=_shape_covariance(message, d),
         reason=str(message.reason),
         **_errors(message),
+        **_chain(message),
     )
 
 
@@ -417,11 +465,27 @@ def _existence(message: Any, state: TrackState) -> float:
     return math.nan if state is TrackState.UNKNOWN and value == 0.0 else value
 
 
-def _errors(message: Any) -> dict[str, float]:
+def _errors(message: Any) -> dict[str, Any]:
     """The error model; none where a publisher leaves it alone, and so 0."""
     if message.error_share == 0.0:
         return {}
     return {'error_share': float(message.error_share), 'error_time': float(message.error_time)}
+
+
+def _chain(message: Any) -> dict[str, Any]:
+    """Weights and ancestry; none where a publisher leaves them alone, and so 0 or empty."""
+    weights = np.array([c.posterior_weight for c in message.components])
+    told, ids = np.nan_to_num(weights).any(), message.ancestry_ids
+    rows = [
+        numbers(c.ancestry, (len(ids),), f'mixture: component {k}: ancestry')
+        for k, c in enumerate(message.components)
+    ]
+    return {
+        'posterior_weights': weights if told else None,
+        'ancestry': np.reshape(rows, (len(rows), len(ids))) if told or len(ids) else None,
+        'ancestry_stamp_ns': time_ns(message.ancestry_stamp),
+        'ancestry_ids': np.array(ids),
+    }
 
 
 def _shape_covariance(message: Any, d: int) -> Array | None:

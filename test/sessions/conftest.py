@@ -61,6 +61,11 @@ class StubTracker:
             values=np.array([-1.5, -2.5]),
             errors=CueErrors(0.25, 0.125),
             shape_covariance=np.zeros((body.dimension, body.dimension)),
+            identities=np.array([77, 1]),
+            posterior_weights=np.array([0.6, 0.4]),
+            origins=np.empty((2, 0)),
+            ancestors=np.empty(0, dtype=int),
+            ancestry_stamp=None,
         )
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up

@@ -9,16 +9,18 @@ from scipy.spatial.transform import Rotation
 
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
+from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.track_messages import TOPICS, TrackedImage, track_messages
 from hmt_ros.sessions.tracking_parameters import FilterParameters
-from hmt_ros.tracking import Status
+from hmt_ros.tracking import Status, Tracker, TrackerSettings
 from hmt_ros.tracking.ground import Ground
 from msg_tools import MessageError
-from msg_tools.messages.cdr import serialise
+from msg_tools.messages.cdr import deserialise, serialise
 from msg_tools.messages.ground import ground_of
 from msg_tools.messages.images import decode_image
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
@@ -54,6 +56,11 @@ def track(body):
             values=np.array([-2.5, -1.5]),
             errors=CueErrors(0.25, 0.125),
             shape_covariance=0.01 * np.eye(body.dimension),
+            identities=np.array([3, 1]),
+            posterior_weights=np.array([0.25, 0.75]),
+            origins=np.array([[0.5, 0.25, 0.25], [0.0, 0.0, 1.0]]),
+            ancestors=np.array([1, 4, 2]),
+            ancestry_stamp=STAMP - 1,
         ),
         point_estimate=poses[1],
         ground=Ground(np.array([0.0, -0.8, -0.6]), 0.05, 1.5, 0.1),
@@ -127,12 +134,60 @@ def test_mixtures(track, body):
     shape = track.tracker.estimate.likelihood.shape_covariance.reshape(-1)
     assert np.array_equal(likelihood.shape_covariance, shape)
     assert len(posterior.shape_covariance) == 0
+    # So is the chain of the modes, about which its components are.
+    of_posterior, of_likelihood = (pose_mixture_of(x) for x in (posterior, likelihood))
+    assert of_likelihood.identities.tolist() == [3, 1]
+    assert of_likelihood.posterior_weights.tolist() == [0.25, 0.75]
+    assert of_likelihood.ancestry.tolist() == [[0.5, 0.25, 0.25], [0.0, 0.0, 1.0]]
+    assert of_likelihood.ancestry_ids.tolist() == [1, 4, 2]
+    assert of_likelihood.ancestry_stamp_ns == STAMP - 1
+    assert (of_posterior.posterior_weights, of_posterior.ancestry) == (None, None)
     # The posterior tells what the cues are believed.
     assert (posterior.cue_names, list(posterior.cue_probabilities)) == (
         ['depth', 'track'],
         [0.25, 1.0],
     )
     assert (likelihood.cue_names, len(likelihood.cue_probabilities)) == ([], 0)
+
+
+def test_the_chain_of_the_modes_passes_through_messages(track, body):
+    """Weights given later images, from messages alone, are those of the filter, by identities."""
+    settings = TrackerSettings(
+        candidates=8,
+        likelihood=LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints),
+        flow_weight=0.0,
+        estimate_shape=False,
+        lifter='',
+    )
+    tracker, pose = Tracker(body, CAMERA, settings), poses_of(body, 3)[1]
+    tracker.reset(GaussianMixture(np.ones(1), pose[None], 0.01 * np.eye(len(pose))[None]))
+    black, rng, count = np.zeros((240, 320, 3), np.uint8), np.random.default_rng(0), 6
+    contents, modes = [], []
+    for i in range(count):
+        pose[body.dof_names.index('left_elbow')] += 0.1
+        pixels = CAMERA.project(body.joint_positions(pose[None]))[0]
+        pixels += rng.normal(size=pixels.shape)
+        covariances = np.tile(np.eye(2), (len(pixels), 1, 1))
+        seen = Keypoints(body.joint_names, pixels, covariances, np.ones(len(pixels)))
+        waiting = WaitingImage(black, STAMP + i * 100_000_000, 'lens')
+        posterior, likelihood = tracker.step(black, waiting.stamp_ns, seen)
+        image = TrackedImage(
+            waiting, tracker, posterior, likelihood, FilterParameters(), '', False, False
+        )
+        ((_, message),) = track_messages(image, lambda topic: topic == 'likelihood_mixture')
+        contents.append(pose_mixture_of(deserialise(serialise(message), message.__msgtype__)))
+        modes.append(tracker.estimate.modes)
+    weights, wanted = contents[-1].posterior_weights, modes[-1].mixture.weights
+    assert len(weights) > 1
+    for i in reversed(range(count)):
+        of_modes = dict(zip(modes[i].identities.tolist(), wanted, strict=True))
+        in_order = [of_modes[x] for x in contents[i].identities.tolist()]
+        assert weights == pytest.approx(in_order, abs=1e-12)
+        if i:
+            assert contents[i].ancestry_ids.tolist() == contents[i - 1].identities.tolist()
+            assert contents[i].ancestry_stamp_ns == contents[i - 1].stamp_ns
+            weights, wanted = weights @ contents[i].ancestry, wanted @ modes[i].origins
+    assert (contents[0].ancestry.shape[1], contents[0].ancestry_stamp_ns) == (0, 0)
 
 
 def test_joint_states_are_those_of_the_point_estimate(track, body):
@@ -211,6 +266,11 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
             values=np.zeros(2),
             errors=CueErrors(0.25, 0.125),
             shape_covariance=np.zeros((body.dimension, body.dimension)),
+            identities=np.arange(1, 3),
+            posterior_weights=np.full(2, 0.5),
+            origins=np.empty((2, 0)),
+            ancestors=np.empty(0, dtype=int),
+            ancestry_stamp=None,
         ),
         point_estimate=poses[1],
     )

@@ -103,7 +103,7 @@ def test_mixtures_tell_state_track_and_identities(session, outputs, small_camera
     likelihoods = mixtures_of(outputs, 'likelihood_mixture')
     assert [content.cue_probabilities for content in likelihoods] == [{}, {}, {}]
     likelihoods = mixtures_of(outputs, 'likelihood_mixture')
-    assert [content.identities.tolist() for content in likelihoods] == [[0, 0], [0, 0], []]
+    assert [content.identities.tolist() for content in likelihoods] == [[77, 1], [77, 1], []]
 
 
 def test_a_lost_track_is_told(session, outputs, small_camera, stub_tracker, monkeypatch):

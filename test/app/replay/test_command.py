@@ -89,6 +89,11 @@ class StandingStill:
             values=np.zeros(1),
             errors=CueErrors(0.25, 0.125),
             shape_covariance=np.zeros((body.dimension, body.dimension)),
+            identities=np.ones(1, dtype=int),
+            posterior_weights=np.ones(1),
+            origins=np.empty((1, 0)),
+            ancestors=np.empty(0, dtype=int),
+            ancestry_stamp=None,
         )
         self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []

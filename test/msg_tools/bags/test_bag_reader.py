@@ -16,7 +16,8 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from msg_tools import BagError, BagReader, BagWriter
 from msg_tools.messages.cdr import serialise
-from msg_tools.messages.message_types import typestore
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.message_types import typestore, typestore_of_definition
 
 STRING = 'std_msgs/msg/String'
 
@@ -195,6 +196,30 @@ def test_a_known_type_in_another_version_is_read_by_its_own_definition(tmp_path)
             # Of those of the project every field is read.
             with pytest.raises(BagError, match='recorded with another definition of this type'):
                 _ = stored.message
+
+
+@pytest.mark.parametrize('nested', [False, True])
+def test_messages_of_the_project_from_before_a_field(tmp_path, messages, nested):
+    """What their definition lacks is zero or empty, also where only a type within is older."""
+    kind = 'hmt_msgs/msg/PoseMixture'
+    component = messages.create('hmt_msgs/msg/PoseComponent', id=3, mean=np.arange(4.0))
+    header = header_message(messages, 5, 'lens')
+    message = messages.create(kind, header=header, components=[component, component], reason='so')
+    definition, _ = typestore().generate_msgdef(kind, ros_version=2)
+    lacking = ['float64 posterior_weight\n', 'float64[] ancestry\n']
+    if not nested:
+        lacking += ['uint32[] ancestry_ids\n', 'builtin_interfaces/Time ancestry_stamp\n']
+    for field in lacking:
+        assert definition.count(field) == 1
+        definition = definition.replace(field, '')
+    old = typestore_of_definition(kind, 'ros2msg', definition)
+    data = bytes(old.serialize_cdr(message, kind))
+    assert len(data) < len(serialise(message))
+    path = tmp_path / 'old.mcap'
+    write_mcap(path, [(1, data)], msgtype=kind, definition=definition.encode())
+    with BagReader(path) as bag:
+        (stored,) = bag.messages()
+        assert serialise(stored.message) == serialise(message)
 
 
 def test_find_topic(tmp_path, messages):

@@ -175,6 +175,71 @@ def test_probabilities_of_cues(pose_mixture, messages):
             replace(pose_mixture, cue_probabilities={'depth': 0.5, 'track': wrong})
 
 
+CHAIN = {
+    'posterior_weights': np.array([0.25, 0.0, 0.75]),
+    'ancestry': np.array([[0.5, 0.5], [0.0, 1.0], [0.125, 0.875]]),
+    'ancestry_stamp_ns': 1_700_000_000_000_000_001,
+    'ancestry_ids': np.array([7, 2**32 - 1]),
+}
+
+
+def test_weights_and_ancestry_of_the_chain_of_the_modes(pose_mixture, messages):
+    """Columns stay in the order of their ids; rows come with their components."""
+    message = pose_mixture_message(messages, replace(pose_mixture, **CHAIN))
+    back = pose_mixture_of(deserialise(serialise(message), POSE_MIXTURE))
+    assert back.identities.tolist() == pose_mixture.identities[::-1].tolist()
+    assert back.posterior_weights.tolist() == CHAIN['posterior_weights'][::-1].tolist()
+    assert back.ancestry.tolist() == CHAIN['ancestry'][::-1].tolist()
+    assert back.ancestry_ids.tolist() == CHAIN['ancestry_ids'].tolist()
+    assert back.ancestry_stamp_ns == CHAIN['ancestry_stamp_ns']
+    assert serialise(pose_mixture_message(messages, back)) == serialise(message)
+    # Weights without ancestry: the modes begin.
+    weights = CHAIN['posterior_weights']
+    for ancestry in (None, np.empty((3, 0))):
+        begins = replace(pose_mixture, posterior_weights=weights, ancestry=ancestry)
+        back = pose_mixture_of(pose_mixture_message(messages, begins))
+        assert back.posterior_weights.tolist() == weights[::-1].tolist()
+        assert (back.ancestry.shape, back.ancestry_ids.shape) == ((3, 0), (0,))
+    # A publisher that leaves all of them alone, or says that it does not know.
+    message = pose_mixture_message(messages, pose_mixture)
+    for nothing in (0.0, math.nan):
+        for component in message.components:
+            component.posterior_weight = nothing
+        back = pose_mixture_of(message)
+        assert (back.posterior_weights, back.ancestry) == (None, None)
+        assert (back.ancestry_stamp_ns, back.ancestry_ids.size) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ('field', 'value', 'error'),
+    [
+        ('0.posterior_weight', 0.5, r'mixture: posterior has weights that sum to 0.75, wanted 1'),
+        ('1.posterior_weight', -0.25, r'mixture: posterior has the weight -0.25, wanted numbers'),
+        ('2.posterior_weight', np.nan, r'mixture: posterior has the weight nan'),
+        ('2.posterior_weight', np.inf, r'mixture: posterior has the weight inf'),
+        ('1.ancestry', np.zeros(0), r'mixture: component 1: ancestry has 0 values, wanted 2'),
+        ('1.ancestry', np.ones(3) / 3, r'mixture: component 1: ancestry has 3 values, wanted 2'),
+        ('1.ancestry', np.array([0.5, 0.6]), r'ancestry of component 1 has weights that sum to 1'),
+        ('1.ancestry', np.array([1.5, -0.5]), r'ancestry of component 1 has the weight -0.5, want'),
+        ('1.ancestry', np.full(2, np.nan), r'ancestry of component 1 has the weight nan, wanted n'),
+        ('ancestry_ids', np.array([], np.uint32), r'component 0: ancestry has 2 values, wanted 0'),
+        ('ancestry_ids', np.array([5, 5], np.uint32), r'ancestry has the identity 5 twice'),
+        ('2.id', 1, r'mixture has the identity 1 twice'),
+    ],
+)
+def test_chains_that_contradict_themselves(pose_mixture, messages, field, value, error):
+    message = pose_mixture_message(messages, replace(pose_mixture, **CHAIN))
+    bend(field, value)(message)
+    with pytest.raises(MessageError, match=error) as caught:
+        pose_mixture_of(message)
+    assert '\n' not in str(caught.value)
+
+
+def test_ancestors_without_ancestry(pose_mixture):
+    with pytest.raises(MessageError, match='mixture has ancestry_ids, and no ancestry'):
+        replace(pose_mixture, ancestry_ids=CHAIN['ancestry_ids'])
+
+
 def test_whose_poses_they_are():
     model = load_body('human37')
     person = model.with_stature(1.6)
