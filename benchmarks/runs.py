@@ -46,7 +46,6 @@ from hmt_ros.image.likelihood import OFF
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.tracking import (
     Lagged,
     LaggedWeights,
@@ -54,6 +53,7 @@ from hmt_ros.tracking import (
     TrackerSettings,
     read_subject,
 )
+from hmt_ros.tracking.laplace_approximation import Likelihood
 from msg_tools.files.new_folder import new_file
 
 Item = TypeVar('Item')
@@ -241,23 +241,19 @@ class Seen(NamedTuple):
     stamp: int
     body: Body
     posterior: GaussianMixture
-    likelihood: GaussianMixture
-    errors: CueErrors
-    shape_covariance: NDArray[np.float64]
+    likelihood: Likelihood
     point: NDArray[np.float64]
 
 
-def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
-    """What the tracker says of the images of a clip; `inputs` and `gravity` as of a `Run`."""
-    tracker, keypoints = begun(clip, inputs)
+def tracked(clip: Clip, inputs: str, gravity: str, seed: int = 0) -> list[Seen]:
+    """What the tracker says of the images of a clip; the arguments are as of a `Run`."""
+    tracker, keypoints = begun(clip, inputs, seed)
     return [
         Seen(
             one.stamp,
             tracker.estimate.body,
             one.posterior,
-            one.likelihood,
-            tracker.estimate.likelihood.errors,
-            tracker.estimate.likelihood.shape_covariance,
+            tracker.estimate.likelihood,
             tracker.estimate.point_estimate,
         )
         for one in stepped(clip, tracker, keypoints, gravity=gravity)

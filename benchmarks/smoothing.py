@@ -48,7 +48,7 @@ from hmt_ros.inference.reduction import leaders
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Output
-from hmt_ros.sessions.smoothed_messages import poses_apart
+from hmt_ros.sessions.smoothed_messages import with_shape
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import Transform
@@ -69,8 +69,8 @@ FILTER, LIVE, OFFLINE = 'filter', 'live', 'offline'
 AVERAGED, NEAREST = 'filter, averaged', 'nearest modes, averaged'
 # Images a second; 0: all of a clip.
 RATES = (0.0, 8.0, 3.0)
-# Mixtures that are kept for smoothing over the whole clip, and components of a smoothed pose.
-KEPT, COMPONENTS = 10_000, 8
+# Mixtures that are kept for smoothing over the whole clip.
+KEPT = 10_000
 # Distance of the joints of two modes, in the mean, from which on they are counted apart, m.
 APART = 0.03
 # Standard deviations of the kernels that joints are averaged with, images.
@@ -258,18 +258,21 @@ def smoothed(
     messages = RosbagsMessages()
     parameters = with_values(SmootherParameters(), {'window_length': KEPT})
     session = SmootherSession(parameters, outputs.append, SMOOTHED.__eq__)
-    shapes = {x.stamp: x.shape_covariance for x in seen}
+    shapes = {x.stamp: x.likelihood.shape_covariance for x in seen}
     for one in seen:
-        likelihood = one.likelihood
+        likelihood, told = one.likelihood.mixture, one.likelihood
         if one.stamp in frames:
             in_world = frames[one.stamp].placed
             likelihood = in_world(one.body, likelihood)[0]
-            at_best = replace(one.posterior[[0]], covariances=one.shape_covariance[None])
+            at_best = replace(one.posterior[[0]], covariances=told.shape_covariance[None])
             shapes[one.stamp] = in_world(one.body, at_best)[0].covariances[0]
         content = PoseMixture.of_body(
             one.body, likelihood, MixtureKind.LIKELIHOOD, one.stamp, 'camera',
-            state=TrackState.TRACKING, track_id=1, error_share=one.errors.independent,
-            error_time=one.errors.time, shape_covariance=shapes[one.stamp],
+            state=TrackState.TRACKING, track_id=1, error_share=told.errors.independent,
+            error_time=told.errors.time, shape_covariance=shapes[one.stamp],
+            identities=told.identities, posterior_weights=told.posterior_weights,
+            ancestry=told.origins, ancestry_stamp_ns=told.ancestry_stamp or 0,
+            ancestry_ids=told.ancestors,
         )  # fmt: skip
         message = pose_mixture_message(messages, content)
         start = time.perf_counter()
@@ -280,7 +283,7 @@ def smoothed(
     whole, of = session.smoothed_span()
     assert whole.stamps_ns is not None
     offline = {
-        stamp: poses_apart(whole, t, of.body, COMPONENTS, shapes[stamp])[0]
+        stamp: with_shape(whole.marginal(t), shapes[stamp])
         for t, stamp in enumerate(whole.stamps_ns)
     }
     session.finish()

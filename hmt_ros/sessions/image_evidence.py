@@ -1,59 +1,38 @@
-"""Evidence of images about a pose, for a smoother, and the part of it that counts."""
+"""What a likelihood mixture says of an image, for a smoother: evidence, and the filter's chain."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-from hmt_ros.inference import GaussianMixture
+import numpy as np
+
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.smoothed_messages import SmoothedBody
-from hmt_ros.smoothing.likelihood import counted, merged_modes, or_missed
+from hmt_ros.smoothing import ImageModes, Link
+from hmt_ros.smoothing.mode_chain import reachable_origins
 from msg_tools import MessageError
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 
-# Time of the free motion that tells how far a pose may be from where an image shows it, s.
-ASTRAY = 1.0
+# Mean speed of the joints, seen from the pelvis, that is within reach of a body, m/s, and what
+# modes of two images differ by besides, m: where no filter tells which mode continues which.
+FASTEST, TREMBLE = 2.0, 0.05
 
 
 class Evidence(NamedTuple):
     """Evidence of an image about the pose.
 
     Attributes:
-        stamp: of the image.
-        mixture: the whole evidence.
-        errors: the error model.
+        modes: the whole evidence, with the weights and the ancestry of the filter's modes.
         shape: (d, d) covariance of the errors shared by poses of all images; None: unknown.
+        identities: (K,) of the modes in the filter; 0: none.
     """
 
-    stamp: int
-    mixture: GaussianMixture
-    errors: CueErrors
+    modes: ImageModes
     shape: Array | None
-
-    def since(self, before: int | None, rates: Array, distance: float) -> GaussianMixture:
-        """The part that counts after an image at the stamp `before`; None: no image before.
-
-        Args:
-            before: ns.
-            rates: (d,) variances of free motion, per second.
-            distance: below which modes are merged, in standard deviations of that part.
-        """
-        dt = self._interval(before)
-        share = self.errors.share(dt)
-        apart = merged_modes(self.mixture, distance / math.sqrt(share))
-        return or_missed(
-            counted(apart, self.errors.of_modes(dt), self.errors.of_changes(dt)), ASTRAY * rates
-        )
-
-    def lasting(self, before: int | None) -> float:
-        """Factor on the variance that is left after it, because its errors last."""
-        return self.errors.lasting(self._interval(before))
-
-    def _interval(self, before: int | None) -> float:
-        return math.inf if before is None else (self.stamp - before) / SECOND_NS
+    identities: tuple[int, ...]
 
 
 class KeptMixtures(NamedTuple):
@@ -70,6 +49,9 @@ class KeptMixtures(NamedTuple):
 
 def evidence_of(content: PoseMixture) -> Evidence:
     """The evidence in a mixture, with its error model; without one, errors do not last.
+
+    Where the publisher does not tell the weights of the modes in its posterior, those of the
+    mixture are taken for them. The modes continue nothing yet, see `continued`.
 
     Raises:
         MessageError: there are no components or no covariances; a forecast; a likelihood without an
@@ -88,4 +70,35 @@ def evidence_of(content: PoseMixture) -> Evidence:
                 'error_share and error_time',
             )
         share, time = 1.0, 0.0
-    return Evidence(content.stamp_ns, mixture, CueErrors(share, time), content.shape_covariance)
+    weights = mixture.weights if content.posterior_weights is None else content.posterior_weights
+    link = Link(weights / weights.sum(), np.empty((len(weights), 0)))
+    modes = ImageModes(content.stamp_ns, link, mixture, CueErrors(share, time))
+    assert content.identities is not None
+    return Evidence(modes, content.shape_covariance, tuple(content.identities.tolist()))
+
+
+def continued(
+    evidence: Evidence, content: PoseMixture, before: Evidence, points: Array, points_before: Array
+) -> Evidence:
+    """The evidence of an image whose modes continue those of the image before.
+
+    Args:
+        evidence: of the image.
+        content: of its message, with the ancestry that the filter tells.
+        before: evidence of the image before.
+        points, points_before: (K, P, 3) and (M, P, 3) of the modes of both, m; where ancestry is
+            unknown, or refers to an image that has not come, a mode may continue all within reach.
+    """
+    modes, others = evidence.modes, before.modes
+    ancestry, known = content.ancestry, content.ancestry_stamp_ns == others.stamp_ns
+    origins = None
+    if ancestry is not None and known and ancestry.shape[1]:
+        assert content.ancestry_ids is not None
+        columns = {int(name): i for i, name in enumerate(content.ancestry_ids)}
+        if set(columns) == set(before.identities):
+            origins = ancestry[:, [columns[name] for name in before.identities]]
+    if origins is None:
+        away = np.linalg.norm(points[:, None] - points_before, axis=3).mean(2)
+        reach = TREMBLE + FASTEST * (modes.stamp_ns - others.stamp_ns) / SECOND_NS
+        origins = reachable_origins(away, others.link.weights, reach)
+    return evidence._replace(modes=modes._replace(link=modes.link._replace(origins=origins)))

@@ -11,12 +11,10 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.body.mirror import propagated, turn_jacobians, turned
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.reduction import led
+from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.sessions.track_messages import MESSAGES, links_of
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
-from hmt_ros.smoothing.path_hypotheses import SAME_MOTION
 from msg_tools.messages.markers import trajectory_markers
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
@@ -130,13 +128,11 @@ def final_messages(
     told: OpenPose,
     wanted: Callable[[str], bool],
     *,
-    components: int,
     frame_prefix: str | None,
 ) -> Iterator[tuple[str, Any]]:
     """Topics and messages of a pose that will not be revised.
 
     Args:
-        components: maximum number of components of the message.
         frame_prefix: of the names of the links on /tf; None: there are no transforms.
 
     Raises:
@@ -145,7 +141,7 @@ def final_messages(
     shows_links = frame_prefix is not None and wanted('/tf')
     if not (wanted('smoothed_pose_mixture') or wanted('smoothed_joint_states') or shows_links):
         return
-    mixture, motions = poses_apart(pose.trajectories, pose.t, of.body, components, told.shape)
+    mixture = with_shape(pose.mixture, told.shape)
     content = PoseMixture.of_body(
         of.body,
         replace(mixture, covariances=_symmetric(mixture.covariances)),
@@ -155,8 +151,8 @@ def final_messages(
         state=told.state,
         track_id=of.track_id,
         existence_probability=told.existence,
-        identities=np.array(pose.identities)[motions],
-        velocities=None if pose.velocities is None else pose.velocities[motions],
+        identities=np.array(pose.identities),
+        velocities=pose.velocities,
     )
     if wanted('smoothed_pose_mixture'):
         yield 'smoothed_pose_mixture', pose_mixture_message(MESSAGES, content)
@@ -170,20 +166,11 @@ def final_messages(
         yield '/tf', transforms_message(MESSAGES, parents, children, rotations, origins, stamp)
 
 
-def poses_apart(
-    found: TrajectoryMixture, t: int, body: Body, components: int, shape: Array | None
-) -> tuple[GaussianMixture, Index]:
-    """The poses of motions that are apart at index t, and the indices of their trajectories.
-
-    Args:
-        shape: (d, d) added to covariances: of errors shared by poses of all images; None: 0.
-    """
-    points = body.relative_joints(found.means[:, t])
-    weights, motions = led(found.weights, points, SAME_MOTION, components)
-    poses = replace(found.marginal(t, motions), weights=weights).normalised()
-    if shape is not None:
-        poses = replace(poses, covariances=poses.covariances + shape)
-    return poses, motions
+def with_shape(mixture: GaussianMixture, shape: Array | None) -> GaussianMixture:
+    """A mixture over poses with the covariance (d, d) of errors shared by all images; None: 0."""
+    if shape is None:
+        return mixture
+    return replace(mixture, covariances=mixture.covariances + shape)
 
 
 def nobody_messages(

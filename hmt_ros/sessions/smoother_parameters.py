@@ -8,11 +8,8 @@ from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_WINDOW,
     NodeParameters,
-    check_choices,
     parameter_field,
 )
-
-METHODS = ('paths', 'variational')
 
 
 @dataclass(frozen=True)
@@ -22,12 +19,10 @@ class SmootherParameters(NodeParameters):
     Attributes:
         body_model: Body model, a name or a YAML file, where the name in the mixtures is not a known
             one; if empty, that name.
-        method: Smoothing method: 'paths', the most probable paths in closed form, or 'variational',
-            refined as in VMS, which takes seconds for an image.
         fixed_lag: Time by which a smoothed pose is older than the newest image, s, at any rate of
             images. It may be a fifth more; 0 is filtering.
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
-        max_hypotheses: Maximum number of components of smoothed_pose_mixture.
+        max_hypotheses: Maximum number of motions, the components of both mixtures.
         resting_feet: If true, feet that rest do not slide between images. The frame of the mixtures
             must then stand still (a still camera, or publish_in_fixed_frame of the filter).
         random_seed: Seed of all random numbers; the same mixtures give the same results.
@@ -40,16 +35,12 @@ class SmootherParameters(NodeParameters):
     """
 
     body_model: str = parameter_field('', NEXT_WINDOW)
-    method: str = parameter_field('paths', NEXT_WINDOW)
     fixed_lag: float = parameter_field(0.5, NEXT_WINDOW, (0.0, 3600.0))
     window_length: int = parameter_field(47, AT_ONCE, (1, 10_000))
-    max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))
+    max_hypotheses: int = parameter_field(8, NEXT_WINDOW, (1, 1024))
     resting_feet: bool = parameter_field(True, NEXT_WINDOW)
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
     publish_covariances: bool = parameter_field(False, AT_ONCE)
     publish_tf: bool = parameter_field(False, AT_ONCE)
     frame_prefix: str = parameter_field('smoothed/', AT_ONCE)
     queue_size: int = parameter_field(100, AT_ONCE, (1, 1000))
-
-    def __post_init__(self) -> None:
-        check_choices(self, method=METHODS)

@@ -13,11 +13,11 @@ The rules, besides those of `Session`:
   and better.
 - A likelihood without components says that nobody is in view any more: the window ends, and a
   smoothed mixture without components and markers that remove those before go out.
-- Errors of images last: an image counts with a share of its evidence, by the error model that its
-  likelihood carries and the time since the image before (`error_model`). A likelihood without an
-  error model, and a forecast, which is no evidence, are skipped.
-- The pose may be none of the modes of an image: each image has a wide component more
-  (`or_missed`), and a motion passes over images that would turn it round and back.
+- The chain of the filter's modes, which likelihoods carry (`posterior_weight`, `ancestry`), is the
+  only judge of motions. Where a publisher does not tell it, a mode continues all within reach.
+- Errors of images last, by the error model that a likelihood carries and the time since the image
+  before (`error_model`). A likelihood without an error model, and a forecast, which is no
+  evidence, are skipped.
 - The uncertainty of the person's shape is the same in all images. It is added once, to the
   covariances that are published.
 - Near the limits of the root's angles, as of a person before a camera on its side, mixtures are
@@ -40,7 +40,7 @@ from hmt_ros.body.mirror import clear_level, free_limits, relevelled, without_tu
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.image_evidence import Evidence, KeptMixtures, evidence_of
+from hmt_ros.sessions.image_evidence import Evidence, KeptMixtures, continued, evidence_of
 from hmt_ros.sessions.named_file import named_file, public_line
 from hmt_ros.sessions.session import Session, SessionState
 from hmt_ros.sessions.smoothed_messages import (
@@ -55,8 +55,7 @@ from hmt_ros.sessions.smoothed_messages import (
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.track import resembles
 from hmt_ros.sessions.warm_up import likelihoods
-from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow, TrajectoryMixture
-from hmt_ros.smoothing.mixture_smoother import PathSmoother
+from hmt_ros.smoothing import FinalPose, MotionSmoother, SlidingWindow, TrajectoryMixture
 from hmt_ros.smoothing.resting_points import RestingPoints
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
@@ -70,16 +69,11 @@ from msg_tools.messages.pose_mixtures import (
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
 MIXTURE = 'likelihood_mixture'
-# Distance of two modes of an image below which they are merged, in standard deviations of the
-# evidence that counts.
-MERGED = 1.75
 NOBODY = 'nobody'  # status while nobody is in view
 # Change of a length from one mixture to the next above which it is another person's, m.
 SAME_PERSON = 0.02
 # Time between two smoothings, as a share of the lag, and at most, s: neighbours hardly differ.
 SHARE_OF_LAG, RARELY = 0.2, 0.1
-# Maximum number of components of a mixture over trajectories.
-MAX_TRAJECTORIES = 16
 # Interval between two mixtures above which a gap is reported, s.
 LONGEST_INTERVAL = 0.25
 # Factor on the variance that the motion prior of the filter gains in a second. Sudden motion is
@@ -186,7 +180,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 self._take_nobody(stamp, content.existence_probability)
                 return
             evidence, of = evidence_of(content), self._whose(content)
-            of = self._clear(of, evidence.mixture)
+            of = self._clear(of, evidence.modes.mixture)
         except MessageError as error:
             self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
@@ -196,9 +190,15 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
                 'say counts more than once',
             )
+        if content.posterior_weights is None:
+            self._log.note(
+                'ancestry',
+                'mixtures do not tell posterior weights and ancestry of their components, as those '
+                'of the filter do: their weights are taken, and a component continues all of the '
+                'mixture before that are within reach',
+            )
         self._begin_track(of)
-        evidence = _levelled(evidence, of.body)
-        evidence = self._without_turns(evidence, of.body)
+        evidence = self._chained(_levelled(evidence, of.body), content, of.body)
         p = self.parameters
         if self._newest is not None:
             interval = (stamp - self._newest) / SECOND_NS
@@ -213,14 +213,11 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._window = SlidingWindow(
                 self._smoother(of.body),
                 p.fixed_lag,
-                p.random_seed,
                 first_identity=self._first_identity,
                 every=min(SHARE_OF_LAG * p.fixed_lag, RARELY),
             )
         try:
-            update = self._window.step(
-                stamp, self._counted(evidence, self._newest, of), evidence.lasting(self._newest)
-            )
+            update = self._window.step(evidence.modes)
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
             self._log.skip('estimate', f'mixture of {stamp} ns can not be smoothed: {text}')
@@ -244,18 +241,17 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         for pose in update.final:
             self._publish_final(pose, of)
 
-    def _counted(self, one: Evidence, before: int | None, of: SmoothedBody) -> GaussianMixture:
-        return one.since(before, of.body.rates, MERGED)
-
-    def _without_turns(self, evidence: Evidence, body: Body) -> Evidence:
-        """The evidence with angles that go on from those of the mixture before."""
-        mixture, kept = evidence.mixture, self.kept.items
+    def _chained(self, evidence: Evidence, content: PoseMixture, body: Body) -> Evidence:
+        """The evidence with angles and modes that go on from those of the mixture before."""
+        mixture, kept = evidence.modes.mixture, self.kept.items
         heaviest = mixture.means[[int(np.argmax(mixture.weights))]]
-        before = kept[-1].mixture.means if kept else heaviest
-        means = without_turns(body, mixture.means, before)
-        return evidence._replace(
-            mixture=GaussianMixture(mixture.weights, means, mixture.covariances)
-        )
+        before = kept[-1].modes.mixture.means if kept else heaviest
+        mixture = replace(mixture, means=without_turns(body, mixture.means, before))
+        evidence = evidence._replace(modes=evidence.modes._replace(mixture=mixture))
+        if not kept:
+            return evidence
+        points = body.relative_joints(mixture.means), body.relative_joints(before)
+        return continued(evidence, content, kept[-1], *points)
 
     def _take_nobody(self, stamp: int, existence: float) -> None:
         """Ends the window: the person is no longer in view."""
@@ -318,16 +314,18 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._of, self._first_identity = of, 1
         self.kept = KeptMixtures(of, ())
 
-    def _smoother(self, body: Body) -> MixtureSmoother:
+    def _smoother(self, body: Body) -> MotionSmoother:
         """The smoother that the parameters ask for."""
         p = self.parameters
         prior = motion_prior(body)
-        livelier = replace(prior, diffusion=LIVELINESS * prior.diffusion)
-        settings = livelier, *free_limits(body), MAX_TRAJECTORIES
-        if p.method != 'paths':
-            return MixtureSmoother(*settings, points=body.relative_joints)
-        resting = RestingPoints.of_soles(body) if p.resting_feet else None
-        return PathSmoother(*settings, points=body.relative_joints, resting=resting)
+        return MotionSmoother(
+            replace(prior, diffusion=LIVELINESS * prior.diffusion),
+            *free_limits(body),
+            points=body.relative_joints,
+            max_motions=p.max_hypotheses,
+            resting=RestingPoints.of_soles(body) if p.resting_feet else None,
+            seed=p.random_seed,
+        )
 
     def _end_window(self) -> None:
         """Publishes the poses that are still open, and forgets the window."""
@@ -347,7 +345,6 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             of,
             self._open.pop(pose.stamp_ns),
             self._wanted,
-            components=p.max_hypotheses,
             frame_prefix=p.frame_prefix if p.publish_tf else None,
         ):
             self._publish(topic, pose.stamp_ns, made)
@@ -367,7 +364,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             ValueError: there is none in the span, or they can not be smoothed.
         """
         found, of = self.smoothed_span(from_ns, to_ns)
-        shapes = _shapes((one.stamp, one.shape) for one in self.kept.items)
+        shapes = _shapes((one.modes.stamp_ns, one.shape) for one in self.kept.items)
         content = trajectory_content(found, of, covariances=True, shapes=shapes)
         return trajectory_mixture_message(self._messages, content)
 
@@ -377,20 +374,17 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         """The trajectories of a span of time, and their person; see `smooth_span`."""
         of, items = self.kept
         chosen = [
-            item for item in items if from_ns <= item.stamp and (to_ns == 0 or item.stamp <= to_ns)
+            item.modes
+            for item in items
+            if from_ns <= item.modes.stamp_ns and (to_ns == 0 or item.modes.stamp_ns <= to_ns)
         ]
         if of is None or not chosen:
             kept = 'none is'
             if items:
-                kept = f'those from {items[0].stamp} to {items[-1].stamp} ns are kept'
+                first, last = (items[i].modes.stamp_ns for i in (0, -1))
+                kept = f'those from {first} to {last} ns are kept'
             raise ValueError(f'no mixture from {from_ns} to {to_ns} ns: {kept}')
-        stamps = [item.stamp for item in chosen]
-        pairs = list(zip([None, *stamps], chosen))
-        mixtures = [self._counted(item, before, of) for before, item in pairs]
-        smoother = self._smoother(of.body)
-        found = smoother.smooth(mixtures, self.parameters.random_seed, stamps_ns=stamps)
-        lasting = [item.lasting(before) for before, item in pairs]
-        return found.widened(sum(lasting) / len(lasting)), of
+        return self._smoother(of.body).smooth(chosen), of
 
     # State.
 
@@ -421,11 +415,12 @@ def _levelled(evidence: Evidence, body: Body) -> Evidence:
     camera = body.levelled(np.eye(3))
     if camera is body:
         return evidence
-    mixture, shape = evidence.mixture, evidence.shape
+    mixture, shape = evidence.modes.mixture, evidence.shape
     if shape is not None:
         at_best = GaussianMixture(np.ones(1), mixture.means[:1], shape[None])
         shape = relevelled(camera, at_best, body).covariances[0]
-    return evidence._replace(mixture=relevelled(camera, mixture, body), shape=shape)
+    modes = evidence.modes._replace(mixture=relevelled(camera, mixture, body))
+    return evidence._replace(modes=modes, shape=shape)
 
 
 def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:

@@ -1,15 +1,22 @@
-"""Mixtures over whole trajectories: network, paths, refinement, variational mixture (VMS)."""
+"""Mixtures over whole trajectories: motions along a filter's chain, and VMS on mixtures alone."""
 
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.smoothing.mixture_smoother import MixtureSmoother
+from hmt_ros.smoothing.mode_chain import Link, backward_paths, backward_weights
+from hmt_ros.smoothing.motion_smoother import ImageModes, MotionSmoother
 from hmt_ros.smoothing.sliding_window import FinalPose, SlidingWindow, WindowUpdate
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
 __all__ = [
     'FinalPose',
+    'ImageModes',
     'LinearGaussianDynamics',
+    'Link',
     'MixtureSmoother',
+    'MotionSmoother',
     'SlidingWindow',
     'TrajectoryMixture',
     'WindowUpdate',
+    'backward_paths',
+    'backward_weights',
 ]

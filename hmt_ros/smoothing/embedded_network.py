@@ -49,17 +49,12 @@ def embedded_network(
     mixtures: Sequence[GaussianMixture],
     dynamics: LinearGaussianDynamics,
     intervals: Array,
-    first: GaussianMixture | None = None,
 ) -> EmbeddedNetwork:
     """The network of Gaussian modes, in closed form.
 
     Args:
-        intervals: (T-1,) s; (T,) with `first`.
-        first: a density of the state (n variables) at a time before the mixtures; its components
-            are the first layer of nodes.
+        intervals: (T-1,) s.
     """
-    if first is not None:
-        return _with_first(first, mixtures, dynamics, intervals)
     d, n = dynamics.dimension, dynamics.state_dimension
     begin = np.concatenate([[0], np.cumsum([len(mixture) for mixture in mixtures])])
     means = np.concatenate([mixture.means for mixture in mixtures])
@@ -121,32 +116,6 @@ def _pairs_within(count: int) -> Index:
 @lru_cache(maxsize=256)
 def _pairs_across(before: int, after: int) -> Index:
     return np.indices((before, after)).reshape(2, -1)
-
-
-def _with_first(
-    first: GaussianMixture,
-    mixtures: Sequence[GaussianMixture],
-    dynamics: LinearGaussianDynamics,
-    intervals: Array,
-) -> EmbeddedNetwork:
-    """The network with a layer of components of the state before the modes."""
-    pairs = _pairs_within(len(first))
-    own = pair_log_densities(
-        first.means, first.covariances, first.means, first.covariances, pairs.T
-    )
-    nodes = _node_values(first.weights, own, pairs)
-    if len(mixtures) == 0:
-        return EmbeddedNetwork((nodes,), ())
-    rest = embedded_network(mixtures, dynamics, intervals[1:])
-    d = dynamics.dimension
-    means, spread = dynamics.predict(first.means, first.covariances, float(intervals[0]))
-    pairs = _pairs_across(len(first), len(mixtures[0]))
-    links = pair_log_densities(
-        means[:, :d], spread[:, :d, :d], mixtures[0].means, mixtures[0].covariances, pairs.T
-    )
-    return EmbeddedNetwork(
-        (nodes, *rest.nodes), (links.reshape(len(first), len(mixtures[0])), *rest.links)
-    )
 
 
 @dataclass(frozen=True, eq=False)

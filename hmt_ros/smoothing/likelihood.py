@@ -7,7 +7,7 @@ times, such as the images themselves (VMS 5).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -20,13 +20,9 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
 from hmt_ros.inference.exact_sums import dot
-from hmt_ros.inference.reduction import merged_if_close
 
 # Modes whose density is below exp(-60) of the greatest are left out: less than rounding.
 NEGLIGIBLE = 60.0
-# Probability that the pose is none of the modes of an image. Such an image says next to nothing,
-# which costs 50 nats and more in 37 dimensions: beside that, this probability hardly matters.
-MISSED = 0.01
 
 
 class SequenceLikelihood(EnergyTerm, Protocol):
@@ -85,18 +81,6 @@ class MixtureLikelihood:
             whiteners.swapaxes(1, 2) @ whiteners,
         )
 
-    @classmethod
-    def joined(cls, parts: Sequence[MixtureLikelihood]) -> MixtureLikelihood:
-        """The likelihood of all times of some, one after the other."""
-        counts = np.concatenate([np.diff(part.first) for part in parts])
-        return cls(
-            np.concatenate([[0], np.cumsum(counts)]),
-            np.concatenate([part.log_scales for part in parts]),
-            np.concatenate([part.means for part in parts]),
-            np.concatenate([part.whiteners for part in parts]),
-            np.concatenate([part.precisions for part in parts]),
-        )
-
     @property
     def times(self) -> int:
         """T."""
@@ -130,60 +114,6 @@ class MixtureLikelihood:
             hessian,
         )
         return Energy(value, gradient, hessian if wanted else None)
-
-
-@dataclass(frozen=True, eq=False)
-class WindowLikelihood:
-    """A density of the first state, and mixtures over the poses of the later ones.
-
-    Attributes:
-        first: over the n variables of the state, one time.
-        later: over the d variables of the pose, T-1 times; None: T = 1.
-    """
-
-    first: MixtureLikelihood
-    later: MixtureLikelihood | None
-
-    @property
-    def times(self) -> int:
-        """T."""
-        return 1 + (0 if self.later is None else self.later.times)
-
-    def modes_of(self, path: Index) -> tuple[Array, Array, Array]:
-        """As for `MixtureLikelihood`, over n variables."""
-        log, mean, precision = self.first.modes_of(path[:1])
-        if self.later is None:
-            return log, mean, precision
-        rest = self.later.modes_of(path[1:])
-        n, (count, d) = mean.shape[1], rest[1].shape
-        means, precisions = np.zeros((count, n)), np.zeros((count, n, n))
-        means[:, :d], precisions[:, :d, :d] = rest[1:]
-        return (
-            np.concatenate([log, rest[0]]),
-            np.concatenate([mean, means]),
-            np.concatenate([precision, precisions]),
-        )
-
-    def energy(
-        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        """See `EnergyTerm`; the rows are times, the points states."""
-        count, n = x.shape
-        value, gradient, hessian = np.zeros(count), np.zeros((count, n)), None
-        if derivatives >= Derivatives.POSITIVE:
-            hessian = np.zeros((count, n, n))
-        for term, shift, at in (
-            (self.first, 0, np.flatnonzero(rows == 0)),
-            (self.later, 1, np.flatnonzero(rows > 0)),
-        ):
-            if term is None:
-                continue
-            d = term.means.shape[1]
-            found = term.energy(x[at, :d], rows[at] - shift, derivatives=derivatives)
-            value[at], gradient[at, :d] = found.value, found.gradient
-            if hessian is not None:
-                hessian[at, :d, :d] = found.hessian
-        return Energy(value, gradient, hessian)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,47 +166,6 @@ def counted(
     log_weights = share * np.log(some.weights) + 0.5 * (1.0 - share) * some.log_determinants
     weights = np.exp(log_weights - logsumexp(log_weights))
     return GaussianMixture(weights, some.means, some.covariances / (of_changes or share))
-
-
-def merged_modes(mixture: GaussianMixture, distance: float) -> GaussianMixture:
-    """The likelihood of an observation with modes that are close as one, led by the highest.
-
-    Modes are weighed by their heights w_k / |2 pi S_k|^(1/2) while they are merged, and a merged
-    mode is as high as its parts together: the width of a mode is its uncertainty, no measure of how
-    well it explains the observation.
-
-    Args:
-        mixture: the whole evidence.
-        distance: between means, in standard deviations, below which modes are merged; 0: none.
-    """
-    if distance == 0.0:
-        return mixture
-    low = np.log(mixture.weights) - 0.5 * mixture.log_determinants
-    heights = replace(mixture, weights=np.exp(low - low.max()))
-    merged = merged_if_close(heights, distance)
-    log = np.log(merged.weights) + 0.5 * merged.log_determinants
-    return replace(merged, weights=np.exp(log - logsumexp(log)))
-
-
-def or_missed(mixture: GaussianMixture, variances: Array) -> GaussianMixture:
-    """The likelihood of an observation whose right mode may have been missed.
-
-        (1 - e) sum_k w_k N(m_k, S_k) + e N(m_1, S_1 + diag(v)),    m_1: the heaviest, e = `MISSED`
-
-    A filter that is wrong for some images searches where it is wrong: no mode is right, and a
-    trajectory that had to go through one would turn the person over and back.
-
-    Args:
-        mixture: weights sum to 1.
-        variances: (d,) v, how far the pose may be from the heaviest mode.
-    """
-    best = int(np.argmax(mixture.weights))
-    wide = mixture.covariances[best] + np.diag(variances)
-    return GaussianMixture(
-        np.append((1.0 - MISSED) * mixture.weights, MISSED),
-        np.concatenate([mixture.means, mixture.means[[best]]]),
-        np.concatenate([mixture.covariances, wide[None]]),
-    )
 
 
 def check_mixtures(mixtures: Sequence[GaussianMixture]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -17,8 +17,6 @@ from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, T
 from hmt_ros.smoothing.embedded_network import Paths
 from hmt_ros.smoothing.likelihood import LikelihoodPart, SequenceLikelihood, check_mixtures
 from hmt_ros.smoothing.mode_sequence import ModeSequence, TrajectoryGaussians, path_gaussians
-from hmt_ros.smoothing.path_hypotheses import FilteredPaths, SmoothedPath, smoothed_paths
-from hmt_ros.smoothing.resting_points import RestingPoints
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states, refine
 from hmt_ros.smoothing.variational_mixture import (
@@ -38,8 +36,6 @@ LONG = 100
 MARGIN = 8
 # A path whose Gaussian lies within so many standard deviations of an optimum says nothing new.
 SAME_DISTANCE = 0.3
-# Motions that are less probable are left as they are, whatever rests.
-LEAST_HELD = 0.05
 # Modes closer than so many standard deviations are merged, as alternatives to the optima.
 MERGE_DISTANCES = (1.75, 2.5)
 
@@ -56,8 +52,6 @@ class MixtureSmoother:
         max_iterations: of the descent of the free energy.
         through_modes: whether, besides the best paths between the ends, those through every single
             mode are starts: more alternatives for each pose, fewer for the whole motion.
-        points: maps poses (N, d) to points (N, P, 3), m, by which motions are told apart
-            (`path_hypotheses`); None: their distance is unknown.
 
     Raises:
         ValueError: settings out of range.
@@ -70,7 +64,6 @@ class MixtureSmoother:
     adapt: Sequence[str] = ADAPTABLE
     max_iterations: int = 15
     through_modes: bool = False
-    points: Callable[[Array], Array] | None = None
 
     def __post_init__(self) -> None:
         if self.max_trajectories < 1:
@@ -132,8 +125,6 @@ class MixtureSmoother:
 
     def paths(self, sequence: ModeSequence) -> Paths:
         """The paths that trajectories start from."""
-        if sequence.filtered is not None:
-            return sequence.filtered.paths
         return sequence.paths(self.max_trajectories, through_modes=self.through_modes)
 
     def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> TrajectoryGaussians:
@@ -252,7 +243,7 @@ class MixtureSmoother:
         self,
         weights: Array,
         states: Array,
-        factors: Sequence[BlockCholesky | SmoothedPath],
+        factors: Sequence[BlockCholesky],
         inflation: Array,
         prior: TrajectoryPrior,
         likelihood: SequenceLikelihood,
@@ -287,77 +278,6 @@ class MixtureSmoother:
             np.inf if self.upper is None else self.upper,
             self.dynamics.dimension,
             self.dynamics.state_dimension,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class PathSmoother(MixtureSmoother):
-    """A smoother in closed form, for windows that have to keep up with a camera.
-
-    The posterior of a sequence of Gaussian mixtures is a Gaussian mixture with a component for
-    every path through their modes. The components of the most probable paths that differ, with the
-    weights that they have in the posterior, are the result; neither optima nor the free energy are
-    descended to, which costs fifty times as much. Modes that overlap share their mass among many
-    paths and should be merged before (`likelihood.merged_modes`).
-
-    `adapt` and `max_iterations` have no meaning here, nor has `seed`; the result has no
-    free energy. Means beyond the limits are moved onto them.
-
-    Attributes:
-        resting: points that may rest on the ground; None: not used.
-    """
-
-    resting: RestingPoints | None = None
-
-    def paths(self, sequence: ModeSequence) -> Paths:
-        """The paths whose Gaussians are the result."""
-        return self._filtered(sequence).paths
-
-    def _filtered(self, sequence: ModeSequence) -> FilteredPaths:
-        if sequence.filtered is not None:
-            return sequence.filtered
-        paths = FilteredPaths(self.dynamics, self.max_trajectories, self.points, sequence.first)
-        # No interval leads to the very first mixture.
-        before = [0.0] if sequence.first is None else []
-        for mixture, interval in zip(sequence.mixtures, [*before, *sequence.intervals]):
-            paths.add(mixture, float(interval))
-        return paths
-
-    def smooth_sequence(
-        self,
-        sequence: ModeSequence,
-        seed: int = 0,
-        stamps_ns: Sequence[int] | None = None,
-        observation: SequenceLikelihood | None = None,
-    ) -> TrajectoryMixture:
-        """As `MixtureSmoother.smooth_sequence`.
-
-        Raises:
-            ValueError: another observation than the mixtures.
-        """
-        if observation is not None:
-            raise ValueError('paths are smoothed by the mixtures alone, without an observation')
-        filtered = self._filtered(sequence)
-        states, factors = smoothed_paths(filtered.steps)
-        weights = np.exp(filtered.steps[-1].log_weights)
-        if self.resting is not None and states.shape[1] > 1:
-            d, motions, nodes = self.dynamics.dimension, filtered.motions, filtered.paths.nodes
-            for i in np.flatnonzero((motions == np.arange(len(motions))) & (weights >= LEAST_HELD)):
-                poses = np.clip(states[i], *self._limits())[:, :d]
-                known = np.array([covariance[:d, :d] for covariance in factors[i].filtered])
-                held = self.resting.held(sequence.prior, poses, known, sequence.intervals)
-                found = path_gaussians(nodes[[i]], held, sequence.likelihood)
-                # Paths of the same motion are shifted along. Covariances ignore the resting points:
-                # rest is a decision, the same from image to image.
-                states[motions == i] += found.states[0] - states[i]
-        return self._mixture(
-            weights,
-            np.clip(states, *self._limits()),
-            factors,
-            np.ones(len(states)),
-            sequence.prior,
-            sequence.likelihood,
-            stamps_ns,
         )
 
 

@@ -41,8 +41,7 @@ from hmt_ros.smoothing.embedded_network import (
     k_best_paths,
     paths_through_nodes,
 )
-from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
-from hmt_ros.smoothing.path_hypotheses import FilteredPaths
+from hmt_ros.smoothing.likelihood import MixtureLikelihood
 
 # Candidates for each path that is chosen.
 CANDIDATES = 4
@@ -53,48 +52,29 @@ class ModeSequence:
     """Mixtures at T times.
 
     Attributes:
-        mixtures: over the d variables of the pose, T of them; T-1 where `first` is given.
+        mixtures: over the d variables of the pose, T of them.
         dynamics: of the state, n variables.
         intervals: (T-1,) s.
-        first: a density of the first state, over n variables, in the place of a likelihood.
-        known: with `first`: -log of `mixtures` alone; None: it is to be made.
-        filtered: paths that were filtered; None: they are to be found.
     """
 
     mixtures: tuple[GaussianMixture, ...]
     dynamics: LinearGaussianDynamics
     intervals: Array
-    first: GaussianMixture | None = None
-    known: MixtureLikelihood | None = None
-    filtered: FilteredPaths | None = None
-
-    @property
-    def layers(self) -> tuple[GaussianMixture, ...]:
-        """The mixtures at all T times."""
-        return self.mixtures if self.first is None else (self.first, *self.mixtures)
 
     @cached_property
-    def likelihood(self) -> MixtureLikelihood | WindowLikelihood:
+    def likelihood(self) -> MixtureLikelihood:
         """-log of the mixtures."""
-        if self.first is None:
-            return MixtureLikelihood.of(self.mixtures)
-        later = None
-        if self.mixtures:
-            later = self.known or MixtureLikelihood.of(self.mixtures)
-        return WindowLikelihood(MixtureLikelihood.of([self.first]), later)
+        return MixtureLikelihood.of(self.mixtures)
 
     @cached_property
     def prior(self) -> TrajectoryPrior:
-        """Prior of the states; with `first`, all variables of the state count as observed."""
-        if self.first is None:
-            return self.dynamics.prior(self.intervals)
-        prior = self.dynamics.prior(self.intervals, initial=False)
-        return replace(prior, dimension=self.dynamics.state_dimension)
+        """Prior of the states."""
+        return self.dynamics.prior(self.intervals)
 
     @cached_property
     def network(self) -> EmbeddedNetwork:
         """The embedded network."""
-        return embedded_network(self.mixtures, self.dynamics, self.intervals, self.first)
+        return embedded_network(self.mixtures, self.dynamics, self.intervals)
 
     def paths(self, count: int, *, through_modes: bool = False) -> Paths:
         """At most `count` paths that are probable and differ from each other.
@@ -118,21 +98,18 @@ class ModeSequence:
     def states(self, paths: Paths) -> Array:
         """States (P, T, n) along the modes of paths; velocities are differences of neighbours."""
         d, n = self.dynamics.dimension, self.dynamics.state_dimension
-        layers = self.layers
-        result = np.zeros((len(paths), len(layers), n))
-        for t, mixture in enumerate(layers):
-            result[:, t, :d] = mixture.means[paths.nodes[:, t], :d]
-        if n == 2 * d and len(layers) > 1:
+        result = np.zeros((len(paths), len(self.mixtures), n))
+        for t, mixture in enumerate(self.mixtures):
+            result[:, t, :d] = mixture.means[paths.nodes[:, t]]
+        if n == 2 * d and len(self.mixtures) > 1:
             edges = np.concatenate([[0.0], np.cumsum(self.intervals)])
             result[:, :, d:] = np.gradient(result[:, :, :d], edges, axis=1)
-        if self.first is not None:
-            result[:, 0] = self.first.means[paths.nodes[:, 0]]
         return result
 
     def merged(self, distance: float) -> ModeSequence:
         """The sequence with modes merged that are closer than so many standard deviations."""
         mixtures = tuple(merged_if_close(mixture, distance) for mixture in self.mixtures)
-        return replace(self, mixtures=mixtures, known=None, filtered=None)
+        return replace(self, mixtures=mixtures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +133,7 @@ class TrajectoryGaussians:
 
 
 def path_gaussians(
-    nodes: Index, prior: TrajectoryPrior, likelihood: MixtureLikelihood | WindowLikelihood
+    nodes: Index, prior: TrajectoryPrior, likelihood: MixtureLikelihood
 ) -> TrajectoryGaussians:
     """The components of paths (P, T), indices of modes with weight."""
     count, times = nodes.shape

@@ -23,7 +23,6 @@ from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     BlockTridiagonal,
 )
-from hmt_ros.smoothing.path_hypotheses import SmoothedPath
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +43,8 @@ class TrajectoryMixture:
             is one window, and trajectories have no identity.
         free_energy_fresh: on samples that the descent has not seen, and its standard error.
         lower, upper: (d,) limits; samples beyond them are projected onto them.
+        disagreements: (M, T, d, d) of the modes that motions stand for, beside the density of the
+            trajectories: part of marginals alone. None: components are no motions.
 
     Raises:
         ValueError: shapes that contradict each other, weights that do not sum to 1.
@@ -51,7 +52,7 @@ class TrajectoryMixture:
 
     weights: Array
     states: Array
-    factors: tuple[BlockCholesky | SmoothedPath, ...]
+    factors: tuple[BlockCholesky, ...]
     inflation: Array
     log_joint: Array
     free_energy: Array
@@ -62,6 +63,7 @@ class TrajectoryMixture:
     free_energy_fresh: tuple[float, float] = (np.nan, np.nan)
     lower: Array | float = -np.inf
     upper: Array | float = np.inf
+    disagreements: Array | None = None
 
     def __post_init__(self) -> None:
         m, times, n = self.states.shape
@@ -107,6 +109,8 @@ class TrajectoryMixture:
             d = self.dimension
             blocks = self.factors[i].inverse_blocks()
             self._covariances[i] = self.inflation[i] ** 2 * blocks[:, :d, :d]
+            if self.disagreements is not None:
+                self._covariances[i] += self.disagreements[i]
         return self._covariances[i]
 
     @cached_property

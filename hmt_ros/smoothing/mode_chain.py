@@ -1,0 +1,89 @@
+"""The chain of a filter's modes: weights and paths given later images.
+
+    W_T(k) = w_k                                                        the newest image T  (1)
+    W_t(j) = sum_k W_(t+1)(k) P(j | k)                                  t < T               (2)
+    p(k_1 .. k_T | all images) = w_(k_T) prod_t P(k_t | k_(t+1))                            (3)
+
+This is the backward half of forward filtering, backward smoothing [Doucet, Godsill and Andrieu,
+2000]. The evidence of an image for a mode is a factor of w_k alone: it cancels in P(j | k), the
+probability that mode k continues mode j of the image before, and reaches image t by (1) and (2). So
+(2) and (3) are exact for the filter's own chain, and have no constant that the filter has not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_ros.inference.arrays import Array, Index
+
+
+class Link(NamedTuple):
+    """The modes of an image in the chain.
+
+    Attributes:
+        weights: (K,) posterior probabilities given this image and those before.
+        origins: (K, M) probability that each mode continues each of the M of the image before; rows
+            sum to 1. M is 0 where the chain begins.
+    """
+
+    weights: Array
+    origins: Array
+
+
+def backward_weights(links: Sequence[Link]) -> list[Array]:
+    """Probabilities (K_t,) of the modes at each time given all images, equations (1) and (2)."""
+    result = [links[-1].weights]
+    for link in reversed(links[1:]):
+        result.append(result[-1] @ link.origins)
+    return result[::-1]
+
+
+def backward_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Array]:
+    """Paths drawn from (3), each with a share of the weight of its last mode.
+
+    Each mode of the newest image begins at least one path and has its weight exactly. Paths through
+    one mode are spread over its origins systematically, in a random order, so that their numbers
+    are as even as can be.
+
+    Args:
+        count: of paths, about.
+        seed: of the order.
+
+    Returns:
+        Modes (N, T) of the paths, and their weights (N,), which sum to 1.
+    """
+    rng = np.random.default_rng(seed)
+    weights = links[-1].weights
+    copies = np.ceil(count * weights).astype(np.intp)
+    at = np.repeat(np.arange(len(weights)), copies)
+    shares = (weights / np.maximum(copies, 1))[at]
+    nodes = np.empty((len(at), len(links)), dtype=np.intp)
+    nodes[:, -1] = at
+    for t in range(len(links) - 1, 0, -1):
+        origins = links[t].origins
+        order = rng.permutation(len(at))
+        order = order[np.argsort(at[order], kind='stable')]
+        total = np.bincount(at, shares, minlength=len(origins))
+        before = (np.cumsum(total) - total)[at[order]]
+        reached = np.cumsum(shares[order]) - before - rng.random() * shares[order]
+        level = reached / total[at[order]]
+        at[order] = (level[:, None] > np.cumsum(origins, axis=1)[at[order], :-1]).sum(1)
+        nodes[:, t - 1] = at
+    return nodes, shares
+
+
+def reachable_origins(away: Array, weights: Array, reach: float) -> Array:
+    """Origins (K, M) of modes whose ancestry nobody has told: all that are within reach.
+
+    Args:
+        away: (K, M) distances from the modes of the image before, m.
+        weights: (M,) of the modes of the image before.
+        reach: distance that a body moves meanwhile, m; where no mode is within reach, all are.
+    """
+    near = (away <= reach) * weights
+    lost = ~near.any(1)
+    near[lost] = weights
+    return np.asarray(near / near.sum(1, keepdims=True))

@@ -1,0 +1,383 @@
+"""The states of motions: smoothed along what the images say of each (VMS 5, in closed form).
+
+    E(X) = |x_1 - m_1|^2_(P_1) / 2 + sum_t |x_(t+1) - A x_t|^2_(lambda Q) / 2
+           + sum_t |x_t - z_t|^2_(R_t) / 2
+
+z_t and R_t are the motion's modes in an image (`motions`). lambda is how much livelier the motion
+is than the prior of people's motion: the least of 1, 4, 16, 64 with which the states stay with the
+modes whose motion they are. N(m_1, P_1) is the state that the motions predict which its paths come
+from. E is a parabola with a block-tridiagonal Hessian; states beyond limits are moved onto them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
+from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
+from hmt_ros.smoothing.mode_chain import Link, backward_paths
+from hmt_ros.smoothing.motions import (
+    SECOND_NS,
+    MotionEvidence,
+    evidence_of_motions,
+    grouped,
+    path_distances,
+)
+from hmt_ros.smoothing.resting_points import RestingPoints
+from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
+from hmt_ros.smoothing.trajectory_refinement import limits_of_states
+
+# Paths that are drawn from the chain.
+PATHS = 128
+# Values of lambda, and the median distance from the modes, m, from which on the next is tried.
+LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
+# Distance from which on the modes of an image are taken for wrong, m, and looks at that.
+WRONG, WRONG_PASSES = 0.15, 3
+# Least weight of a motion of more than one image, and of one whose resting feet are held.
+LEAST, LEAST_HELD = 0.002, 0.05
+
+
+class ImageModes(NamedTuple):
+    """What a filter says of an image.
+
+    Attributes:
+        stamp_ns: of the image.
+        link: posterior weights and ancestry of its K modes.
+        mixture: the likelihood of the image, undiscounted; K components. Their weights in it do
+            not count.
+        errors: how its errors last.
+    """
+
+    stamp_ns: int
+    link: Link
+    mixture: GaussianMixture
+    errors: CueErrors
+
+
+class WindowImage(NamedTuple):
+    """An image of a window.
+
+    Attributes:
+        modes: of the image.
+        counted: the likelihood with the covariances that count for changes.
+        points: (K, P, 3) of the modes, m.
+        lasting: factor on the variance that is left after it, because its errors last.
+    """
+
+    modes: ImageModes
+    counted: GaussianMixture
+    points: Array
+    lasting: float
+
+
+class Past(NamedTuple):
+    """What is known of the first image of a window from the images before.
+
+    Attributes:
+        shares: (K, M) probability that each mode of the image continues each of M motions.
+        means, covariances: (M, n) and (M, n, n) of the states that these motions predict.
+        liveliness: (M,) their lambda.
+    """
+
+    shares: Array
+    means: Array
+    covariances: Array
+    liveliness: Array
+
+
+class FirstStates(NamedTuple):
+    """What the past tells of the first states of M motions.
+
+    Attributes:
+        means, covariances: (M, n) and (M, n, n).
+        liveliness: (M,) lambda of the motion that each continues.
+    """
+
+    means: Array
+    covariances: Array
+    liveliness: Array
+
+
+class SmoothedMotions(NamedTuple):
+    """The motions of a window.
+
+    Attributes:
+        trajectories: M of them.
+        shares: T arrays (K_t, M), probability that each mode belongs to each motion.
+        evidence: of the images.
+        liveliness: (M,) lambda.
+        first: of the past; None: nothing is known.
+    """
+
+    trajectories: TrajectoryMixture
+    shares: list[Array]
+    evidence: MotionEvidence
+    liveliness: Array
+    first: FirstStates | None
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSmoother:
+    """Smooths the modes of a filter's chain.
+
+    Attributes:
+        dynamics: of the state.
+        lower, upper: (d,) limits of the pose at every time; None: none.
+        points: maps poses (N, d) to points (N, P, 3), m, by which motions are told apart; None: the
+            variables of the pose.
+        max_motions: motions at most.
+        resting: points that may rest on the ground; None: not used.
+        seed: of the paths that are drawn.
+
+    Raises:
+        ValueError: settings out of range.
+    """
+
+    dynamics: LinearGaussianDynamics
+    lower: ArrayLike | None = None
+    upper: ArrayLike | None = None
+    points: Callable[[Array], Array] | None = None
+    max_motions: int = 8
+    resting: RestingPoints | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.max_motions < 1:
+            raise ValueError(f'max_motions must be at least 1, saw {self.max_motions}')
+        self.limits()
+
+    def limits(self) -> tuple[Array, Array]:
+        """Limits (n,) of the states."""
+        low = -np.inf if self.lower is None else self.lower
+        high = np.inf if self.upper is None else self.upper
+        return limits_of_states(low, high, self.dynamics.dimension, self.dynamics.state_dimension)
+
+    def points_of(self, poses: Array) -> Array:
+        """Points (..., P, 3) of poses (..., d)."""
+        flat = poses.reshape(-1, poses.shape[-1])
+        found = flat[..., None] if self.points is None else self.points(flat)
+        return np.asarray(found.reshape(*poses.shape[:-1], *found.shape[1:]))
+
+    def image(self, modes: ImageModes, before_ns: int | None) -> WindowImage:
+        """An image of a window after one at `before_ns`; None: the first.
+
+        Raises:
+            ValueError: modes that can not be smoothed.
+        """
+        mixture, link = modes.mixture, modes.link
+        if mixture.dimension != self.dynamics.dimension:
+            raise ValueError(
+                f'the modes have {mixture.dimension} variables, the dynamics '
+                f'{self.dynamics.dimension}'
+            )
+        total = float(link.weights.sum())
+        if not (len(mixture) == len(link.weights) > 0 and abs(total - 1.0) < 1e-6):
+            raise ValueError(
+                f'{len(mixture)} modes have {len(link.weights)} weights that sum to {total:g}, '
+                'wanted one for each, sum 1'
+            )
+        mixture.cholesky()
+        dt = np.inf if before_ns is None else (modes.stamp_ns - before_ns) / SECOND_NS
+        counted = replace(mixture, covariances=mixture.covariances / modes.errors.of_changes(dt))
+        points = self.points_of(mixture.means)
+        return WindowImage(modes, counted, points, modes.errors.lasting(dt))
+
+    def smooth(self, sequence: Sequence[ImageModes]) -> TrajectoryMixture:
+        """The motions of a whole sequence.
+
+        Raises:
+            ValueError: no images, stamps that do not increase, modes that can not be smoothed.
+        """
+        if not sequence:
+            raise ValueError('no images to smooth')
+        stamps = [None, *(modes.stamp_ns for modes in sequence)]
+        images = [self.image(modes, before) for modes, before in zip(sequence, stamps)]
+        return self.smoothed(images).trajectories
+
+    def smoothed(self, images: Sequence[WindowImage], past: Past | None = None) -> SmoothedMotions:
+        """The motions of the images of a window."""
+        stamps = [image.modes.stamp_ns for image in images]
+        links = [image.modes.link for image in images]
+        nodes, weights = backward_paths(links, PATHS, self.seed)
+        distances = path_distances(nodes, [image.points for image in images], stamps)
+        least = LEAST if len(images) > 1 else 0.0
+        labels = grouped(weights, distances, self.max_motions, least)
+        evidence = evidence_of_motions(nodes, weights, labels, [image.counted for image in images])
+        masses: Array = np.bincount(labels, weights).astype(np.float64)
+        shares = [
+            _shares(nodes[:, t], weights, labels, len(link.weights), masses)
+            for t, link in enumerate(links)
+        ]
+        first = None if past is None else self._first(past, nodes[:, 0], weights, labels)
+        intervals = np.diff(stamps) / SECOND_NS
+        prior = self.dynamics.prior(intervals, initial=False)
+        found = [
+            self._states(prior, intervals, evidence, first, m, masses[m] >= LEAST_HELD)
+            for m in range(len(masses))
+        ]
+        low, high = self.limits()
+        d = self.dynamics.dimension
+        trajectories = TrajectoryMixture(
+            weights=masses / masses.sum(),
+            states=np.clip([one[0] for one in found], low, high),
+            factors=tuple(one[1] for one in found),
+            inflation=np.full(len(masses), np.sqrt(np.mean([image.lasting for image in images]))),
+            log_joint=np.array([one[2] for one in found]),
+            free_energy=np.empty(0),
+            dimension=d,
+            stamps_ns=tuple(stamps),
+            lower=low[:d],
+            upper=high[:d],
+            disagreements=evidence.disagreements,
+        )
+        return SmoothedMotions(
+            trajectories, shares, evidence, np.array([one[3] for one in found]), first
+        )
+
+    def _first(self, past: Past, nodes: Index, weights: Array, labels: Index) -> FirstStates:
+        """The first state of each motion, by its paths there."""
+        shares = np.zeros((int(labels.max()) + 1, past.shares.shape[1]))
+        np.add.at(shares, labels, weights[:, None] * past.shares[nodes])
+        shares /= shares.sum(1, keepdims=True)
+        means = shares @ past.means
+        offsets = past.means - means[:, None]
+        covariances = np.einsum('mk,kij->mij', shares, past.covariances)
+        covariances += (offsets * shares[:, :, None]).swapaxes(1, 2) @ offsets
+        return FirstStates(means, covariances, past.liveliness[shares.argmax(1)])
+
+    def _states(
+        self,
+        prior: TrajectoryPrior,
+        intervals: Array,
+        evidence: MotionEvidence,
+        first: FirstStates | None,
+        m: int,
+        held: bool,
+    ) -> tuple[Array, BlockCholesky, float, float]:
+        """States (T, n) of motion m, their factor, log joint density and lambda.
+
+        Args:
+            prior: of states whose first one is free.
+            held: whether points that rest are.
+        """
+        dynamics, d = self.dynamics, self.dynamics.dimension
+        means, precisions = evidence.means[m], np.linalg.inv(evidence.covariances[m])
+        pull = (precisions @ means[:, :, None])[:, :, 0]
+        low, high = self.limits()
+        if first is None:
+            at, known, least = dynamics.initial_mean, dynamics.initial_precision, LIVELIER[0]
+        else:
+            at, known = first.means[m], np.linalg.inv(first.covariances[m])
+            least = first.liveliness[m] / LIVELIER[1]
+        known = 0.5 * (known + known.T)
+        for liveliness in (x for x in LIVELIER if x >= least):
+            own = _livelier(prior, liveliness)
+            own.precision.diagonal[0] += known
+            own.information[0] += known @ at
+            states, factor = _conditioned(own, precisions, pull)
+            away = self._away(states, means)
+            if self.points is None or np.median(away) <= ASTRAY:
+                break
+        for _ in range(WRONG_PASSES):
+            wrong = away > WRONG
+            if self.points is None or not wrong.any():
+                break
+            trust = np.where(wrong, (ASTRAY / away) ** 2, 1.0)
+            precisions, pull = precisions * trust[:, None, None], pull * trust[:, None]
+            states, factor = _conditioned(own, precisions, pull)
+            away = self._away(states, means)
+        poses = np.clip(states, low, high)[:, :d]
+        seen = 0.5 * (np.vdot(means, pull) - np.linalg.slogdet(precisions)[1].sum())
+        seen += 0.5 * (at @ known @ at) + own.constant
+        gained = 0.5 * (np.vdot(states, own.information) + np.vdot(states[:, :d], pull))
+        if held and self.resting is not None and len(poses) > 1:
+            # Covariances ignore what rests: rest is a decision, the same from image to image.
+            resting = self.resting.held(own, poses, evidence.covariances[m], intervals)
+            states = _conditioned(resting, precisions, pull)[0]
+        return states, factor, float(gained - seen), liveliness
+
+    def _away(self, states: Array, modes: Array) -> Array:
+        """Mean distances (T,) of points in states (T, n) from those in modes (T, d), m."""
+        poses = np.clip(states, *self.limits())[:, : modes.shape[1]]
+        return np.asarray(
+            np.linalg.norm(self.points_of(poses) - self.points_of(modes), axis=2).mean(1)
+        )
+
+    def advanced(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
+        """What the first images of a window tell of the one after them.
+
+        Args:
+            found: motions of the window.
+            count: images that are left behind.
+            after: the image after these.
+        """
+        dynamics, evidence = self.dynamics, found.evidence
+        d = dynamics.dimension
+        stamps = found.trajectories.stamps_ns
+        assert stamps is not None
+        times = [*stamps[:count], after.stamp_ns]
+        if found.first is None:
+            rest = np.broadcast_to(
+                dynamics.initial_mean[d:], (len(found.liveliness), len(dynamics.initial_mean) - d)
+            )
+            means = np.concatenate([evidence.means[:, 0], rest], axis=1)
+            covariances = dynamics.states(evidence.covariances[:, 0])
+        else:
+            means, covariances = found.first.means, found.first.covariances
+        for t in range(count):
+            if t > 0 or found.first is not None:
+                spread = covariances[:, :d, :d] + evidence.covariances[:, t]
+                gains = np.linalg.solve(spread, covariances[:, :d]).swapaxes(1, 2)
+                means = means + (gains @ (evidence.means[:, t] - means[:, :d])[:, :, None])[:, :, 0]
+                covariances = covariances - gains @ covariances[:, :d]
+            interval = (times[t + 1] - times[t]) / SECOND_NS
+            means, covariances = dynamics.predict(means, covariances, interval)
+            livelier = found.liveliness[:, None, None] - 1.0
+            covariances = covariances + livelier * dynamics.transition(interval)[1]
+            covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
+        shares = (
+            found.shares[count] if count < len(stamps) else after.link.origins @ found.shares[-1]
+        )
+        return Past(shares, means, covariances, found.liveliness)
+
+
+def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Array) -> Array:
+    """Probability (K, M) that each mode of an image belongs to each motion; unvisited: as any."""
+    result = np.zeros((count, len(masses)))
+    np.add.at(result, (nodes, labels), weights)
+    result[~result.any(1)] = masses
+    return np.asarray(result / result.sum(1, keepdims=True))
+
+
+def _livelier(prior: TrajectoryPrior, factor: float) -> TrajectoryPrior:
+    """The prior of motions whose noise is a factor as large; the first state is free."""
+    diagonal, lower = prior.precision.diagonal / factor, prior.precision.lower / factor
+    constant = prior.constant + 0.5 * np.log(factor) * lower.shape[0] * lower.shape[1]
+    information = prior.information / factor
+    return TrajectoryPrior(
+        BlockTridiagonal(diagonal, lower), information, constant, prior.dimension
+    )
+
+
+def _conditioned(
+    prior: TrajectoryPrior, precisions: Array, pull: Array
+) -> tuple[Array, BlockCholesky]:
+    """States (T, n) given Gaussians over poses, and the factor of their precision.
+
+    Args:
+        precisions, pull: (T, d, d) of the Gaussians, and (T, d) these times their means.
+    """
+    d = pull.shape[1]
+    diagonal, right = prior.precision.diagonal.copy(), prior.information.copy()
+    diagonal[:, :d, :d] += precisions
+    right[:, :d] += pull
+    factor = BlockTridiagonal(diagonal, prior.precision.lower).cholesky()
+    return factor.solve(right), factor
