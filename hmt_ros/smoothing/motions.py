@@ -4,12 +4,14 @@
     z_t = sum_k r_k x_k,  R_t = sum_k r_k (S_k / b + (x_k - z_t)(x_k - z_t)')               (2)
 
 a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three spans. Paths
-closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one alone is
-no motion of its own, however far away it is, and is absorbed by the one nearest in time. Spans
-without an image do not count; where a window is shorter than a moment the mean is over the window.
+closer than 30 mm are one motion. A span counts with c = 90 mm at most, unless it shows another pose
+altogether, 250 mm away: what shows in one alone is no motion of its own, and is absorbed by the one
+nearest in time. Spans without an image do not count; where a window is shorter than a moment the
+mean is over the window.
 
-A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each. b is the
-share by which the image tells changes (`CueErrors.of_changes`). What the modes disagree by is in R.
+A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each, of those
+within reach of the heaviest: a mean over opposite poses is no pose. b is the share by which the
+image tells changes (`CueErrors.of_changes`). What the modes disagree by is in R.
 """
 
 from __future__ import annotations
@@ -24,8 +26,11 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 
 SECOND_NS = 10**9
-# Distance of two paths below which they are one motion, and the most that a span counts with, m.
-SAME_MOTION, MOST_APART = 0.03, 0.09
+# Distance of two paths below which they are one motion, the most that a span counts with, and from
+# which on it counts whole, m.
+SAME_MOTION, MOST_APART, ANOTHER_POSE = 0.03, 0.09, 0.25
+# Distance of two modes of an image from which on they are no one Gaussian, m.
+OPPOSITE = 0.15
 # Length of a span, s, and spans of a moment.
 SPAN, MOMENT = 1.0 / 6.0, 3
 
@@ -44,30 +49,39 @@ class MotionEvidence(NamedTuple):
     disagreements: Array
 
 
-def path_distances(nodes: Index, points: Sequence[Array], stamps: Sequence[int]) -> Array:
+def path_distances(
+    nodes: Index, points: Sequence[Array], stamps: Sequence[int], before: Array | None = None
+) -> Array:
     """Distances (N, N) of paths, equation (1), m.
 
     Args:
         nodes: (N, T) modes of the paths.
         points: T arrays (K_t, P, 3) of the modes, m.
         stamps: (T,) ns.
+        before: (N, P, 3) where each path comes from, a span before the first; None: unknown.
     """
     ages = (stamps[-1] - np.asarray(stamps, dtype=np.int64)) / SECOND_NS
     spans = np.floor(ages / SPAN + 1e-3).astype(np.intp)
-    recent, most = [], np.zeros((len(nodes), len(nodes)))
-    for span in np.unique(spans):
-        places = [points[t][nodes[:, t]] for t in np.flatnonzero(spans == span).tolist()]
-        apart = np.zeros_like(most)
-        for joint in np.mean(places, axis=0).swapaxes(0, 1):
-            apart += cdist(joint, joint)
-        recent.append((span, np.minimum(apart / places[0].shape[1], MOST_APART)))
-        recent = [one for one in recent if one[0] > span - MOMENT]
-        if span >= MOMENT - 1 or span == spans[0]:
-            np.maximum(most, np.mean([one[1] for one in recent], axis=0), out=most)
+    places = {
+        int(span): np.mean(
+            [points[t][nodes[:, t]] for t in np.flatnonzero(spans == span).tolist()], axis=0
+        )
+        for span in np.unique(spans)
+    }
+    if before is not None:
+        places[int(spans[0]) + 1] = before
+    recent: dict[int, Array] = {}
+    most, oldest = np.zeros((len(nodes), len(nodes))), max(places)
+    for span, at in places.items():
+        apart = sum(cdist(joint, joint) for joint in at.swapaxes(0, 1)) / at.shape[1]
+        recent[span] = np.where(apart < ANOTHER_POSE, np.minimum(apart, MOST_APART), apart)
+        recent = {other: gap for other, gap in recent.items() if other > span - MOMENT}
+        if span >= MOMENT - 1 or span == oldest:
+            np.maximum(most, sum(recent.values()) / len(recent), out=most)
     return most
 
 
-def grouped(weights: Array, distances: Array, most: int, least: float) -> Index:
+def grouped(weights: Array, distances: Array, most: int) -> Index:
     """Motion (N,) of each path, numbered by weight.
 
     Motions are found one by one: the path with the most weight within `SAME_MOTION` leads the
@@ -77,11 +91,10 @@ def grouped(weights: Array, distances: Array, most: int, least: float) -> Index:
         weights: (N,) of paths.
         distances: (N, N) of paths, m.
         most: number of motions at most.
-        least: weight around a leader, as a share of all; the first leads whatever it has.
     """
     near, left = distances <= SAME_MOTION, weights.copy()
     around, leaders = near @ left, list[int]()
-    while len(leaders) < most and around.max() > (least * weights.sum() if leaders else 0.0):
+    while len(leaders) < most and around.any():
         leaders.append(int(np.argmax(around)))
         left[near[leaders[-1]]] = 0.0
         around = near @ left
@@ -95,6 +108,7 @@ def evidence_of_motions(
     weights: Array,
     labels: Index,
     mixtures: Sequence[GaussianMixture],
+    points: Sequence[Array],
 ) -> MotionEvidence:
     """What images say of each motion.
 
@@ -102,19 +116,22 @@ def evidence_of_motions(
         nodes: (N, T) modes of the paths.
         weights, labels: (N,) of the paths, and the motion of each.
         mixtures: T likelihoods, with covariances S_k / b.
+        points: T arrays (K_t, P, 3) of their modes, m.
     """
     count, times, d = int(labels.max()) + 1, len(mixtures), mixtures[0].dimension
     means = np.empty((count, times, d))
     covariances, apart = np.empty((2, count, times, d, d))
-    for t, mixture in enumerate(mixtures):
+    for t, (mixture, places) in enumerate(zip(mixtures, points, strict=True)):
         shares = np.zeros((count, len(mixture)))
         np.add.at(shares, (labels, nodes[:, t]), weights)
+        heaviest = places[shares.argmax(1)]
+        away = np.linalg.norm(heaviest[:, None] - places, axis=3).mean(2)
+        shares[away > OPPOSITE] = 0.0
         shares /= shares.sum(1, keepdims=True)
         means[:, t] = shares @ mixture.means
         offsets = mixture.means - means[:, t, None]
         apart[:, t] = (offsets * shares[:, :, None]).swapaxes(1, 2) @ offsets
-        covariances[:, t] = (shares @ mixture.covariances.reshape(len(mixture), -1)).reshape(
-            -1, d, d
-        )
+        flat = shares @ mixture.covariances.reshape(len(mixture), -1)
+        covariances[:, t] = flat.reshape(-1, d, d)
     covariances += apart
     return MotionEvidence(means, covariances, apart)
