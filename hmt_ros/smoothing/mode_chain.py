@@ -19,9 +19,6 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Array, Index
 
-# Paths of a mode of the oldest image.
-LEAST = 4
-
 
 class Link(NamedTuple):
     """The modes of an image in the chain.
@@ -48,8 +45,8 @@ def drawn_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Ar
     """Paths drawn from (3), each with a share of the weight of its first mode given all images.
 
     Drawn forwards, with P(k | j) = W_(t+1)(k) P(j | k) / W_t(j). Each mode of the oldest image
-    begins at least four paths and has its weight (2) exactly, however small it is. Paths through
-    one mode are spread over what follows systematically, in a random order, so that their numbers
+    begins at least one path and has its weight (2) exactly, however small it is. Paths through one
+    mode are spread over what follows systematically, in a random order, so that their numbers
     are as even as can be.
 
     Args:
@@ -62,7 +59,6 @@ def drawn_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Ar
     rng = np.random.default_rng(seed)
     smoothed = backward_weights(links)
     copies = np.ceil(count * smoothed[0]).astype(np.intp)
-    copies[smoothed[0] > 0.0] = np.maximum(copies[smoothed[0] > 0.0], LEAST)
     at = np.repeat(np.arange(len(copies)), copies)
     shares = (smoothed[0] / np.maximum(copies, 1))[at]
     nodes = np.empty((len(at), len(links)), dtype=np.intp)

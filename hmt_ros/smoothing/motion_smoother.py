@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
-from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.inference.error_model import TOGETHER, CueErrors
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
-from hmt_ros.smoothing.mode_chain import Link, drawn_paths
+from hmt_ros.smoothing.mode_chain import Link, backward_weights, drawn_paths
 from hmt_ros.smoothing.motions import (
     SECOND_NS,
     MotionEvidence,
@@ -49,8 +49,10 @@ WRONG, WRONG_PASSES = 0.15, 3
 FASTEST, TREMBLE = 3.0, 0.05
 NEIGHBOURS, FLICKER = 3, 0.1
 ANEW = 1e6
-# Motions that are less probable are left as they are, whatever rests.
-LEAST_HELD = 0.05
+# Distance from all motions from which on a mode is a stray, m.
+STRAY = 0.06
+# Least weight of a motion of more than one image, and of one whose resting feet are held.
+LEAST, LEAST_HELD = 0.01, 0.05
 
 
 class ImageModes(NamedTuple):
@@ -78,12 +80,14 @@ class WindowImage(NamedTuple):
         counted: the likelihood with the covariances that count for changes.
         points: (K, P, 3) of the modes, m.
         lasting: factor on the variance that is left after it, because its errors last.
+        alone: factor on the covariances of modes that nothing but the images so far tells of.
     """
 
     modes: ImageModes
     counted: GaussianMixture
     points: Array
     lasting: float
+    alone: float
 
 
 class Past(NamedTuple):
@@ -220,7 +224,8 @@ class MotionSmoother:
         dt = np.inf if before_ns is None else (modes.stamp_ns - before_ns) / SECOND_NS
         counted = replace(mixture, covariances=mixture.covariances / modes.errors.of_changes(dt))
         points = self.points_of(mixture.means)
-        return WindowImage(modes, counted, points, modes.errors.lasting(dt))
+        alone = TOGETHER / modes.errors.share(dt)
+        return WindowImage(modes, counted, points, modes.errors.lasting(dt), alone)
 
     def smooth(self, sequence: Sequence[ImageModes]) -> TrajectoryMixture:
         """The motions of a whole sequence.
@@ -242,7 +247,8 @@ class MotionSmoother:
         points = [image.points for image in images]
         before = None if past is None else past.places[past.shares[nodes[:, 0]].argmax(1)]
         distances = path_distances(nodes, points, stamps, before)
-        labels = grouped(weights, distances, self.max_motions)
+        least = LEAST if len(images) > 1 else 0.0
+        labels = grouped(weights, distances, self.max_motions, least)
         counted = [image.counted for image in images]
         evidence = evidence_of_motions(nodes, weights, labels, counted, points)
         masses: Array = np.bincount(labels, weights).astype(np.float64)
@@ -260,9 +266,10 @@ class MotionSmoother:
         evidence = evidence._replace(covariances=evidence.covariances / trust[:, :, None, None])
         low, high = self.limits()
         d = self.dynamics.dimension
+        states = np.clip([one.states for one in found], low, high)
         trajectories = TrajectoryMixture(
             weights=masses / masses.sum(),
-            states=np.clip([one.states for one in found], low, high),
+            states=states,
             factors=tuple(one.factor for one in found),
             inflation=np.full(len(masses), np.sqrt(np.mean([image.lasting for image in images]))),
             log_joint=np.array([one.log_joint for one in found]),
@@ -272,10 +279,26 @@ class MotionSmoother:
             lower=low[:d],
             upper=high[:d],
             disagreements=evidence.disagreements,
+            strays=self._strays(images, states[:, :, :d]),
         )
         liveliness = np.array([one.liveliness for one in found])
         begins = np.array([one.begins for one in found])
         return SmoothedMotions(trajectories, shares, evidence, liveliness, begins, first)
+
+    def _strays(self, images: Sequence[WindowImage], poses: Array) -> tuple[GaussianMixture, ...]:
+        """The modes of T images that are near no motion, of poses (M, T, d)."""
+        result = []
+        smoothed = backward_weights([image.modes.link for image in images])
+        for image, weights, places in zip(
+            images, smoothed, self.points_of(poses).swapaxes(0, 1), strict=True
+        ):
+            away = _distances(places[:, None], image.points).min(0)
+            stray = np.flatnonzero((away > STRAY) & (weights > 0.0))
+            modes = image.modes.mixture[stray]
+            result.append(
+                GaussianMixture(weights[stray], modes.means, image.alone * modes.covariances)
+            )
+        return tuple(result)
 
     def _first(self, past: Past, nodes: Index, weights: Array, labels: Index) -> FirstStates:
         """The first state of each motion, by its paths there."""

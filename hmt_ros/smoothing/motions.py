@@ -4,10 +4,9 @@
     z_t = sum_k r_k x_k,  R_t = sum_k r_k (S_k / b + (x_k - z_t)(x_k - z_t)')               (2)
 
 a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three spans. Paths
-closer than 30 mm are one motion. A span counts with c = 90 mm at most, unless it shows another pose
-altogether, 250 mm away: what shows in one alone is no motion of its own, and is absorbed by the one
-nearest in time. Spans without an image do not count; where a window is shorter than a moment the
-mean is over the window.
+closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one alone is
+no motion of its own, however far away it is, and is absorbed by the one nearest in time. Spans
+without an image do not count; where a window is shorter than a moment the mean is over the window.
 
 A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each, of those
 within reach of the heaviest: a mean over opposite poses is no pose. b is the share by which the
@@ -26,9 +25,8 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 
 SECOND_NS = 10**9
-# Distance of two paths below which they are one motion, the most that a span counts with, and from
-# which on it counts whole, m.
-SAME_MOTION, MOST_APART, ANOTHER_POSE = 0.03, 0.09, 0.25
+# Distance of two paths below which they are one motion, and the most that a span counts with, m.
+SAME_MOTION, MOST_APART = 0.03, 0.09
 # Distance of two modes of an image from which on they are no one Gaussian, m.
 OPPOSITE = 0.15
 # Length of a span, s, and spans of a moment.
@@ -74,27 +72,28 @@ def path_distances(
     most, oldest = np.zeros((len(nodes), len(nodes))), max(places)
     for span, at in places.items():
         apart = sum(cdist(joint, joint) for joint in at.swapaxes(0, 1)) / at.shape[1]
-        recent[span] = np.where(apart < ANOTHER_POSE, np.minimum(apart, MOST_APART), apart)
+        recent[span] = np.minimum(apart, MOST_APART)
         recent = {other: gap for other, gap in recent.items() if other > span - MOMENT}
         if span >= MOMENT - 1 or span == oldest:
             np.maximum(most, sum(recent.values()) / len(recent), out=most)
     return most
 
 
-def grouped(weights: Array, distances: Array, most: int) -> Index:
+def grouped(weights: Array, distances: Array, most: int, least: float) -> Index:
     """Motion (N,) of each path, numbered by weight.
 
     Motions are found one by one: the path with the most weight within `SAME_MOTION` leads the
     next. Every path then belongs to the nearest leader.
 
     Args:
-        weights: (N,) of paths.
+        weights: (N,) of paths, which sum to 1.
         distances: (N, N) of paths, m.
         most: number of motions at most.
+        least: weight within `SAME_MOTION` of a leader, besides the first.
     """
     near, left = distances <= SAME_MOTION, weights.copy()
     around, leaders = near @ left, list[int]()
-    while len(leaders) < most and around.any():
+    while len(leaders) < most and around.max() > (least if leaders else 0.0):
         leaders.append(int(np.argmax(around)))
         left[near[leaders[-1]]] = 0.0
         around = near @ left

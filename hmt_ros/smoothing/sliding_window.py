@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -45,21 +46,26 @@ class FinalPose:
     trajectories: TrajectoryMixture
     t: int
 
-    @property
+    @cached_property
     def mixture(self) -> GaussianMixture:
-        """Its density, a component for each trajectory of the window."""
+        """Its density, K components: one for each trajectory of the window, then the strays."""
         return self.trajectories.marginal(self.t)
 
     @property
     def velocities(self) -> Array | None:
-        """(M, d) per second; None: unknown."""
+        """(K, d) per second; of strays 0. None: unknown."""
         velocities = self.trajectories.velocities
-        return None if velocities is None else velocities[:, self.t]
+        if velocities is None:
+            return None
+        result = np.zeros_like(self.mixture.means)
+        result[: len(velocities)] = velocities[:, self.t]
+        return result
 
     @property
     def identities(self) -> tuple[int, ...]:
-        """(M,) of the trajectories."""
-        return self.trajectories.identities
+        """(K,) of the trajectories; of strays 0."""
+        own = self.trajectories.identities
+        return own + (0,) * (len(self.mixture) - len(own))
 
 
 @dataclass(frozen=True, eq=False)
