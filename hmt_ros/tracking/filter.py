@@ -229,8 +229,9 @@ class MixtureFilter:
             prediction,
         )
         candidates = propose(self._proposals, search, base, predicted, self._rng)
-        weighed = self._weigh(search, search.optimise(candidates))
-        self._select(*weighed, observation, search)
+        # Every mode goes on, whatever else is proposed.
+        found = search.optimise(candidates).joined(Optimised(predicted, base))
+        self._select(*self._weigh(search, found), observation, search)
         self._fit_shape(observation, ERRORS['shape'].share(dt))
         return self._judge(observation, search)
 
