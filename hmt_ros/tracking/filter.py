@@ -251,7 +251,7 @@ class MixtureFilter:
         optimised, evidence = optimised[rows], evidence[rows]
         poses = optimised.minima.x
         transitions = search.continuity.log_transitions(poses)
-        histories = search.continuity.log_histories(transitions)
+        histories = search.continuity.log_histories(poses)
         log_weights, facing = weigh_ways(
             self.body,
             search.modes,
