@@ -39,7 +39,6 @@ def log_transition(body, pose, expected, dt):
 def transition(body, pose, expected, all_poses, dt):
     """p(x_k | x_j), equation (2)."""
 
-
     def share(x):
         crowd = sum(np.exp(log_transition(body, x, other, dt)) for other in all_poses)
         return np.exp(log_transition(body, x, expected, dt)) / crowd
