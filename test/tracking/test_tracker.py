@@ -413,9 +413,9 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
                 break
         assert statuses[-2] is Status.LOST
         assert (statuses[-1] is Status.TRACKING) == given
-        errors[given] = best_error(tracker.estimate.body, posterior, human32, other)
+        errors[given] = best_error(tracker.estimate.body, posterior[:1], human32, other)
     # Five keypoints hold little: the prior of the angles draws the pose away from the prediction.
-    assert errors[True] < 0.97 * errors[False]
+    assert errors[True] < 0.6 * errors[False]
 
 
 def test_nothing_becomes_certain_while_a_lost_track_is_sought(
