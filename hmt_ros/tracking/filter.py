@@ -230,8 +230,9 @@ class MixtureFilter:
             prediction,
         )
         candidates = propose(self._proposals, search, base, predicted, self._rng)
-        weighed = self._weigh(search, search.optimise(candidates))
-        self._select(*weighed, observation, search)
+        # Every mode goes on, whatever else is proposed.
+        found = search.optimise(candidates).joined(Optimised(predicted, base))
+        self._select(*self._weigh(search, found), observation, search)
         self._fit_shape(observation, ERRORS['shape'].share(dt))
         return self._judge(observation, search)
 
@@ -251,7 +252,7 @@ class MixtureFilter:
         optimised, evidence = optimised[rows], evidence[rows]
         poses = optimised.minima.x
         transitions = search.continuity.log_transitions(poses)
-        histories = search.continuity.log_histories(transitions)
+        histories = search.continuity.log_histories(poses)
         log_weights, facing = weigh_ways(
             self.body,
             search.modes,
