@@ -112,7 +112,7 @@ class SmoothedMotions(NamedTuple):
     Attributes:
         trajectories: M of them.
         shares: T arrays (K_t, M), probability that each mode belongs to each motion.
-        evidence: of the images.
+        evidence: of the images, with covariances that are larger where modes are taken for wrong.
         liveliness: (M,) lambda.
         first: of the past; None: nothing is known.
     """
@@ -238,6 +238,8 @@ class MotionSmoother:
             upper=high[:d],
             disagreements=evidence.disagreements,
         )
+        trust = np.array([one[4] for one in found])[:, :, None, None]
+        evidence = evidence._replace(covariances=evidence.covariances / trust)
         return SmoothedMotions(
             trajectories, shares, evidence, np.array([one[3] for one in found]), first
         )
@@ -261,8 +263,10 @@ class MotionSmoother:
         first: FirstStates | None,
         m: int,
         held: bool,
-    ) -> tuple[Array, BlockCholesky, float, float]:
-        """States (T, n) of motion m, their factor, log joint density and lambda.
+    ) -> tuple[Array, BlockCholesky, float, float, Array]:
+        """States (T, n) of motion m, their factor, log joint density, lambda, and trust (T,).
+
+        Trust is the factor on the precisions of images, less than 1 where they are taken for wrong.
 
         Args:
             prior: of states whose first one is free.
@@ -286,12 +290,14 @@ class MotionSmoother:
             away = self._away(states, means)
             if self.points is None or np.median(away) <= ASTRAY:
                 break
+        trust = np.ones(len(means))
         for _ in range(WRONG_PASSES):
             wrong = away > WRONG
             if self.points is None or not wrong.any():
                 break
-            trust = np.where(wrong, (ASTRAY / away) ** 2, 1.0)
-            precisions, pull = precisions * trust[:, None, None], pull * trust[:, None]
+            less = np.where(wrong, (ASTRAY / away) ** 2, 1.0)
+            precisions, pull = precisions * less[:, None, None], pull * less[:, None]
+            trust = trust * less
             states, factor = _conditioned(own, precisions, pull)
             away = self._away(states, means)
         poses = np.clip(states, low, high)[:, :d]
@@ -302,7 +308,7 @@ class MotionSmoother:
             # Covariances ignore what rests: rest is a decision, the same from image to image.
             resting = self.resting.held(own, poses, evidence.covariances[m], intervals)
             states = _conditioned(resting, precisions, pull)[0]
-        return states, factor, float(gained - seen), liveliness
+        return states, factor, float(gained - seen), liveliness, trust
 
     def _away(self, states: Array, modes: Array) -> Array:
         """Mean distances (T,) of points in states (T, n) from those in modes (T, d), m."""

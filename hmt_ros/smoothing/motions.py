@@ -3,7 +3,7 @@
     d(a, b) = max over moments of mean_s min(mean_j |a_sj - b_sj|, c)                       (1)
     z_t = sum_k r_k x_k,  R_t = sum_k r_k (S_k / b + (x_k - z_t)(x_k - z_t)')               (2)
 
-a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three spans. Paths
+a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three in a row. Paths
 closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one alone is
 no motion of its own, however far away it is, and is absorbed by the one nearest in time. Spans
 without an image do not count; where a window is shorter than a moment the mean is over the window.
@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.arrays import Array, Index, Mask
 
 SECOND_NS = 10**9
 # Distance of two paths below which they are one motion, and the most that a span counts with, m.
@@ -54,17 +54,28 @@ def path_distances(nodes: Index, points: Sequence[Array], stamps: Sequence[int])
     """
     ages = (stamps[-1] - np.asarray(stamps, dtype=np.int64)) / SECOND_NS
     spans = np.floor(ages / SPAN + 1e-3).astype(np.intp)
-    recent, most = [], np.zeros((len(nodes), len(nodes)))
-    for span in np.unique(spans):
-        places = [points[t][nodes[:, t]] for t in np.flatnonzero(spans == span).tolist()]
-        apart = np.zeros_like(most)
-        for joint in np.mean(places, axis=0).swapaxes(0, 1):
-            apart += cdist(joint, joint)
-        recent.append((span, np.minimum(apart / places[0].shape[1], MOST_APART)))
-        recent = [one for one in recent if one[0] > span - MOMENT]
-        if span >= MOMENT - 1 or span == spans[0]:
-            np.maximum(most, np.mean([one[1] for one in recent], axis=0), out=most)
+    # The last span of each moment, newest first; others would have the same images.
+    ends = np.unique(
+        np.concatenate([spans, spans + MOMENT - 1]).clip(MOMENT - 1).clip(max=spans[0])
+    )
+    recent, most = dict[int, Array](), np.zeros((len(nodes), len(nodes)))
+    for end in ends.tolist():
+        chosen = np.unique(spans[(spans > end - MOMENT) & (spans <= end)]).tolist()
+        recent = {
+            span: recent[span] if span in recent else _apart(nodes, points, spans == span)
+            for span in chosen
+        }
+        np.maximum(most, np.mean([*recent.values()], axis=0), out=most)
     return most
+
+
+def _apart(nodes: Index, points: Sequence[Array], span: Mask) -> Array:
+    """Distances (N, N) of paths over a span, the times (T,) of which are told."""
+    places = [points[t][nodes[:, t]] for t in np.flatnonzero(span).tolist()]
+    apart = np.zeros((len(nodes), len(nodes)))
+    for joint in np.mean(places, axis=0).swapaxes(0, 1):
+        apart += cdist(joint, joint)
+    return np.asarray(np.minimum(apart / places[0].shape[1], MOST_APART))
 
 
 def grouped(weights: Array, distances: Array, most: int, least: float) -> Index:

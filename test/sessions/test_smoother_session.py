@@ -25,7 +25,7 @@ WINDOW = ['trajectory_mixture', 'trajectory_markers']
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 
 # Constants of the session that tests change.
-CONSTANTS = ('max_trajectories', 'longest_interval')
+CONSTANTS = ('longest_interval',)
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_final_poses_are_mixtures_that_need_no_kinematics(session, outputs, like
 def test_errors_that_last_are_discounted_once(session, outputs, likelihoods):
     """The first of three poses, by the dense joint precision of each variable."""
     body = likelihoods.body
-    one = session(max_trajectories=1, fixed_lag=0.3, resting_feet=False)
+    one = session(max_hypotheses=1, fixed_lag=0.3, resting_feet=False)
     errors, stamps, means = CueErrors(0.5, 0.1), (0, 1, 3), []
     for index in stamps:
         mixture = likelihoods.mixture(index)[:1].normalised()
@@ -160,7 +160,7 @@ def test_forecasts_are_no_evidence(session, outputs, likelihoods):
 
 
 def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihoods):
-    one = session(max_trajectories=2)
+    one = session(max_hypotheses=2)
     for index in range(5):
         message = likelihoods.message(index)
         message.track_id = 3
@@ -262,7 +262,7 @@ def test_a_motion_passes_over_an_image_that_is_all_wrong(session, outputs, likel
 
 
 def test_motions_have_the_same_numbers_in_both_messages(session, outputs, likelihoods):
-    one = session(max_trajectories=2)
+    one = session(max_hypotheses=2)
     for index in range(6):
         one.take(MIXTURE, likelihoods.message(index))
     windows = [trajectory_mixture_of(m) for m in read(outputs, 'trajectory_mixture')]
@@ -285,19 +285,19 @@ def test_motions_have_the_same_numbers_in_both_messages(session, outputs, likeli
 
 
 def test_trajectories(session, outputs, likelihoods):
-    one = session(max_trajectories=3)
+    one = session(max_hypotheses=2)
     for index in range(4):
         one.take(MIXTURE, likelihoods.message(index))
     *_, last = read(outputs, 'trajectory_mixture')
     content = trajectory_mixture_of(last, likelihoods.body.dof_names)
     assert content.stamps_ns == tuple(likelihoods.stamp(index) for index in (1, 2, 3))
     assert content.final_until_ns == likelihoods.stamp(1)
-    assert content.means.shape == (3, 3, likelihoods.body.dimension)
+    assert content.means.shape == (2, 3, likelihoods.body.dimension)
     assert content.marginal_covariances is None
     one.parameters = with_values(one.parameters, {'publish_covariances': True})
     one.take(MIXTURE, likelihoods.message(4))
     *_, last = read(outputs, 'trajectory_mixture')
-    assert trajectory_mixture_of(last).marginal_covariances.shape == (3, 3, 37, 37)
+    assert trajectory_mixture_of(last).marginal_covariances.shape == (2, 3, 37, 37)
     (final,) = read(outputs, 'smoothed_pose_mixture')[-1:]
     found, window = pose_mixture_of(final), trajectory_mixture_of(last)
     for identity, covariance in zip(found.identities, found.covariances, strict=True):
@@ -517,7 +517,7 @@ def test_posteriors_are_told_but_smoothed(session, likelihoods):
 
 
 def test_a_span_is_smoothed_on_demand(session, likelihoods):
-    one = session(window_length=4, max_trajectories=4)
+    one = session(window_length=4, max_hypotheses=4)
     with pytest.raises(ValueError, match='none is'):
         one.smooth_span()
     for index in range(6):
