@@ -3,10 +3,11 @@
     d(a, b) = max over moments of mean_s min(mean_j |a_sj - b_sj|, c)                       (1)
     z_t = sum_k r_k x_k,  R_t = sum_k r_k (S_k / b + (x_k - z_t)(x_k - z_t)')               (2)
 
-a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three in a row. Paths
-closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one alone is
-no motion of its own, however far away it is, and is absorbed by the one nearest in time. Spans
-without an image do not count; where a window is shorter than a moment the mean is over the window.
+a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three in a row.
+Paths closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one
+alone is no motion of its own, however far away it is, and is absorbed by the one nearest in time.
+Spans without an image do not count; where a window is shorter than a moment the mean is over the
+window.
 
 A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each. b is the
 share by which the image tells changes (`CueErrors.of_changes`). What the modes disagree by is in R.
@@ -54,12 +55,10 @@ def path_distances(nodes: Index, points: Sequence[Array], stamps: Sequence[int])
     """
     ages = (stamps[-1] - np.asarray(stamps, dtype=np.int64)) / SECOND_NS
     spans = np.floor(ages / SPAN + 1e-3).astype(np.intp)
-    # The last span of each moment, newest first; others would have the same images.
-    ends = np.unique(
-        np.concatenate([spans, spans + MOMENT - 1]).clip(MOMENT - 1).clip(max=spans[0])
-    )
+    # The oldest span of each moment; those between have the same images.
+    ends = np.unique([spans, spans + MOMENT - 1]).clip(MOMENT - 1).clip(max=spans[0])
     recent, most = dict[int, Array](), np.zeros((len(nodes), len(nodes)))
-    for end in ends.tolist():
+    for end in np.unique(ends).tolist():
         chosen = np.unique(spans[(spans > end - MOMENT) & (spans <= end)]).tolist()
         recent = {
             span: recent[span] if span in recent else _apart(nodes, points, spans == span)

@@ -1,11 +1,10 @@
 """Weights of the modes of an image, smoothed over the L images after it.
 
-They are the backward half of forward filtering, backward smoothing (`smoothing.mode_chain`), over a
-window of L + 1 images. The evidence of an image for mode k, or for the way that it faces
-(`classes`), is a factor of w_k alone. So the
-lagged weights agree with the published ones, which are those of L = 0: they are the sum over all
-histories of the modes. Where a mode stands for several hypotheses, P is their mean
-(`weighting.pooled_origins`).
+They are those of forward filtering, backward smoothing (`smoothing.mode_chain`) in a window of the
+image and the L after it. The evidence of an image for mode k, or for the way that it faces
+(`classes`), is a factor of w_k alone. So the lagged weights agree with the published ones, which
+are those of L = 0: they are the sum over all histories of the modes. Where a mode stands for
+several hypotheses, P is their mean (`weighting.pooled_origins`).
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def test_parameters_are_those_of_the_file(running):
     running.assert_described(SmootherParameters())
     running.assert_refused(
         ({'fixed_lag': -1.0}, 'out of range'),
-        ({'method': 'guess'}, "saw 'guess'"),
+        ({'max_hypotheses': 0}, 'out of range'),
         ({'body_model': 'nobody'}, 'nobody: no such file, and no name; there are human32'),
         ({'autostart': False}, 'read-only'),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -101,7 +103,7 @@ def test_motions_keep_their_identity(walk, chained):
         )
         for t, order in enumerate(orders)
     ]
-    origins = [np.empty((2, 0)), *(1.0 * (b[:, None] == a) for a, b in zip(orders, orders[1:]))]
+    origins = [np.empty((2, 0)), *(1.0 * (b[:, None] == a) for a, b in pairwise(orders))]
     seen = []
     for image in chained(mixtures, origins=origins):
         found = window.step(image).trajectories
