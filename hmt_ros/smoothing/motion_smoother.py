@@ -170,8 +170,13 @@ class MotionSmoother:
         """An image of a window after one at `before_ns`; None: the first.
 
         Raises:
-            ValueError: modes that can not be smoothed.
+            ValueError: modes that can not be smoothed, a stamp that does not increase.
         """
+        if before_ns is not None and modes.stamp_ns <= before_ns:
+            raise ValueError(
+                f'stamps must increase, saw {modes.stamp_ns} ns after {before_ns} ns; begin anew '
+                'to go back'
+            )
         mixture, link = modes.mixture, modes.link
         if mixture.dimension != self.dynamics.dimension:
             raise ValueError(
@@ -239,7 +244,7 @@ class MotionSmoother:
             disagreements=evidence.disagreements,
         )
         trust = np.array([one[4] for one in found])[:, :, None, None]
-        evidence = evidence._replace(covariances=evidence.covariances / trust)
+        np.divide(evidence.covariances, trust, out=evidence.covariances)
         return SmoothedMotions(
             trajectories, shares, evidence, np.array([one[3] for one in found]), first
         )
