@@ -214,7 +214,7 @@ class MotionSmoother:
         nodes, weights = backward_paths(links, PATHS, self.seed)
         distances = path_distances(nodes, [image.points for image in images], stamps)
         least = LEAST if len(images) > 1 else 0.0
-        labels = grouped(weights, distances, self.max_motions, least)
+        labels = grouped(weights, *distances, self.max_motions, least)
         evidence = evidence_of_motions(nodes, weights, labels, [image.counted for image in images])
         masses: Array = np.bincount(labels, weights).astype(np.float64)
         shares = [

@@ -45,8 +45,10 @@ class MotionEvidence(NamedTuple):
     disagreements: Array
 
 
-def path_distances(nodes: Index, points: Sequence[Array], stamps: Sequence[int]) -> Array:
-    """Distances (N, N) of paths, equation (1), m.
+def path_distances(
+    nodes: Index, points: Sequence[Array], stamps: Sequence[int]
+) -> tuple[Array, Array]:
+    """Distances (N, N) of paths, equation (1), m; and their means over all spans with c infinite.
 
     Args:
         nodes: (N, T) modes of the paths.
@@ -57,15 +59,17 @@ def path_distances(nodes: Index, points: Sequence[Array], stamps: Sequence[int])
     spans = np.floor(ages / SPAN + 1e-3).astype(np.intp).clip(max=max(round(ages[0] / SPAN), 1) - 1)
     # The oldest span of each moment; those between have the same images.
     ends = np.unique([spans, spans + MOMENT - 1]).clip(MOMENT - 1).clip(max=spans[0])
-    recent, most = dict[int, Array](), np.zeros((len(nodes), len(nodes)))
+    most, total = np.zeros((2, len(nodes), len(nodes)))
+    recent = dict[int, Array]()
     for end in np.unique(ends).tolist():
         chosen = np.unique(spans[(spans > end - MOMENT) & (spans <= end)]).tolist()
-        recent = {
-            span: recent[span] if span in recent else _apart(nodes, points, spans == span)
-            for span in chosen
-        }
-        np.maximum(most, np.mean([*recent.values()], axis=0), out=most)
-    return most
+        for span in chosen:
+            if span not in recent:
+                recent[span] = _apart(nodes, points, spans == span)
+                total += recent[span]
+        recent = {span: recent[span] for span in chosen}
+        np.maximum(most, np.minimum([*recent.values()], MOST_APART).mean(0), out=most)
+    return most, total / len(np.unique(spans))
 
 
 def _apart(nodes: Index, points: Sequence[Array], span: Mask) -> Array:
@@ -74,18 +78,18 @@ def _apart(nodes: Index, points: Sequence[Array], span: Mask) -> Array:
     apart = np.zeros((len(nodes), len(nodes)))
     for joint in np.mean(places, axis=0).swapaxes(0, 1):
         apart += cdist(joint, joint)
-    return np.asarray(np.minimum(apart / places[0].shape[1], MOST_APART))
+    return apart / places[0].shape[1]
 
 
-def grouped(weights: Array, distances: Array, most: int, least: float) -> Index:
+def grouped(weights: Array, distances: Array, means: Array, most: int, least: float) -> Index:
     """Motion (N,) of each path, numbered by weight.
 
     Motions are found one by one: the path with the most weight within `SAME_MOTION` leads the
-    next. Every path then belongs to the nearest leader.
+    next. Every path then belongs to the leader that is nearest in the mean.
 
     Args:
         weights: (N,) of paths.
-        distances: (N, N) of paths, m.
+        distances, means: (N, N) of paths, m, see `path_distances`.
         most: number of motions at most.
         least: weight around a leader, as a share of all; the first leads whatever it has.
     """
@@ -95,7 +99,7 @@ def grouped(weights: Array, distances: Array, most: int, least: float) -> Index:
         leaders.append(int(np.argmax(around)))
         left[near[leaders[-1]]] = 0.0
         around = near @ left
-    labels = np.argmin(distances[leaders], axis=0)
+    labels = np.argmin(means[leaders], axis=0)
     order = np.argsort(-np.bincount(labels, weights), kind='stable')
     return np.asarray(np.argsort(order)[labels])
 
