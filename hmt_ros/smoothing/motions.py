@@ -78,7 +78,7 @@ def _apart(nodes: Index, points: Sequence[Array], span: Mask) -> Array:
     apart = np.zeros((len(nodes), len(nodes)))
     for joint in np.mean(places, axis=0).swapaxes(0, 1):
         apart += cdist(joint, joint)
-    return apart / places[0].shape[1]
+    return np.asarray(apart / places[0].shape[1])
 
 
 def grouped(weights: Array, distances: Array, means: Array, most: int, least: float) -> Index:
