@@ -143,6 +143,15 @@ def test_a_path_that_is_no_motion_belongs_to_what_it_is_near_for_longer():
     assert found.tolist() == [0, 2, 1, 2]
 
 
+def test_what_flickers_far_away_does_not_leave_its_motion():
+    """For a sixth of a second 1 m away; another motion, on that side, is 40 mm away all along."""
+    points = [np.array([[[0.0, 0.0, 0.0]], [[0.04, 0.0, 0.0]], [[1.0, 0.0, 0.0]]])] * 16
+    nodes = np.zeros((3, 16), dtype=np.intp)
+    nodes[1], nodes[2, 6:11] = 1, 2
+    distances = path_distances(nodes, points, [round(1e9 * t / RATE) for t in range(16)])
+    assert grouped(np.array([0.5, 0.4, 0.1]), *distances, 8, 0.02).tolist() == [0, 1, 0]
+
+
 def test_evidence_has_the_moments_of_the_modes(rng):
     counts, weights = (3, 1, 4), rng.dirichlet(np.ones(6))
     nodes = np.stack([rng.integers(0, k, 6) for k in counts], axis=1)
