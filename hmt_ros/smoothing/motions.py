@@ -7,7 +7,8 @@ a_sj is the mean place of joint j over span s, a sixth of a second; a moment is 
 Paths closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one
 alone is no motion of its own, however far away it is, and is absorbed by the one nearest in time.
 Spans without an image do not count; where a window is shorter than a moment the mean is over the
-window. The oldest images are a span where there is half of one, else part of the next.
+window. The oldest span may have few images: these may be the end of what has lasted longer, and
+what shows in two of them is a motion.
 
 A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each. b is the
 share by which the image tells changes (`CueErrors.of_changes`). What the modes disagree by is in R.
@@ -56,7 +57,7 @@ def path_distances(
         stamps: (T,) ns.
     """
     ages = (stamps[-1] - np.asarray(stamps, dtype=np.int64)) / SECOND_NS
-    spans = np.floor(ages / SPAN + 1e-3).astype(np.intp).clip(max=max(round(ages[0] / SPAN), 1) - 1)
+    spans = np.floor(ages / SPAN + 1e-3).astype(np.intp)
     # The oldest span of each moment; those between have the same images.
     ends = np.unique([spans, spans + MOMENT - 1]).clip(MOMENT - 1).clip(max=spans[0])
     most, total = np.zeros((2, len(nodes), len(nodes)))

@@ -31,8 +31,7 @@ def by_definition(nodes, points, stamps):
     And the mean over all spans, without a limit.
     """
     ages = [(stamps[-1] - stamp) * 1e-9 for stamp in stamps]
-    count = max(1, round(ages[0] / SPAN))
-    of_span = [min(int(np.floor(age / SPAN + 1e-3)), count - 1) for age in ages]
+    of_span = [int(np.floor(age / SPAN + 1e-3)) for age in ages]
     result, means = np.zeros((2, len(nodes), len(nodes)))
     for a in range(len(nodes)):
         for b in range(len(nodes)):
@@ -91,9 +90,12 @@ def two_paths(images, away, some):
 @pytest.mark.parametrize('images', [14, 16, 17, 18, 19, 45, 60])
 @pytest.mark.parametrize('away', [0.05, 0.1, 0.15, 9.0])
 def test_what_flickers_is_absorbed(images, away):
-    """For less than a tenth of a second, 150 mm away; in one span, however far."""
+    """For less than a tenth of a second, 150 mm away; in one span, however far.
+
+    But for the oldest images of a window, which are less than a span: a motion may end there.
+    """
     newest = [range(images - 5 * k - 5, images - 5 * k) for k in range(images // 5)]
-    for first in range(images - 1):
+    for first in range(images % 5, images - 1):
         some = {first, first + 1}
         if away <= 0.15 or any(some < set(span) for span in newest):
             assert two_paths(images, away, some) <= SAME_MOTION + 1e-12
