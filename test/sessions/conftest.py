@@ -363,19 +363,21 @@ class Likelihoods:
 
     body: Body = field(default_factory=lambda: load_body('human37'))
     messages: RosbagsMessages = field(default_factory=RosbagsMessages)
+    leans: bool = False
     hops: float = 0.002  # probability that a mode continues the other one
 
     def stamp(self, index):
         return START_NS + round(index * FRAME_NS)
 
     def mixture(self, index):
-        """A mixture over poses; the second mode is an elbow that bends more, and leans back."""
+        """A mixture over poses; the second mode is an elbow that bends more, and may lean back."""
         means = np.tile(self.body.prior_mean, (2, 1))
         means[:, 2] = 4.0
         moving = self.body.dof_names.index('left_elbow')
         means[:, moving] = 0.5 + 0.05 * index
         means[1, moving] += 0.8
-        means[1, self.body.dof_names.index('trunk_x')] -= 0.6
+        if self.leans:
+            means[1, self.body.dof_names.index('trunk_x')] -= 0.6
         covariances = np.tile(1e-3 * np.eye(self.body.dimension), (2, 1, 1))
         return GaussianMixture(np.array([0.6, 0.4]), means, covariances)
 

@@ -28,6 +28,12 @@ FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 CONSTANTS = ('longest_interval',)
 
 
+@pytest.fixture(scope='module')
+def likelihoods(likelihoods):
+    """Of two modes that are two motions."""
+    return replace(likelihoods, leans=True)
+
+
 @pytest.fixture
 def session(outputs, monkeypatch, random_walk):
     def make(wanted=lambda topic: True, prior=random_walk, **values):
