@@ -206,8 +206,13 @@ class MotionSmoother:
         """An image of a window after one at `before_ns`; None: the first.
 
         Raises:
-            ValueError: modes that can not be smoothed.
+            ValueError: modes that can not be smoothed, a stamp that does not increase.
         """
+        if before_ns is not None and modes.stamp_ns <= before_ns:
+            raise ValueError(
+                f'stamps must increase, saw {modes.stamp_ns} ns after {before_ns} ns; begin anew '
+                'to go back'
+            )
         mixture, link = modes.mixture, modes.link
         if mixture.dimension != self.dynamics.dimension:
             raise ValueError(
@@ -248,7 +253,7 @@ class MotionSmoother:
         before = None if past is None else past.places[past.shares[nodes[:, 0]].argmax(1)]
         distances = path_distances(nodes, points, stamps, before)
         least = LEAST if len(images) > 1 else 0.0
-        labels = grouped(weights, distances, self.max_motions, least)
+        labels = grouped(weights, *distances, self.max_motions, least)
         counted = [image.counted for image in images]
         evidence = evidence_of_motions(nodes, weights, labels, counted, points)
         masses: Array = np.bincount(labels, weights).astype(np.float64)

@@ -3,10 +3,11 @@
     d(a, b) = max over moments of mean_s min(mean_j |a_sj - b_sj|, c)                       (1)
     z_t = sum_k r_k x_k,  R_t = sum_k r_k (S_k / b + (x_k - z_t)(x_k - z_t)')               (2)
 
-a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three spans. Paths
-closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one alone is
-no motion of its own, however far away it is, and is absorbed by the one nearest in time. Spans
-without an image do not count; where a window is shorter than a moment the mean is over the window.
+a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three in a row.
+Paths closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one
+alone is no motion of its own, however far away it is, and is absorbed by the one nearest in time.
+Where a path comes from is a span before the first. Spans without an image do not count; where a
+window is shorter than a moment the mean is over the window.
 
 A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each, of those
 within reach of the heaviest: a mean over opposite poses is no pose. b is the share by which the
@@ -49,8 +50,8 @@ class MotionEvidence(NamedTuple):
 
 def path_distances(
     nodes: Index, points: Sequence[Array], stamps: Sequence[int], before: Array | None = None
-) -> Array:
-    """Distances (N, N) of paths, equation (1), m.
+) -> tuple[Array, Array]:
+    """Distances (N, N) of paths, equation (1), m; and their means over all spans with c infinite.
 
     Args:
         nodes: (N, T) modes of the paths.
@@ -60,34 +61,37 @@ def path_distances(
     """
     ages = (stamps[-1] - np.asarray(stamps, dtype=np.int64)) / SECOND_NS
     spans = np.floor(ages / SPAN + 1e-3).astype(np.intp)
-    places = {
-        int(span): np.mean(
-            [points[t][nodes[:, t]] for t in np.flatnonzero(spans == span).tolist()], axis=0
-        )
-        for span in np.unique(spans)
+    apart = {
+        span: _apart([points[t][nodes[:, t]] for t in np.flatnonzero(spans == span).tolist()])
+        for span in np.unique(spans).tolist()
     }
     if before is not None:
-        places[int(spans[0]) + 1] = before
-    recent: dict[int, Array] = {}
-    most, oldest = np.zeros((len(nodes), len(nodes))), max(places)
-    for span, at in places.items():
-        apart = sum(cdist(joint, joint) for joint in at.swapaxes(0, 1)) / at.shape[1]
-        recent[span] = np.minimum(apart, MOST_APART)
-        recent = {other: gap for other, gap in recent.items() if other > span - MOMENT}
-        if span >= MOMENT - 1 or span == oldest:
-            np.maximum(most, sum(recent.values()) / len(recent), out=most)
-    return most
+        apart[max(apart) + 1] = _apart([before])
+    known = np.array([*apart])
+    # The oldest span of each moment; those between have the same images.
+    ends = np.unique([known, known + MOMENT - 1]).clip(MOMENT - 1).clip(max=known.max())
+    most = np.zeros((len(nodes), len(nodes)))
+    for end in np.unique(ends):
+        moment = [apart[span] for span in known.tolist() if end - MOMENT < span <= end]
+        np.maximum(most, np.minimum(moment, MOST_APART).mean(0), out=most)
+    return most, np.mean([*apart.values()], axis=0)
 
 
-def grouped(weights: Array, distances: Array, most: int, least: float) -> Index:
+def _apart(places: Sequence[Array]) -> Array:
+    """Distances (N, N) of paths over a span, of whose images places (N, P, 3) are given, m."""
+    joints = np.mean(places, axis=0).swapaxes(0, 1)
+    return np.asarray(sum(cdist(joint, joint) for joint in joints) / len(joints))
+
+
+def grouped(weights: Array, distances: Array, means: Array, most: int, least: float) -> Index:
     """Motion (N,) of each path, numbered by weight.
 
     Motions are found one by one: the path with the most weight within `SAME_MOTION` leads the
-    next. Every path then belongs to the nearest leader.
+    next. Every path then belongs to the leader that is nearest in the mean.
 
     Args:
         weights: (N,) of paths, which sum to 1.
-        distances: (N, N) of paths, m.
+        distances, means: (N, N) of paths, m, see `path_distances`.
         most: number of motions at most.
         least: weight within `SAME_MOTION` of a leader, besides the first.
     """
@@ -97,7 +101,7 @@ def grouped(weights: Array, distances: Array, most: int, least: float) -> Index:
         leaders.append(int(np.argmax(around)))
         left[near[leaders[-1]]] = 0.0
         around = near @ left
-    labels = np.argmin(distances[leaders], axis=0)
+    labels = np.argmin(means[leaders], axis=0)
     order = np.argsort(-np.bincount(labels, weights), kind='stable')
     return np.asarray(np.argsort(order)[labels])
 
