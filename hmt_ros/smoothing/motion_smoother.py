@@ -21,12 +21,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmt_ros.body.resting_points import RestingPoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
 from hmt_ros.inference.error_model import TOGETHER, CueErrors
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
-from hmt_ros.smoothing.mode_chain import Link, backward_weights, drawn_paths
+from hmt_ros.inference.mode_chain import Link, backward_weights, drawn_paths
 from hmt_ros.smoothing.motions import (
     SAME_MOTION,
     SECOND_NS,
@@ -35,12 +36,11 @@ from hmt_ros.smoothing.motions import (
     grouped,
     path_distances,
 )
-from hmt_ros.smoothing.resting_points import RestingPoints
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states
 
 # Paths that are drawn from the chain.
-PATHS = 128
+PATHS = 96
 # Values of lambda, and the median distance from the modes, m, from which on the next is tried.
 LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
 # Distance from which on the modes of an image are taken for wrong, m, and looks at that.
@@ -53,7 +53,7 @@ ANEW = 1e6
 # Distance from all motions from which on a mode is a stray, m.
 STRAY = 0.06
 # Least weight of a motion of more than one image, and of one whose resting feet are held.
-LEAST, LEAST_HELD = 0.01, 0.05
+LEAST, LEAST_HELD = 0.01, 0.1
 
 
 class ImageModes(NamedTuple):
@@ -370,7 +370,8 @@ class MotionSmoother:
             # Covariances ignore what rests: rest is a decision, the same from image to image.
             poses = np.clip(states, *self.limits())[:, :d]
             resting = self.resting.held(prior, poses, evidence.covariances[m], intervals)
-            states = _conditioned(resting, precisions, means)[0]
+            if resting is not prior:
+                states = _conditioned(resting, precisions, means)[0]
         return MotionStates(states, factor, float(gained - seen), liveliness, trust, begins)
 
     def _away(self, states: Array, places: Array) -> Array:
