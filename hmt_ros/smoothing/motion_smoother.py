@@ -53,7 +53,7 @@ ANEW = 1e6
 # Distance from all motions from which on a mode is a stray, m.
 STRAY = 0.06
 # Least weight of a motion of more than one image, and of one whose resting feet are held.
-LEAST, LEAST_HELD = 0.01, 0.1
+LEAST, LEAST_HELD = 0.03, 0.1
 
 
 class ImageModes(NamedTuple):
