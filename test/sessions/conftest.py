@@ -54,7 +54,7 @@ class StubTracker:
         )
         self.validity = Validity()
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
-        self.foreseen, self.nobody_shown, self.reason = False, True, ''
+        self.foreseen, self.nobody_shown, self.reason, self.shown = False, True, '', None
         self.track_id, self.started_from = 0, None
         self.existence_probability = 0.875
         self.likelihood = SimpleNamespace(
