@@ -4,9 +4,10 @@
     F(q) = E_q[log q(X) - log p(X, R)],    q = sum_i a_i N(M_i, s_i^2 S_i)                      (2)
 
 The distinct motions of a window start descents on (1) within limits, with one prior for all: that
-of the liveliest among them. Of optima that are one motion the most probable is kept. (2) is over
-these. What it adapts is chosen on clips (docs/smoothing.md): the chain of the filter's modes weighs
-motions better than (2), so an optimum has the weight of the motions that came to it.
+of the liveliest among them, with the feet held that rest in the heaviest. Of optima that are one
+motion the most probable is kept; (2) is over these. What it adapts is chosen on clips
+(docs/smoothing.md): the chain of the filter's modes weighs motions better than (2), so an optimum
+has the weight of the motions that came to it.
 """
 
 from __future__ import annotations
@@ -63,7 +64,12 @@ def refined_on_images(
     chosen = _first_of_each(smoother, motions, motions.states, motions.weights, LEAST)[0]
     liveliness = float(found.liveliness[chosen].max())
     dynamics = replace(smoother.dynamics, diffusion=liveliness * smoother.dynamics.diffusion)
-    prior = dynamics.prior(np.diff(motions.stamps_ns) / SECOND_NS)
+    intervals = np.diff(motions.stamps_ns) / SECOND_NS
+    prior = dynamics.prior(intervals)
+    if smoother.resting is not None and len(intervals):
+        first = chosen[0]
+        covariances = found.evidence.covariances[first]
+        prior = smoother.resting.held(prior, motions.means[first], covariances, intervals)
     optima = refine(
         motions.states[chosen],
         prior,
