@@ -38,6 +38,7 @@ class StubTracker:
     made: list[StubTracker] = []  # noqa: RUF012
     empty: set[int] = set()  # noqa: RUF012  # stamps of images without a person
     fault: Exception | None = None
+    shown: Any = None
 
     def __init__(
         self, body, camera, settings=None, background=None, seed=0, known_ground=None,
@@ -54,7 +55,7 @@ class StubTracker:
         )
         self.validity = Validity()
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
-        self.foreseen, self.nobody_shown, self.reason, self.shown = False, True, '', None
+        self.foreseen, self.nobody_shown, self.reason = False, True, ''
         self.track_id, self.started_from = 0, None
         self.existence_probability = 0.875
         self.likelihood = SimpleNamespace(
