@@ -20,6 +20,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from hmt_ros.body.ground_terms import GroundTerm
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
@@ -41,7 +42,7 @@ class SeenImage:
 
     likelihood: ImageLikelihood
     observation: Observation
-    known: tuple[FrameTerm, ...] = ()
+    known: tuple[FrameTerm | GroundTerm, ...] = ()
 
     def levelled(self, level: Array) -> SeenImage:
         """The same, of poses whose root angles are measured against other axes."""
@@ -124,4 +125,7 @@ class ImageSequence:
 
 def _scaled(energy: Energy, factor: float) -> Energy:
     """An energy times a factor."""
-    return Energy(*(None if part is None else factor * part for part in energy))
+    value, gradient, hessian = energy
+    if gradient is None or hessian is None:
+        return Energy(factor * value)
+    return Energy(factor * value, factor * gradient, factor * hessian)

@@ -130,4 +130,4 @@ def _first_of_each(
     distances = path_distances(nodes, list(points), motions.stamps_ns)
     labels = grouped(weights, distances, MOST, least)
     first = np.unique(labels, return_index=True)[1]
-    return first, np.bincount(labels, weights)
+    return first, np.bincount(labels, weights).astype(np.float64)
