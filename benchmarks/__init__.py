@@ -31,6 +31,7 @@ BENCHMARKS = {
     'smoothing': 'the smoother against the filter, on clips with known truth',
     'soak': 'nodes and files under load and fault',
     'strangers': 'files of other programs, as their commands take them',
+    'symmetric': 'whether two motions with one image and one prior both keep their weight',
     'tracking': 'accuracy, calibration and speed of the tracker on clips with known truth',
     'unseen': 'what is said of limbs that no image shows',
     'vertical': 'how well the lines of a scene tell which way is up, and what a look costs',

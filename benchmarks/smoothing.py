@@ -280,7 +280,7 @@ def smoothed(
         spent.append(time.perf_counter() - start)
         if handled.faults:
             raise ValueError(handled.faults[0])
-    whole, of = session.smoothed_span()
+    whole, _ = session.smoothed_span()
     assert whole.stamps_ns is not None
     offline = {
         stamp: with_shape(whole.marginal(t), shapes[stamp])

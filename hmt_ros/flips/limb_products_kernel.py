@@ -238,26 +238,30 @@ def fill_configurations(tree, limbs, modes, found, found_counts, flipped, price,
     lead, pose = modes[0], np.empty(d)
     place_pose(tree, lead, columns, origins, axes, on_axes)
     sources = len(modes) + found.shape[1] + most_leaves
-    angles = np.zeros((sources * most_leaves, width))
+    given, firsts = np.zeros((sources, width)), np.zeros(sources, np.int64)
+    angles = np.zeros((sources * (1 + most_leaves), width))
     result.trunks[0] = lead
-    # Limbs on the first trunk: of the modes, those found, in the other side's place, all flips.
+    # Limbs on the first trunk: of the modes, those found, in the other side's place; each with its
+    # flips, which are not to be crowded out by modes that tremble.
     for c in range(limit):
-        n = 0
+        count = 0
         for g in range(len(modes)):
             for j in range(limbs.dofs[c]):
-                angles[n, j] = modes[g, limbs.own[c, j]]
-            n += 1
+                given[count, j] = modes[g, limbs.own[c, j]]
+            count += 1
         for i in range(found_counts[c]):
-            angles[n] = found[c, i]
-            n += 1
+            given[count] = found[c, i]
+            count += 1
         if limbs.siblings[c] >= 0:
             ends = _ends(limbs, limbs.siblings[c], columns, origins)
-            n += _hang(limbs, c, columns, origins, lead, ends, SLACK, leaves, angles[n:])
-        given = n
-        for i in range(given):
+            count += _hang(limbs, c, columns, origins, lead, ends, SLACK, leaves, given[count:])
+        n = 0
+        for i in range(count):
+            firsts[i], angles[n] = n, given[i]
+            n += 1
             pose[:] = lead
             for j in range(limbs.dofs[c]):
-                pose[limbs.own[c, j]] = angles[i, j]
+                pose[limbs.own[c, j]] = given[i, j]
             place_pose(tree, pose, moved, places, axes, on_axes)
             ends = _ends(limbs, c, moved, places)
             n += _hang(limbs, c, moved, places, pose, ends, 0.0, leaves, angles[n:])
@@ -270,7 +274,7 @@ def fill_configurations(tree, limbs, modes, found, found_counts, flipped, price,
         for i in range(n):
             if owner[i] >= 0:
                 for g in range(len(modes)):
-                    penalty = 0.0 if i == g else price
+                    penalty = 0.0 if i == firsts[g] else price
                     result.penalties[g, c, owner[i]] = min(
                         result.penalties[g, c, owner[i]], penalty
                     )

@@ -59,14 +59,6 @@ class CueErrors:
         """Share of the energy, or of its curvature, that an image adds dt s after the last one."""
         return self.independent * share_of_time(dt, self.time)
 
-    def of_modes(self, dt: float) -> float:
-        """Share of the log weights by which an image tells modes apart, dt s after the last one.
-
-        That of time alone: neighbours in space repeat each other's errors, which makes a mode look
-        sharper than it is, but they do so in all modes. Chosen on clips (docs/smoothing.md).
-        """
-        return share_of_time(dt, self.time)
-
     def together(self, count: float) -> float:
         """Factor on the summed information of images about a constant.
 

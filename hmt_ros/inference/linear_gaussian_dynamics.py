@@ -236,18 +236,22 @@ class LinearGaussianDynamics:
             return means, covariances + q
         return means @ a.T, a @ covariances @ a.T + q
 
-    def prior(self, intervals: Array, *, initial: bool = True) -> TrajectoryPrior:
+    def prior(
+        self, intervals: Array, *, initial: bool = True, noise: ArrayLike = 1.0
+    ) -> TrajectoryPrior:
         """The density of trajectories with these intervals (T-1,) between their states, s.
 
         Args:
             intervals: (T-1,).
             initial: whether the prior of the first state is part of it.
+            noise: (T-1,) or scalar, factor on the noise over each interval.
 
         Raises:
             ValueError: the noise over an interval is not positive definite.
         """
         n = self.state_dimension
         times = len(intervals) + 1
+        factors = np.broadcast_to(np.asarray(noise, dtype=np.float64), (times - 1,))
         diagonal = np.zeros((times, n, n))
         lower = np.zeros((times - 1, n, n))
         information = np.zeros((times, n))
@@ -265,10 +269,12 @@ class LinearGaussianDynamics:
         for i, interval in enumerate(different):
             before, after, forth, log_det = self.coupling(float(interval))
             at = np.flatnonzero(which == i)
-            diagonal[at] += before
-            diagonal[at + 1] += after
-            lower[at] = -forth
+            share = 1.0 / factors[at, None, None]
+            diagonal[at] += share * before
+            diagonal[at + 1] += share * after
+            lower[at] = -share * forth
             constant += 0.5 * len(at) * (n * np.log(2 * np.pi) + log_det)
+        constant += 0.5 * n * float(np.log(factors).sum())
         precision = BlockTridiagonal(diagonal, lower)
         return TrajectoryPrior(precision, information, float(constant), self.dimension)
 

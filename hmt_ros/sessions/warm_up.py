@@ -93,6 +93,11 @@ def likelihoods(body: Body) -> list[Any]:
             '',
             error_share=0.5,
             error_time=0.1,
+            identities=np.array([1, 2]),
+            posterior_weights=np.array([0.6, 0.4]),
+            ancestry=np.array([[0.9, 0.1], [0.2, 0.8]])[:, : 2 * (t > 0)],
+            ancestry_stamp_ns=_stamp(t - 1) if t else 0,
+            ancestry_ids=np.array([1, 2][: 2 * (t > 0)]),
         )
         made.append(pose_mixture_message(messages, content))
     return made

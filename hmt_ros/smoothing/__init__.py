@@ -2,7 +2,7 @@
 
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.smoothing.mixture_smoother import MixtureSmoother
-from hmt_ros.smoothing.mode_chain import Link, backward_paths, backward_weights
+from hmt_ros.smoothing.mode_chain import Link, backward_weights, drawn_paths
 from hmt_ros.smoothing.motion_smoother import ImageModes, MotionSmoother
 from hmt_ros.smoothing.sliding_window import FinalPose, SlidingWindow, WindowUpdate
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
@@ -17,6 +17,6 @@ __all__ = [
     'SlidingWindow',
     'TrajectoryMixture',
     'WindowUpdate',
-    'backward_paths',
     'backward_weights',
+    'drawn_paths',
 ]

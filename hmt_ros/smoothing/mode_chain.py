@@ -41,11 +41,12 @@ def backward_weights(links: Sequence[Link]) -> list[Array]:
     return result[::-1]
 
 
-def backward_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Array]:
-    """Paths drawn from (3), each with a share of the weight of its last mode.
+def drawn_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Array]:
+    """Paths drawn from (3), each with a share of the weight of its first mode given all images.
 
-    Each mode of the newest image begins at least one path and has its weight exactly. Paths through
-    one mode are spread over its origins systematically, in a random order, so that their numbers
+    Drawn forwards, with P(k | j) = W_(t+1)(k) P(j | k) / W_t(j). Each mode of the oldest image
+    begins at least one path and has its weight (2) exactly, however small it is. Paths through one
+    mode are spread over what follows systematically, in a random order, so that their numbers
     are as even as can be.
 
     Args:
@@ -56,22 +57,22 @@ def backward_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index,
         Modes (N, T) of the paths, and their weights (N,), which sum to 1.
     """
     rng = np.random.default_rng(seed)
-    weights = links[-1].weights
-    copies = np.ceil(count * weights).astype(np.intp)
-    at = np.repeat(np.arange(len(weights)), copies)
-    shares = (weights / np.maximum(copies, 1))[at]
+    smoothed = backward_weights(links)
+    copies = np.ceil(count * smoothed[0]).astype(np.intp)
+    at = np.repeat(np.arange(len(copies)), copies)
+    shares = (smoothed[0] / np.maximum(copies, 1))[at]
     nodes = np.empty((len(at), len(links)), dtype=np.intp)
-    nodes[:, -1] = at
-    for t in range(len(links) - 1, 0, -1):
-        origins = links[t].origins
+    nodes[:, 0] = at
+    for t in range(1, len(links)):
+        onwards = np.cumsum(links[t].origins.T * smoothed[t], axis=1)
         order = rng.permutation(len(at))
         order = order[np.argsort(at[order], kind='stable')]
-        total = np.bincount(at, shares, minlength=len(origins))
+        total = np.bincount(at, shares, minlength=len(onwards))
         before = (np.cumsum(total) - total)[at[order]]
         reached = np.cumsum(shares[order]) - before - rng.random() * shares[order]
-        level = reached / total[at[order]]
-        at[order] = (level[:, None] > np.cumsum(origins, axis=1)[at[order], :-1]).sum(1)
-        nodes[:, t - 1] = at
+        level = reached / total[at[order]] * onwards[at[order], -1]
+        at[order] = (level[:, None] > onwards[at[order], :-1]).sum(1)
+        nodes[:, t] = at
     return nodes, shares
 
 

@@ -1,12 +1,15 @@
 """The states of motions: smoothed along what the images say of each (VMS 5, in closed form).
 
-    E(X) = |x_1 - m_1|^2_(P_1) / 2 + sum_t |x_(t+1) - A x_t|^2_(lambda Q) / 2
+    E(X) = |x_1 - m_1|^2_(P_1) / 2 + sum_t |x_(t+1) - A x_t|^2_(l_t Q) / 2
            + sum_t |x_t - z_t|^2_(R_t) / 2
 
-z_t and R_t are the motion's modes in an image (`motions`). lambda is how much livelier the motion
-is than the prior of people's motion: the least of 1, 4, 16, 64 with which the states stay with the
-modes whose motion they are. N(m_1, P_1) is the state that the motions predict which its paths come
-from. E is a parabola with a block-tridiagonal Hessian; states beyond limits are moved onto them.
+z_t and R_t are the motion's modes in an image (`motions`), N(m_1, P_1) is the state predicted by
+the motions that its paths come from. l_t is how much livelier the motion is than the prior of
+people's motion: the least of 1, 4, 16, 64 with which the states stay with the modes whose motion
+they are. Where the modes before and after a time are farther apart than a body moves, the chain has
+gone over to another explanation, and the states begin anew. An image whose modes are far from both
+is wrong, and counts little. E is a parabola with a block-tridiagonal Hessian; states beyond limits
+are moved onto them.
 """
 
 from __future__ import annotations
@@ -19,11 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
-from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.inference.error_model import TOGETHER, CueErrors
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
-from hmt_ros.smoothing.mode_chain import Link, backward_paths
+from hmt_ros.smoothing.mode_chain import Link, backward_weights, drawn_paths
 from hmt_ros.smoothing.motions import (
     SECOND_NS,
     MotionEvidence,
@@ -41,8 +44,15 @@ PATHS = 128
 LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
 # Distance from which on the modes of an image are taken for wrong, m, and looks at that.
 WRONG, WRONG_PASSES = 0.15, 3
+# Speed of a body, seen from the pelvis, m/s, and what modes tremble by, m: beyond, states begin
+# anew, unless modes less than so many images and seconds away deny it. Factor on the noise there.
+FASTEST, TREMBLE = 3.0, 0.05
+NEIGHBOURS, FLICKER = 3, 0.1
+ANEW = 1e6
+# Distance from all motions from which on a mode is a stray, m.
+STRAY = 0.06
 # Least weight of a motion of more than one image, and of one whose resting feet are held.
-LEAST, LEAST_HELD = 0.002, 0.05
+LEAST, LEAST_HELD = 0.01, 0.05
 
 
 class ImageModes(NamedTuple):
@@ -70,12 +80,14 @@ class WindowImage(NamedTuple):
         counted: the likelihood with the covariances that count for changes.
         points: (K, P, 3) of the modes, m.
         lasting: factor on the variance that is left after it, because its errors last.
+        alone: factor on the covariances of modes that nothing but the images so far tells of.
     """
 
     modes: ImageModes
     counted: GaussianMixture
     points: Array
     lasting: float
+    alone: float
 
 
 class Past(NamedTuple):
@@ -84,13 +96,15 @@ class Past(NamedTuple):
     Attributes:
         shares: (K, M) probability that each mode of the image continues each of M motions.
         means, covariances: (M, n) and (M, n, n) of the states that these motions predict.
-        liveliness: (M,) their lambda.
+        liveliness: (M,) their l.
+        places: (M, P, 3) where they were in the last image, m.
     """
 
     shares: Array
     means: Array
     covariances: Array
     liveliness: Array
+    places: Array
 
 
 class FirstStates(NamedTuple):
@@ -98,12 +112,32 @@ class FirstStates(NamedTuple):
 
     Attributes:
         means, covariances: (M, n) and (M, n, n).
-        liveliness: (M,) lambda of the motion that each continues.
+        liveliness: (M,) l of the motion that each continues.
     """
 
     means: Array
     covariances: Array
     liveliness: Array
+
+
+class MotionStates(NamedTuple):
+    """The states of a motion.
+
+    Attributes:
+        states: (T, n).
+        factor: of their precision.
+        log_joint: log p(X, R), images as Gaussians.
+        liveliness: l.
+        trust: (T,) share that each image counts with.
+        begins: (T,) whether the states begin anew at an image.
+    """
+
+    states: Array
+    factor: BlockCholesky
+    log_joint: float
+    liveliness: float
+    trust: Array
+    begins: Mask
 
 
 class SmoothedMotions(NamedTuple):
@@ -112,8 +146,9 @@ class SmoothedMotions(NamedTuple):
     Attributes:
         trajectories: M of them.
         shares: T arrays (K_t, M), probability that each mode belongs to each motion.
-        evidence: of the images.
-        liveliness: (M,) lambda.
+        evidence: of the images; wrong ones have larger covariances.
+        liveliness: (M,) l.
+        begins: (M, T) whether the states begin anew at an image.
         first: of the past; None: nothing is known.
     """
 
@@ -121,6 +156,7 @@ class SmoothedMotions(NamedTuple):
     shares: list[Array]
     evidence: MotionEvidence
     liveliness: Array
+    begins: Mask
     first: FirstStates | None
 
 
@@ -170,8 +206,13 @@ class MotionSmoother:
         """An image of a window after one at `before_ns`; None: the first.
 
         Raises:
-            ValueError: modes that can not be smoothed.
+            ValueError: modes that can not be smoothed, a stamp that does not increase.
         """
+        if before_ns is not None and modes.stamp_ns <= before_ns:
+            raise ValueError(
+                f'stamps must increase, saw {modes.stamp_ns} ns after {before_ns} ns; begin anew '
+                'to go back'
+            )
         mixture, link = modes.mixture, modes.link
         if mixture.dimension != self.dynamics.dimension:
             raise ValueError(
@@ -188,7 +229,8 @@ class MotionSmoother:
         dt = np.inf if before_ns is None else (modes.stamp_ns - before_ns) / SECOND_NS
         counted = replace(mixture, covariances=mixture.covariances / modes.errors.of_changes(dt))
         points = self.points_of(mixture.means)
-        return WindowImage(modes, counted, points, modes.errors.lasting(dt))
+        alone = TOGETHER / modes.errors.share(dt)
+        return WindowImage(modes, counted, points, modes.errors.lasting(dt), alone)
 
     def smooth(self, sequence: Sequence[ImageModes]) -> TrajectoryMixture:
         """The trajectories of a whole sequence; see `motions`."""
@@ -210,11 +252,14 @@ class MotionSmoother:
         """The motions of the images of a window."""
         stamps = [image.modes.stamp_ns for image in images]
         links = [image.modes.link for image in images]
-        nodes, weights = backward_paths(links, PATHS, self.seed)
-        distances = path_distances(nodes, [image.points for image in images], stamps)
+        nodes, weights = drawn_paths(links, PATHS, self.seed)
+        points = [image.points for image in images]
+        before = None if past is None else past.places[past.shares[nodes[:, 0]].argmax(1)]
+        distances = path_distances(nodes, points, stamps, before)
         least = LEAST if len(images) > 1 else 0.0
-        labels = grouped(weights, distances, self.max_motions, least)
-        evidence = evidence_of_motions(nodes, weights, labels, [image.counted for image in images])
+        labels = grouped(weights, *distances, self.max_motions, least)
+        counted = [image.counted for image in images]
+        evidence = evidence_of_motions(nodes, weights, labels, counted, points)
         masses: Array = np.bincount(labels, weights).astype(np.float64)
         shares = [
             _shares(nodes[:, t], weights, labels, len(link.weights), masses)
@@ -222,29 +267,47 @@ class MotionSmoother:
         ]
         first = None if past is None else self._first(past, nodes[:, 0], weights, labels)
         intervals = np.diff(stamps) / SECOND_NS
-        prior = self.dynamics.prior(intervals, initial=False)
         found = [
-            self._states(prior, intervals, evidence, first, m, masses[m] >= LEAST_HELD)
+            self._states(intervals, evidence, first, m, masses[m] >= LEAST_HELD)
             for m in range(len(masses))
         ]
+        trust = np.array([one.trust for one in found])
+        evidence = evidence._replace(covariances=evidence.covariances / trust[:, :, None, None])
         low, high = self.limits()
         d = self.dynamics.dimension
+        states = np.clip([one.states for one in found], low, high)
         trajectories = TrajectoryMixture(
             weights=masses / masses.sum(),
-            states=np.clip([one[0] for one in found], low, high),
-            factors=tuple(one[1] for one in found),
+            states=states,
+            factors=tuple(one.factor for one in found),
             inflation=np.full(len(masses), np.sqrt(np.mean([image.lasting for image in images]))),
-            log_joint=np.array([one[2] for one in found]),
+            log_joint=np.array([one.log_joint for one in found]),
             free_energy=np.empty(0),
             dimension=d,
             stamps_ns=tuple(stamps),
             lower=low[:d],
             upper=high[:d],
             disagreements=evidence.disagreements,
+            strays=self._strays(images, states[:, :, :d]),
         )
-        return SmoothedMotions(
-            trajectories, shares, evidence, np.array([one[3] for one in found]), first
-        )
+        liveliness = np.array([one.liveliness for one in found])
+        begins = np.array([one.begins for one in found])
+        return SmoothedMotions(trajectories, shares, evidence, liveliness, begins, first)
+
+    def _strays(self, images: Sequence[WindowImage], poses: Array) -> tuple[GaussianMixture, ...]:
+        """The modes of T images that are near no motion, of poses (M, T, d)."""
+        result = []
+        smoothed = backward_weights([image.modes.link for image in images])
+        for image, weights, places in zip(
+            images, smoothed, self.points_of(poses).swapaxes(0, 1), strict=True
+        ):
+            away = _distances(places[:, None], image.points).min(0)
+            stray = np.flatnonzero((away > STRAY) & (weights > 0.0))
+            modes = image.modes.mixture[stray]
+            result.append(
+                GaussianMixture(weights[stray], modes.means, image.alone * modes.covariances)
+            )
+        return tuple(result)
 
     def _first(self, past: Past, nodes: Index, weights: Array, labels: Index) -> FirstStates:
         """The first state of each motion, by its paths there."""
@@ -259,35 +322,34 @@ class MotionSmoother:
 
     def _states(
         self,
-        prior: TrajectoryPrior,
         intervals: Array,
         evidence: MotionEvidence,
         first: FirstStates | None,
         m: int,
         held: bool,
-    ) -> tuple[Array, BlockCholesky, float, float]:
-        """States (T, n) of motion m, their factor, log joint density and lambda.
-
-        Args:
-            prior: of states whose first one is free.
-            held: whether points that rest are.
-        """
+    ) -> MotionStates:
+        """The states of motion m; `held`: points that rest are."""
         dynamics, d = self.dynamics, self.dynamics.dimension
         means, precisions = evidence.means[m], np.linalg.inv(evidence.covariances[m])
-        pull = (precisions @ means[:, :, None])[:, :, 0]
-        low, high = self.limits()
-        if first is None:
-            at, known, least = dynamics.initial_mean, dynamics.initial_precision, LIVELIER[0]
-        else:
-            at, known = first.means[m], np.linalg.inv(first.covariances[m])
-            least = first.liveliness[m] / LIVELIER[1]
+        places, trust = self.points_of(means), np.ones(len(means))
+        begins = np.zeros(len(means), dtype=np.bool_)
+        if self.points is not None:
+            begins[1:] = _begins(places, intervals)
+        at, known, least = dynamics.initial_mean, dynamics.initial_precision, LIVELIER[0]
+        if first is not None:
+            before = self.points_of(first.means[m, :d])
+            begins[0] = self.points is not None and _distances(before, places).min() > WRONG
+            if not begins[0]:
+                at, known = first.means[m], np.linalg.inv(first.covariances[m])
+                least = first.liveliness[m] / LIVELIER[1]
         known = 0.5 * (known + known.T)
         for liveliness in (x for x in LIVELIER if x >= least):
-            own = _livelier(prior, liveliness)
-            own.precision.diagonal[0] += known
-            own.information[0] += known @ at
-            states, factor = _conditioned(own, precisions, pull)
-            away = self._away(states, means)
+            noise = np.where(begins[1:], ANEW, liveliness)
+            prior = dynamics.prior(intervals, initial=False, noise=noise)
+            prior.precision.diagonal[0] += known
+            prior.information[0] += known @ at
+            states, factor = _conditioned(prior, precisions, means)
+            away = self._away(states, places)
             if self.points is None or np.median(away) <= ASTRAY:
                 break
         for _ in range(WRONG_PASSES):
@@ -295,25 +357,24 @@ class MotionSmoother:
             if self.points is None or not wrong.any():
                 break
             trust = np.where(wrong, (ASTRAY / away) ** 2, 1.0)
-            precisions, pull = precisions * trust[:, None, None], pull * trust[:, None]
-            states, factor = _conditioned(own, precisions, pull)
-            away = self._away(states, means)
-        poses = np.clip(states, low, high)[:, :d]
+            states, factor = _conditioned(prior, precisions * trust[:, None, None], means)
+            away = self._away(states, places)
+        precisions = precisions * trust[:, None, None]
+        pull = (precisions @ means[:, :, None])[:, :, 0]
         seen = 0.5 * (np.vdot(means, pull) - np.linalg.slogdet(precisions)[1].sum())
-        seen += 0.5 * (at @ known @ at) + own.constant
-        gained = 0.5 * (np.vdot(states, own.information) + np.vdot(states[:, :d], pull))
-        if held and self.resting is not None and len(poses) > 1:
+        seen += 0.5 * (at @ known @ at) + prior.constant
+        gained = 0.5 * (np.vdot(states, prior.information) + np.vdot(states[:, :d], pull))
+        if held and self.resting is not None and len(states) > 1:
             # Covariances ignore what rests: rest is a decision, the same from image to image.
-            resting = self.resting.held(own, poses, evidence.covariances[m], intervals)
-            states = _conditioned(resting, precisions, pull)[0]
-        return states, factor, float(gained - seen), liveliness
+            poses = np.clip(states, *self.limits())[:, :d]
+            resting = self.resting.held(prior, poses, evidence.covariances[m], intervals)
+            states = _conditioned(resting, precisions, means)[0]
+        return MotionStates(states, factor, float(gained - seen), liveliness, trust, begins)
 
-    def _away(self, states: Array, modes: Array) -> Array:
-        """Mean distances (T,) of points in states (T, n) from those in modes (T, d), m."""
-        poses = np.clip(states, *self.limits())[:, : modes.shape[1]]
-        return np.asarray(
-            np.linalg.norm(self.points_of(poses) - self.points_of(modes), axis=2).mean(1)
-        )
+    def _away(self, states: Array, places: Array) -> Array:
+        """Mean distances (T,) of the points of states (T, n) from others (T, P, 3), m."""
+        poses = np.clip(states, *self.limits())[:, : self.dynamics.dimension]
+        return _distances(self.points_of(poses), places)
 
     def advanced(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
         """What the first images of a window tell of the one after them.
@@ -328,20 +389,23 @@ class MotionSmoother:
         stamps = found.trajectories.stamps_ns
         assert stamps is not None
         times = [*stamps[:count], after.stamp_ns]
+        begins = found.begins.copy()
         if found.first is None:
-            rest = np.broadcast_to(
-                dynamics.initial_mean[d:], (len(found.liveliness), len(dynamics.initial_mean) - d)
-            )
-            means = np.concatenate([evidence.means[:, 0], rest], axis=1)
+            begins[:, 0] = True
+            means = np.zeros((len(begins), dynamics.state_dimension))
             covariances = dynamics.states(evidence.covariances[:, 0])
         else:
             means, covariances = found.first.means, found.first.covariances
         for t in range(count):
-            if t > 0 or found.first is not None:
-                spread = covariances[:, :d, :d] + evidence.covariances[:, t]
-                gains = np.linalg.solve(spread, covariances[:, :d]).swapaxes(1, 2)
-                means = means + (gains @ (evidence.means[:, t] - means[:, :d])[:, :, None])[:, :, 0]
-                covariances = covariances - gains @ covariances[:, :d]
+            seen, spread = evidence.means[:, t], evidence.covariances[:, t]
+            gains = np.linalg.solve(covariances[:, :d, :d] + spread, covariances[:, :d])
+            gains = gains.swapaxes(1, 2)
+            means = means + (gains @ (seen - means[:, :d])[:, :, None])[:, :, 0]
+            covariances = covariances - gains @ covariances[:, :d]
+            anew = begins[:, t]
+            means[anew] = dynamics.initial_mean
+            means[anew, :d] = seen[anew]
+            covariances[anew] = dynamics.states(spread[anew])
             interval = (times[t + 1] - times[t]) / SECOND_NS
             means, covariances = dynamics.predict(means, covariances, interval)
             livelier = found.liveliness[:, None, None] - 1.0
@@ -350,7 +414,8 @@ class MotionSmoother:
         shares = (
             found.shares[count] if count < len(stamps) else after.link.origins @ found.shares[-1]
         )
-        return Past(shares, means, covariances, found.liveliness)
+        places = self.points_of(found.trajectories.means[:, count - 1])
+        return Past(shares, means, covariances, found.liveliness, places)
 
 
 def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Array) -> Array:
@@ -361,27 +426,41 @@ def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Arr
     return np.asarray(result / result.sum(1, keepdims=True))
 
 
-def _livelier(prior: TrajectoryPrior, factor: float) -> TrajectoryPrior:
-    """The prior of motions whose noise is a factor as large; the first state is free."""
-    diagonal, lower = prior.precision.diagonal / factor, prior.precision.lower / factor
-    constant = prior.constant + 0.5 * np.log(factor) * lower.shape[0] * lower.shape[1]
-    information = prior.information / factor
-    return TrajectoryPrior(
-        BlockTridiagonal(diagonal, lower), information, constant, prior.dimension
-    )
+def _distances(one: Array, other: Array) -> Array:
+    """Mean distances (...) of points (..., P, 3), m."""
+    return np.asarray(np.linalg.norm(one - other, axis=-1).mean(-1))
+
+
+def _begins(places: Array, intervals: Array) -> Mask:
+    """Where, (T-1,), modes (T, P, 3) have gone over to another explanation since the image before.
+
+    Those shortly before are out of reach of those shortly after.
+    """
+    seconds = np.concatenate([[0.0], np.cumsum(intervals)])
+    last = np.arange(len(intervals))
+    result = np.ones(len(intervals), dtype=np.bool_)
+    for a, b in np.ndindex(NEIGHBOURS, NEIGHBOURS):
+        i, k = last - a, last + 1 + b
+        some = np.flatnonzero((i >= 0) & (k < len(places)))
+        i, k = i[some], k[some]
+        gap = seconds[k] - seconds[i]
+        near = _distances(places[i], places[k]) <= TREMBLE + FASTEST * gap
+        short = gap - intervals[some] <= FLICKER
+        result[some[near & short]] = False
+    return result
 
 
 def _conditioned(
-    prior: TrajectoryPrior, precisions: Array, pull: Array
+    prior: TrajectoryPrior, precisions: Array, means: Array
 ) -> tuple[Array, BlockCholesky]:
     """States (T, n) given Gaussians over poses, and the factor of their precision.
 
     Args:
-        precisions, pull: (T, d, d) of the Gaussians, and (T, d) these times their means.
+        precisions, means: (T, d, d) and (T, d) of the Gaussians.
     """
-    d = pull.shape[1]
+    d = means.shape[1]
     diagonal, right = prior.precision.diagonal.copy(), prior.information.copy()
     diagonal[:, :d, :d] += precisions
-    right[:, :d] += pull
+    right[:, :d] += (precisions @ means[:, :, None])[:, :, 0]
     factor = BlockTridiagonal(diagonal, prior.precision.lower).cholesky()
     return factor.solve(right), factor

@@ -3,13 +3,15 @@
     d(a, b) = max over moments of mean_s min(mean_j |a_sj - b_sj|, c)                       (1)
     z_t = sum_k r_k x_k,  R_t = sum_k r_k (S_k / b + (x_k - z_t)(x_k - z_t)')               (2)
 
-a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three spans. Paths
-closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one alone is
-no motion of its own, however far away it is, and is absorbed by the one nearest in time. Spans
-without an image do not count; where a window is shorter than a moment the mean is over the window.
+a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three in a row.
+Paths closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one
+alone is no motion of its own, however far away it is, and is absorbed by the one nearest in time.
+Where a path comes from is a span before the first. Spans without an image do not count; where a
+window is shorter than a moment the mean is over the window.
 
-A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each. b is the
-share by which the image tells changes (`CueErrors.of_changes`). What the modes disagree by is in R.
+A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each, of those
+within reach of the heaviest: a mean over opposite poses is no pose. b is the share by which the
+image tells changes (`CueErrors.of_changes`). What the modes disagree by is in R.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ from hmt_ros.inference.arrays import Array, Index
 SECOND_NS = 10**9
 # Distance of two paths below which they are one motion, and the most that a span counts with, m.
 SAME_MOTION, MOST_APART = 0.03, 0.09
+# Distance of two modes of an image from which on they are no one Gaussian, m.
+OPPOSITE = 0.15
 # Length of a span, s, and spans of a moment.
 SPAN, MOMENT = 1.0 / 6.0, 3
 
@@ -44,48 +48,60 @@ class MotionEvidence(NamedTuple):
     disagreements: Array
 
 
-def path_distances(nodes: Index, points: Sequence[Array], stamps: Sequence[int]) -> Array:
-    """Distances (N, N) of paths, equation (1), m.
+def path_distances(
+    nodes: Index, points: Sequence[Array], stamps: Sequence[int], before: Array | None = None
+) -> tuple[Array, Array]:
+    """Distances (N, N) of paths, equation (1), m; and their means over all spans with c infinite.
 
     Args:
         nodes: (N, T) modes of the paths.
         points: T arrays (K_t, P, 3) of the modes, m.
         stamps: (T,) ns.
+        before: (N, P, 3) where each path comes from, a span before the first; None: unknown.
     """
     ages = (stamps[-1] - np.asarray(stamps, dtype=np.int64)) / SECOND_NS
     spans = np.floor(ages / SPAN + 1e-3).astype(np.intp)
-    recent, most = [], np.zeros((len(nodes), len(nodes)))
-    for span in np.unique(spans):
-        places = [points[t][nodes[:, t]] for t in np.flatnonzero(spans == span).tolist()]
-        apart = np.zeros_like(most)
-        for joint in np.mean(places, axis=0).swapaxes(0, 1):
-            apart += cdist(joint, joint)
-        recent.append((span, np.minimum(apart / places[0].shape[1], MOST_APART)))
-        recent = [one for one in recent if one[0] > span - MOMENT]
-        if span >= MOMENT - 1 or span == spans[0]:
-            np.maximum(most, np.mean([one[1] for one in recent], axis=0), out=most)
-    return most
+    apart = {
+        span: _apart([points[t][nodes[:, t]] for t in np.flatnonzero(spans == span).tolist()])
+        for span in np.unique(spans).tolist()
+    }
+    if before is not None:
+        apart[max(apart) + 1] = _apart([before])
+    known = np.array([*apart])
+    # The oldest span of each moment; those between have the same images.
+    ends = np.unique([known, known + MOMENT - 1]).clip(MOMENT - 1).clip(max=known.max())
+    most = np.zeros((len(nodes), len(nodes)))
+    for end in np.unique(ends):
+        moment = [apart[span] for span in known.tolist() if end - MOMENT < span <= end]
+        np.maximum(most, np.minimum(moment, MOST_APART).mean(0), out=most)
+    return most, np.mean([*apart.values()], axis=0)
 
 
-def grouped(weights: Array, distances: Array, most: int, least: float) -> Index:
+def _apart(places: Sequence[Array]) -> Array:
+    """Distances (N, N) of paths over a span, of whose images places (N, P, 3) are given, m."""
+    joints = np.mean(places, axis=0).swapaxes(0, 1)
+    return np.asarray(sum(cdist(joint, joint) for joint in joints) / len(joints))
+
+
+def grouped(weights: Array, distances: Array, means: Array, most: int, least: float) -> Index:
     """Motion (N,) of each path, numbered by weight.
 
     Motions are found one by one: the path with the most weight within `SAME_MOTION` leads the
-    next. Every path then belongs to the nearest leader.
+    next. Every path then belongs to the leader that is nearest in the mean.
 
     Args:
-        weights: (N,) of paths.
-        distances: (N, N) of paths, m.
+        weights: (N,) of paths, which sum to 1.
+        distances, means: (N, N) of paths, m, see `path_distances`.
         most: number of motions at most.
-        least: weight around a leader, as a share of all; the first leads whatever it has.
+        least: weight within `SAME_MOTION` of a leader, besides the first.
     """
     near, left = distances <= SAME_MOTION, weights.copy()
     around, leaders = near @ left, list[int]()
-    while len(leaders) < most and around.max() > (least * weights.sum() if leaders else 0.0):
+    while len(leaders) < most and around.max() > (least if leaders else 0.0):
         leaders.append(int(np.argmax(around)))
         left[near[leaders[-1]]] = 0.0
         around = near @ left
-    labels = np.argmin(distances[leaders], axis=0)
+    labels = np.argmin(means[leaders], axis=0)
     order = np.argsort(-np.bincount(labels, weights), kind='stable')
     return np.asarray(np.argsort(order)[labels])
 
@@ -95,6 +111,7 @@ def evidence_of_motions(
     weights: Array,
     labels: Index,
     mixtures: Sequence[GaussianMixture],
+    points: Sequence[Array],
 ) -> MotionEvidence:
     """What images say of each motion.
 
@@ -102,19 +119,22 @@ def evidence_of_motions(
         nodes: (N, T) modes of the paths.
         weights, labels: (N,) of the paths, and the motion of each.
         mixtures: T likelihoods, with covariances S_k / b.
+        points: T arrays (K_t, P, 3) of their modes, m.
     """
     count, times, d = int(labels.max()) + 1, len(mixtures), mixtures[0].dimension
     means = np.empty((count, times, d))
     covariances, apart = np.empty((2, count, times, d, d))
-    for t, mixture in enumerate(mixtures):
+    for t, (mixture, places) in enumerate(zip(mixtures, points, strict=True)):
         shares = np.zeros((count, len(mixture)))
         np.add.at(shares, (labels, nodes[:, t]), weights)
+        heaviest = places[shares.argmax(1)]
+        away = np.linalg.norm(heaviest[:, None] - places, axis=3).mean(2)
+        shares[away > OPPOSITE] = 0.0
         shares /= shares.sum(1, keepdims=True)
         means[:, t] = shares @ mixture.means
         offsets = mixture.means - means[:, t, None]
         apart[:, t] = (offsets * shares[:, :, None]).swapaxes(1, 2) @ offsets
-        covariances[:, t] = (shares @ mixture.covariances.reshape(len(mixture), -1)).reshape(
-            -1, d, d
-        )
+        flat = shares @ mixture.covariances.reshape(len(mixture), -1)
+        covariances[:, t] = flat.reshape(-1, d, d)
     covariances += apart
     return MotionEvidence(means, covariances, apart)

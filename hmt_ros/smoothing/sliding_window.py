@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -45,21 +46,26 @@ class FinalPose:
     trajectories: TrajectoryMixture
     t: int
 
-    @property
+    @cached_property
     def mixture(self) -> GaussianMixture:
-        """Its density, a component for each trajectory of the window."""
+        """Its density, K components: one for each trajectory of the window, then the strays."""
         return self.trajectories.marginal(self.t)
 
     @property
     def velocities(self) -> Array | None:
-        """(M, d) per second; None: unknown."""
+        """(K, d) per second; of strays 0. None: unknown."""
         velocities = self.trajectories.velocities
-        return None if velocities is None else velocities[:, self.t]
+        if velocities is None:
+            return None
+        result = np.zeros_like(self.mixture.means)
+        result[: len(velocities)] = velocities[:, self.t]
+        return result
 
     @property
     def identities(self) -> tuple[int, ...]:
-        """(M,) of the trajectories."""
-        return self.trajectories.identities
+        """(K,) of the trajectories; of strays 0."""
+        own = self.trajectories.identities
+        return own + (0,) * (len(self.mixture) - len(own))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,18 +143,13 @@ class SlidingWindow:
                 window is as it was.
         """
         stamp, stamps = int(modes.stamp_ns), self.stamps_ns
-        if stamps and stamp <= stamps[-1]:
-            raise ValueError(
-                f'stamps must increase, saw {stamp} ns after {stamps[-1]} ns; reset the window to '
-                'go back'
-            )
+        image = self.smoother.image(modes, stamps[-1] if stamps else None)
         before = len(self._images[-1].modes.link.weights) if self._images else None
         if before is not None and modes.link.origins.shape[1:] != (before,):
             raise ValueError(
                 f'origins have shape {modes.link.origins.shape}, wanted a column for each of '
                 f'{before} modes of the image before'
             )
-        image = self.smoother.image(modes, stamps[-1] if stamps else None)
         self._leave_behind(image)
         self._images.append(image)
         if not self._is_due((stamp - stamps[-1]) / SECOND_NS if stamps else 0.0):
@@ -213,13 +214,14 @@ class SlidingWindow:
         """Identities of trajectories, given heaviest first; each has that of its predecessor.
 
         The predecessor is the nearest trajectory of the window before without a heavier successor,
-        if it is closer than `SAME_MOTION`; without one it is a new motion.
+        distances counted by its weight, if it is closer than `SAME_MOTION`; without one it is a new
+        motion.
         """
         numbers = np.zeros(len(found), dtype=np.int64)
         away, before = self._distances(found)
         for i in np.argsort(-found.weights, kind='stable'):
             j = int(np.argmin(away[i])) if len(before) else -1
-            if j >= 0 and away[i, j] <= SAME_MOTION:
+            if j >= 0 and away[i, j] < np.inf:
                 numbers[i] = before[j]
                 away[:, j] = np.inf
             else:
@@ -230,7 +232,8 @@ class SlidingWindow:
     def _distances(self, found: TrajectoryMixture) -> tuple[Array, tuple[int, ...]]:
         """Distances (M, L) from the L trajectories found last, and their identities.
 
-        They are means over the points, and over the times of both windows.
+        They are means over the points, and over the times of both windows, over the weight of the
+        one found last; infinite beyond `SAME_MOTION`.
         """
         last = self._last
         common = 0 if last is None else len({*self.stamps_ns} & {*(last.stamps_ns or ())})
@@ -240,7 +243,8 @@ class SlidingWindow:
             self.smoother.points_of(means)
             for means in (found.means[:, :common], last.means[:, -common:])
         )
-        return np.linalg.norm(now[:, None] - before, axis=-1).mean((2, 3)), last.identities
+        away = np.linalg.norm(now[:, None] - before, axis=-1).mean((2, 3))
+        return np.where(away <= SAME_MOTION, away / last.weights, np.inf), last.identities
 
 
 def _final_poses(found: TrajectoryMixture, indices: Sequence[int]) -> tuple[FinalPose, ...]:

@@ -18,11 +18,14 @@ from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     BlockTridiagonal,
 )
+
+# Probability at least that some motion is near the pose.
+LEAST_COVERED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +48,8 @@ class TrajectoryMixture:
         lower, upper: (d,) limits; samples beyond them are projected onto them.
         disagreements: (M, T, d, d) of the modes that motions stand for, beside the density of the
             trajectories: part of marginals alone. None: components are no motions.
+        strays: T mixtures of modes that no motion is near, with their probabilities: part of
+            marginals, whose last components they are. Empty: there are none.
 
     Raises:
         ValueError: shapes that contradict each other, weights that do not sum to 1.
@@ -64,6 +69,7 @@ class TrajectoryMixture:
     lower: Array | float = -np.inf
     upper: Array | float = np.inf
     disagreements: Array | None = None
+    strays: tuple[GaussianMixture, ...] = ()
 
     def __post_init__(self) -> None:
         m, times, n = self.states.shape
@@ -132,15 +138,20 @@ class TrajectoryMixture:
         seconds = (np.array(self.stamps_ns) - self.stamps_ns[0]) * 1e-9
         return np.asarray(np.gradient(self.means, seconds, axis=1))
 
-    def marginal(self, t: int, which: Index | None = None) -> GaussianMixture:
-        """The density of the pose at index t, a component for each trajectory.
-
-        Args:
-            which: trajectories whose components are wanted, which costs less; None: all.
-        """
-        chosen = np.arange(len(self)) if which is None else which
-        covariances = np.array([self.covariances_of(int(i))[t] for i in chosen])
-        return GaussianMixture(self.weights[chosen], self.means[chosen, t], covariances)
+    def marginal(self, t: int) -> GaussianMixture:
+        """The density of the pose at index t: a component for each trajectory, and the strays."""
+        covariances = np.array([self.covariances_of(i)[t] for i in range(len(self))])
+        poses = GaussianMixture(self.weights, self.means[:, t], covariances)
+        if not self.strays or not len(strays := self.strays[t]):
+            return poses
+        # The heaviest motion stays the heaviest component: it leads the point estimate.
+        covered = max(1.0 - float(strays.weights.sum()), LEAST_COVERED) * self.weights
+        lighter = np.minimum(strays.weights, covered.max())
+        return GaussianMixture(
+            np.concatenate([covered, lighter]),
+            np.concatenate([poses.means, strays.means]),
+            np.concatenate([poses.covariances, strays.covariances]),
+        ).normalised()
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws trajectories (n, T, d), projected onto the limits."""

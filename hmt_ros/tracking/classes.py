@@ -17,7 +17,10 @@ transition of the joints (`weighting`), h that of the heading, which wanders at 
 body. The best motion of either way stands for it (2), as the number of its modes is no evidence,
 nor is a motion that was not followed. An image shows the facing direction with the probability v,
 else something unrelated, like a flash or a covered lens (3): no single image turns a track about.
-A mode holds the odds of its own way: -S, or S where it faces back.
+A mode holds the odds of its own way: -S, or S where it faces back. To the ancestry of the modes a
+pair that faces different ways has
+
+    log t(x_k, x_j) = log (exp min(log t, log h) + [exp(Q dt)]_ww')                             (6)
 
 Exchange of left and right by the detector, in each mode from image to image:
 
@@ -145,6 +148,18 @@ def weigh_ways(
         share = -np.logaddexp(0.0, -odds)
         result[which] += share - np.logaddexp.reduce(log_weights[which])
     return result, facing
+
+
+def across_ways(
+    body: Body, modes: Modes, predicted: Array, poses: Array, transitions: Array, dt: float
+) -> Array:
+    """log t (K, N) of the ancestry of poses (N, d), equation (6); arguments as of `weigh_ways`."""
+    if not body.trunk_pairs:
+        return transitions
+    other = modes.back[:, None] != ways(body, poses, modes.poses[0])
+    turns = np.minimum(transitions, log_turns(body, predicted, poses, dt))
+    turned = np.logaddexp(turns, -body.symmetries['reversal'].price(dt))
+    return np.where(other, turned, transitions)
 
 
 def log_turns(body: Body, first: Array, last: Array, dt: float) -> Array:

@@ -26,6 +26,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.classes import (
+    across_ways,
     best_of_the_other_way,
     first_facing,
     seen_exchanges,
@@ -229,8 +230,9 @@ class MixtureFilter:
             prediction,
         )
         candidates = propose(self._proposals, search, base, predicted, self._rng)
-        weighed = self._weigh(search, search.optimise(candidates))
-        self._select(*weighed, observation, search)
+        # Every mode goes on, whatever else is proposed.
+        found = search.optimise(candidates).joined(Optimised(predicted, base))
+        self._select(*self._weigh(search, found), observation, search)
         self._fit_shape(observation, ERRORS['shape'].share(dt))
         return self._judge(observation, search)
 
@@ -250,7 +252,7 @@ class MixtureFilter:
         optimised, evidence = optimised[rows], evidence[rows]
         poses = optimised.minima.x
         transitions = search.continuity.log_transitions(poses)
-        histories = search.continuity.log_histories(transitions)
+        histories = search.continuity.log_histories(poses)
         log_weights, facing = weigh_ways(
             self.body,
             search.modes,
@@ -262,7 +264,10 @@ class MixtureFilter:
             np.asarray(~optimised.hypotheses.jumped.all(1)),
             search.dt,
         )
-        return optimised, log_weights, facing, histories
+        linked = across_ways(
+            self.body, search.modes, search.continuity.predicted, poses, transitions, search.dt
+        )
+        return optimised, log_weights, facing, search.continuity.log_histories(linked)
 
     def _select(
         self,
@@ -279,7 +284,8 @@ class MixtureFilter:
             optimised: N distinct hypotheses at their optima.
             log_weights: (N,).
             facing: (N,) log odds of the way that each faces.
-            histories: (K, N) log w_k p(x_n | x_k), of K modes before; K is 0 where modes begin.
+            histories: (K, N) log w_k p(x_n | x_k), of K modes before, for the ancestry; K is 0
+                where modes begin.
             observation: of the image.
             search: that led to the hypotheses; None: the modes begin.
         """

@@ -104,6 +104,12 @@ class Optimised:
     def __getitem__(self, rows: Index) -> Optimised:
         return Optimised(self.hypotheses[rows], self.minima[rows])
 
+    def joined(self, other: Optimised) -> Optimised:
+        """These and others."""
+        return Optimised(
+            joined([self.hypotheses, other.hypotheses]), self.minima.joined(other.minima)
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Modes(Hypotheses):

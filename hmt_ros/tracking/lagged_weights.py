@@ -1,16 +1,10 @@
 """Weights of the modes of an image, smoothed over the L images after it.
 
-    W_T(k) = w_k                                                        the newest image T  (1)
-    W_t(j) = sum_k W_(t+1)(k) P(j | k)                                  T - L <= t < T      (2)
-    P(j | k) = w_j p(x_k | x_j) / sum_l w_l p(x_k | x_l)
-
-This is the backward half of forward filtering, backward smoothing (Doucet, Godsill and Andrieu,
-"On sequential Monte Carlo sampling methods for Bayesian filtering", 2000). The evidence of an image
-for mode k, or for the way that it faces (`classes`), is a factor of w_k alone: it cancels in
-P(j | k), the probability that the history of k went through j, and reaches image t by (1). So the
-lagged weights agree with the published ones, which are those of L = 0: they are the sum over all
-histories of the modes. Where a mode stands for several hypotheses, P is their mean
-(`weighting.pooled_origins`).
+They are those of forward filtering, backward smoothing (`smoothing.mode_chain`) in a window of the
+image and the L after it. The evidence of an image for mode k, or for the way that it faces
+(`classes`), is a factor of w_k alone. So the lagged weights agree with the published ones, which
+are those of L = 0: they are the sum over all histories of the modes. Where a mode stands for
+several hypotheses, P is their mean (`weighting.pooled_origins`).
 """
 
 from __future__ import annotations
@@ -20,6 +14,7 @@ from typing import NamedTuple
 
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.smoothing.mode_chain import Link, backward_weights
 
 
 class Lagged(NamedTuple):
@@ -93,10 +88,10 @@ class LaggedWeights:
 
     def _smoothed(self) -> list[Lagged]:
         """The waiting images by all that follow them."""
-        result: list[Lagged] = []
-        weights = None
-        for one, origins in reversed(self._waiting):
-            weights = one.posterior.weights if weights is None else weights
-            result.append(one._replace(posterior=replace(one.posterior, weights=weights)))
-            weights = weights @ origins
-        return result[::-1]
+        if not self._waiting:
+            return []
+        links = [Link(one.posterior.weights, origins) for one, origins in self._waiting]
+        return [
+            one._replace(posterior=replace(one.posterior, weights=weights))
+            for (one, _), weights in zip(self._waiting, backward_weights(links), strict=True)
+        ]

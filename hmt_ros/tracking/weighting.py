@@ -1,15 +1,18 @@
 """The weight of a hypothesis: the forward recursion over all pairs of modes.
 
     log w_k = log sum_j w_j p(x_k | x_j) - sum_g a_g(dt) E_g(x_k)                               (1)
-    p(x_k | x_j) = t(x_k, x_j) / (sum_l t(x_l, x_j) + e^-c)                                     (2)
+    p(x_k | x_j) = t(x_k, x_j) / n_k / (sum_l t(x_l, x_j) / n_l + e^-c),
+    n_k = sum_l t(x_k, x_l)                                                                     (2)
     log t(x, x_j) = -nu/2 log(1 + D(x, f(x_j)) / (nu q dt))                                     (3)
 
 x_j are the modes of the image before and f(x_j) where the dynamics move them; D is the mean squared
 distance of the joints, seen from the pelvis, and q the mean squared distance by which people leave
 their prediction in a second. Every hypothesis is a continuation of every mode, as far as a body can
 move in dt: which proposal it came from does not enter. A mode goes on as one of the hypotheses of
-the image (2), or ends, if all of them are less likely than e^-c. E_g is the energy of cue g, of
-which an image adds the share a_g (`inference.error_model`).
+the image (2), or ends, if all of them are less likely than e^-c. Hypotheses are where the search
+looked, and their number is no evidence: n_k counts those about x_k, or a motion with many copies
+would draw weight from another that was found once. E_g is the energy of cue g, of which an image
+adds the share a_g (`inference.error_model`).
 
 The normaliser |S_k|^(1/2) of a mode is left out, as in the paper: the Hessian shows how well the
 image fixes a pose, so a badly fixed one (in depth, or with a limb behind the trunk) would gain
@@ -50,8 +53,10 @@ class Continuity:
 
     def log_transitions(self, poses: Array) -> Array:
         """log t(x_n, x_k), (K, N), of poses (N, d), equation (3)."""
-        joints = self.body.relative_joints(poses)
-        a, b = (x.reshape(len(x), -1) for x in (self._joints, joints))
+        return self._log_transitions(self._joints, self.body.relative_joints(poses))
+
+    def _log_transitions(self, first: Array, joints: Array) -> Array:
+        a, b = (x.reshape(len(x), -1) for x in (first, joints))
         squares = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * a @ b.T
         ratio = np.maximum(squares, 0.0) / (joints.shape[1] * TRANSITION_SPREAD * self.dt)
         return np.asarray(-0.5 * TRANSITION_TAILS * np.log1p(ratio / TRANSITION_TAILS))
@@ -63,14 +68,13 @@ class Continuity:
         )
         return result
 
-    def log_histories(self, transitions: Array) -> Array:
-        """log w_k p(x_n | x_k), (K, N), of all hypotheses of an image, equation (2).
-
-        Args:
-            transitions: (K, N) of these hypotheses; see `log_transitions`.
-        """
-        total = np.logaddexp(np.logaddexp.reduce(transitions, axis=1), -END_NATS)
-        return np.asarray((self.log_weights - total)[:, None] + transitions)
+    def log_histories(self, poses: Array) -> Array:
+        """log w_k p(x_n | x_k), (K, N), of all hypotheses (N, d) of an image, equation (2)."""
+        joints = self.body.relative_joints(poses)
+        near = np.logaddexp.reduce(self._log_transitions(joints, joints), axis=0)
+        moves = self._log_transitions(self._joints, joints) - near
+        total = np.logaddexp(np.logaddexp.reduce(moves, axis=1), -END_NATS)
+        return np.asarray((self.log_weights - total)[:, None] + moves)
 
 
 def normalised(log_weights: Array) -> Array:

@@ -80,10 +80,11 @@ def configurations_one_by_one(body, modes, found):
         poses = np.repeat(lead, len(sources), axis=0)
         poses[:, own] = sources
         flips, parents = enumerate_flips(body, poses, chain)
-        new = np.concatenate([[False], parents[1:] == parents[:-1]])
-        every = np.concatenate([sources, flips[new][:, own]])
+        # Each is the first of its own flips.
+        every = flips[:, own]
         price = np.full((len(modes), len(every)), PRICE)
-        price[:, : len(modes)][np.eye(len(modes)) > 0] = 0.0
+        for g in range(len(modes)):
+            price[g, np.flatnonzero(parents == g)[0]] = 0.0
         kept, owner = distinct_one_by_one(body, lead[0], chain, every)
         angles[0][chain] = every[kept]
         penalties[chain] = np.stack(
@@ -131,6 +132,20 @@ def test_configurations_one_by_one(body, count, seed):
                 assert np.allclose(own_angles, wanted[chain], atol=1e-12)
             if t == 0:
                 assert np.array_equal(got.penalties[:, c, : got.counts[t, c]], penalties[chain])
+
+
+def test_many_modes_leave_the_flips_of_the_best_among_few_configurations(body):
+    modes = modes_of(body, 8, 0, spread=0.4)
+    lead, most = modes[:1], 4
+    products = LimbProducts.of(body, modes, {}, PRICE, apart=APART, most=most)
+    far = 0
+    for c, (chain, own) in enumerate(body.skeleton.chain_dofs.items()):
+        flips = enumerate_flips(body, lead, chain)[0][:, own]
+        kept = distinct_one_by_one(body, lead[0], chain, flips)[0][:most]
+        far += len(kept) - 1
+        found = products.configurations.angles[0, c, : len(kept), : len(own)]
+        assert np.allclose(found, flips[kept], atol=1e-12)
+    assert far > 0
 
 
 def test_limbs_change_places_and_the_torso_flips_somewhere(body):

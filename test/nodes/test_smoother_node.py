@@ -2,6 +2,7 @@
 
 import time
 
+import numpy as np
 import pytest
 
 from hmt_ros.sessions.smoothed_messages import TOPICS
@@ -83,7 +84,7 @@ def test_parameters_are_those_of_the_file(running):
     running.assert_described(SmootherParameters())
     running.assert_refused(
         ({'fixed_lag': -1.0}, 'out of range'),
-        ({'method': 'guess'}, "saw 'guess'"),
+        ({'max_hypotheses': 0}, 'out of range'),
         ({'body_model': 'nobody'}, 'nobody: no such file, and no name; there are human32'),
         ({'autostart': False}, 'read-only'),
     )
@@ -123,6 +124,20 @@ def test_windows_are_smoothed_on_demand(running, likelihoods, monkeypatch):
     assert len(running.call(SmoothWindow, 'smooth_window').trajectories.stamps) == 4
     running.spin_until(lambda: len(running.handled) == count + 20, 'all that had come')
     assert running.session.state.counts['smoothed'] == 24
+
+
+def test_a_node_lives_on_after_values_that_are_no_numbers(running, likelihoods):
+    running.send('likelihood_mixture', likelihoods.message(0))
+    bad = likelihoods.message(1)
+    bad.components[0].covariance = np.full(37 * 37, np.nan)
+    handled = running.send('likelihood_mixture', bad)
+    (fault,) = handled.faults
+    assert 'covariance of mixture has values that are not finite' in fault
+    assert '\n' not in fault
+    handled = running.send('likelihood_mixture', likelihoods.message(2))
+    assert handled.faults == ()
+    assert running.session.state.window == 2
+    assert running.errors() == []
 
 
 def test_queue_holds_what_was_published(running, likelihoods):

@@ -364,17 +364,21 @@ class Likelihoods:
 
     body: Body = field(default_factory=lambda: load_body('human37'))
     messages: RosbagsMessages = field(default_factory=RosbagsMessages)
+    leans: bool = False
+    hops: float = 0.002  # probability that a mode continues the other one
 
     def stamp(self, index):
         return START_NS + round(index * FRAME_NS)
 
     def mixture(self, index):
-        """A mixture over poses; the second mode is an elbow that bends more."""
+        """A mixture over poses; the second mode is an elbow that bends more, and may lean back."""
         means = np.tile(self.body.prior_mean, (2, 1))
         means[:, 2] = 4.0
         moving = self.body.dof_names.index('left_elbow')
         means[:, moving] = 0.5 + 0.05 * index
         means[1, moving] += 0.8
+        if self.leans:
+            means[1, self.body.dof_names.index('trunk_x')] -= 0.6
         covariances = np.tile(1e-3 * np.eye(self.body.dimension), (2, 1, 1))
         return GaussianMixture(np.array([0.6, 0.4]), means, covariances)
 
@@ -386,14 +390,53 @@ class Likelihoods:
             kind=int(MixtureKind.PREDICTION),
         )
 
+    def chain(self, weights, before):
+        """What a filter tells of modes that continue those of image `before`; None: they begin."""
+        count, known = len(weights), before is not None
+        own = self.hops + (1.0 - count * self.hops) * np.eye(count)
+        ids = np.arange(5, 5 + count)
+        return {
+            'identities': ids,
+            'posterior_weights': np.array(weights),
+            # Columns may have any order.
+            'ancestry': own[:, ::-1] if known else np.empty((count, 0)),
+            'ancestry_ids': ids[::-1] if known else ids[:0],
+            'ancestry_stamp_ns': self.stamp(before) if known else 0,
+        }
+
     def message(
-        self, index, body=None, kind=MixtureKind.LIKELIHOOD, errors=INDEPENDENT, mixture=None
+        self,
+        index,
+        body=None,
+        kind=MixtureKind.LIKELIHOOD,
+        errors=INDEPENDENT,
+        mixture=None,
+        weights=None,
+        before=...,
+        chain=True,
     ):
-        body = self.body if body is None else body
+        """A mixture as a message.
+
+        Args:
+            weights: posterior weights of the modes; None: 0.7 and 0.3, or those of another mixture.
+            before: image whose modes they continue, by default the last one; None: they begin.
+            chain: whether the message tells both, as those of the filter do.
+        """
+        body, found = body or self.body, mixture or self.mixture(index)
+        if weights is None:
+            weights = found.weights if len(found) != 2 else [0.7, 0.3]
+        before = index - 1 if before is ... else before
+        told = self.chain(weights, before) if chain and kind is MixtureKind.LIKELIHOOD else {}
         content = PoseMixture.of_body(
-            body, mixture or self.mixture(index), kind, self.stamp(index), 'lens',
-            error_share=errors.independent, error_time=errors.time,
-        )  # fmt: skip
+            body,
+            found,
+            kind,
+            self.stamp(index),
+            'lens',
+            error_share=errors.independent,
+            error_time=errors.time,
+            **told,
+        )
         return pose_mixture_message(self.messages, content)
 
 

@@ -220,7 +220,6 @@ def test_the_smoother_smooths_a_person_before_a_camera_that_moves(
 ):
     """Who stands still in the room stands still, behind the origin of odom, too."""
     monkeypatch.setattr(smoother_session, 'motion_prior', random_walk)
-    monkeypatch.setattr(smoother_session, 'MAX_TRAJECTORIES', 1)
     body = load_body('human37')
     stands = np.tile(body.prior_mean, (1, 1))
     stands[:, 2], stands[:, 3] = -2.0, 2.0

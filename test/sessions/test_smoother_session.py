@@ -25,7 +25,13 @@ WINDOW = ['trajectory_mixture', 'trajectory_markers']
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 
 # Constants of the session that tests change.
-CONSTANTS = ('max_trajectories', 'longest_interval')
+CONSTANTS = ('longest_interval',)
+
+
+@pytest.fixture(scope='module')
+def likelihoods(likelihoods):
+    """Of two modes that are two motions."""
+    return replace(likelihoods, leans=True)
 
 
 @pytest.fixture
@@ -103,7 +109,7 @@ def test_final_poses_are_mixtures_that_need_no_kinematics(session, outputs, like
 def test_errors_that_last_are_discounted_once(session, outputs, likelihoods):
     """The first of three poses, by the dense joint precision of each variable."""
     body = likelihoods.body
-    one = session(max_trajectories=1, fixed_lag=0.3, resting_feet=False)
+    one = session(max_hypotheses=1, fixed_lag=0.3, resting_feet=False)
     errors, stamps, means = CueErrors(0.5, 0.1), (0, 1, 3), []
     for index in stamps:
         mixture = likelihoods.mixture(index)[:1].normalised()
@@ -160,7 +166,7 @@ def test_forecasts_are_no_evidence(session, outputs, likelihoods):
 
 
 def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihoods):
-    one = session(max_trajectories=2)
+    one = session(max_hypotheses=2)
     for index in range(5):
         message = likelihoods.message(index)
         message.track_id = 3
@@ -262,7 +268,7 @@ def test_a_motion_passes_over_an_image_that_is_all_wrong(session, outputs, likel
 
 
 def test_motions_have_the_same_numbers_in_both_messages(session, outputs, likelihoods):
-    one = session(max_trajectories=2)
+    one = session(max_hypotheses=2)
     for index in range(6):
         one.take(MIXTURE, likelihoods.message(index))
     windows = [trajectory_mixture_of(m) for m in read(outputs, 'trajectory_mixture')]
@@ -285,19 +291,19 @@ def test_motions_have_the_same_numbers_in_both_messages(session, outputs, likeli
 
 
 def test_trajectories(session, outputs, likelihoods):
-    one = session(max_trajectories=3)
+    one = session(max_hypotheses=2)
     for index in range(4):
         one.take(MIXTURE, likelihoods.message(index))
     *_, last = read(outputs, 'trajectory_mixture')
     content = trajectory_mixture_of(last, likelihoods.body.dof_names)
     assert content.stamps_ns == tuple(likelihoods.stamp(index) for index in (1, 2, 3))
     assert content.final_until_ns == likelihoods.stamp(1)
-    assert content.means.shape == (3, 3, likelihoods.body.dimension)
+    assert content.means.shape == (2, 3, likelihoods.body.dimension)
     assert content.marginal_covariances is None
     one.parameters = with_values(one.parameters, {'publish_covariances': True})
     one.take(MIXTURE, likelihoods.message(4))
     *_, last = read(outputs, 'trajectory_mixture')
-    assert trajectory_mixture_of(last).marginal_covariances.shape == (3, 3, 37, 37)
+    assert trajectory_mixture_of(last).marginal_covariances.shape == (2, 3, 37, 37)
     (final,) = read(outputs, 'smoothed_pose_mixture')[-1:]
     found, window = pose_mixture_of(final), trajectory_mixture_of(last)
     for identity, covariance in zip(found.identities, found.covariances, strict=True):
@@ -433,6 +439,22 @@ BAD = {
     ),
     'not finite': (nan_in_mean, 'mixture: mean has values that are not finite'),
     'not positive definite': (lambda m: covariance_of(m, 1.0), 'is not positive definite'),
+    'covariance that is not a number': (
+        lambda m: covariance_of(m, np.nan),
+        'covariance of mixture has values that are not finite',
+    ),
+    'posterior weights': (
+        lambda m: change(m.components[0], posterior_weight=0.2) and m,
+        'posterior has weights that sum to 0.5, wanted 1',
+    ),
+    'ancestry': (
+        lambda m: change(m.components[1], ancestry=[0.5, 0.1]) and m,
+        'ancestry of component 1',
+    ),
+    'ancestry that is not a number': (
+        lambda m: change(m.components[1], ancestry=[np.nan, 1.0]) and m,
+        'ancestry of component 1',
+    ),
     'weight': (lambda m: change(m.components[0], weight=3.0) and m, 'weights that sum to 3.4'),
     'size of the shape': (
         lambda m: change(m, shape_covariance=np.zeros(36)),
@@ -517,7 +539,7 @@ def test_posteriors_are_told_but_smoothed(session, likelihoods):
 
 
 def test_a_span_is_smoothed_on_demand(session, likelihoods):
-    one = session(window_length=4, max_trajectories=4)
+    one = session(window_length=4, max_hypotheses=4)
     with pytest.raises(ValueError, match='none is'):
         one.smooth_span()
     for index in range(6):
@@ -576,3 +598,134 @@ def test_a_camera_on_its_side_is_smoothed_as_an_upright_one(session, outputs, li
     last = trajectories[1]
     joints = likelihoods.body.joint_positions(last.means[0])
     assert joints == pytest.approx(last.joint_positions[0], abs=1e-6)
+
+
+def weights_of(outputs):
+    """Posterior weights of the straight and of the bent elbow in each smoothed pose."""
+    found = [pose_mixture_of(message) for message in read(outputs, 'smoothed_pose_mixture')]
+    trunk = found[0].dof_names.index('trunk_x')
+    middle = found[0].means[:, trunk].mean() if len(found[0].means) > 1 else -0.5
+    bent = [content.means[:, trunk] < middle for content in found]
+    return np.array([content.weights @ own for content, own in zip(found, bent, strict=True)])
+
+
+def test_motions_have_the_weights_that_the_filter_tells(session, outputs, likelihoods):
+    """Not those of the likelihood; in a window of one image, and of one each."""
+    for lag in (SECONDS, 0.0):
+        outputs.clear()
+        one = session(fixed_lag=lag)
+        one.take(MIXTURE, likelihoods.message(0))
+        one.finish()
+        assert weights_of(outputs) == pytest.approx([0.3], abs=1e-9)
+    for index in range(1, 6):
+        one.take(MIXTURE, likelihoods.message(index))
+    one.finish()
+    assert weights_of(outputs) == pytest.approx([0.3] * 6, abs=1e-9)
+    # With a lag, what later images tell counts.
+    outputs.clear()
+    one = session()
+    for index in range(6):
+        weights = [0.7, 0.3] if index < 5 else [0.1, 0.9]
+        one.take(MIXTURE, likelihoods.message(index, weights=weights))
+    one.finish()
+    assert weights_of(outputs) == pytest.approx([0.3] * 3 + [0.9] * 3, abs=0.02)
+
+
+def test_messages_from_elsewhere_tell_no_chain(session, outputs, likelihoods):
+    """A mode continues those within reach, at 30 images a second; what is missing is said once."""
+    one, times = session(), [index / 3 for index in range(6)]
+    handled = [one.take(MIXTURE, likelihoods.message(index, chain=False)) for index in times]
+    assert [len(h.faults) for h in handled] == [0] * 6
+    assert [len(h.warnings) for h in handled] == [1, 0, 0, 0, 0, 0]
+    assert 'do not tell posterior weights and ancestry' in handled[0].warnings[0]
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(index) for index in times]
+    # Their own weights are taken. Both modes are farther apart than anybody moves.
+    assert weights_of(outputs) == pytest.approx([0.4] * 6, abs=1e-9)
+    windows = [trajectory_mixture_of(m) for m in read(outputs, 'trajectory_mixture')]
+    assert [len(window.weights) for window in windows] == [2] * len(windows)
+    # At ten a second they are not, and either may continue either.
+    outputs.clear()
+    for index in range(3, 6):
+        one.take(MIXTURE, likelihoods.message(index, chain=False))
+    assert len(trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1]).weights) > 2
+
+
+def test_a_likelihood_that_is_lost_on_the_way(session, outputs, likelihoods):
+    """Ancestry refers to an image that has not come: modes continue what is within reach."""
+    one = session(longest_interval=0.5)
+    for index in (0, 1, 2, 4, 5, 6):
+        handled = one.take(MIXTURE, likelihoods.message(index))
+        assert handled.faults == handled.warnings == ()
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(index) for index in (0, 1, 2, 4, 5, 6)]
+    assert weights_of(outputs) == pytest.approx([0.3] * 6, abs=0.2)
+    numbers = {
+        tuple(sorted(pose_mixture_of(m).identities)) for m in read(outputs, 'smoothed_pose_mixture')
+    }
+    assert {1, 2} <= set.union(*map(set, numbers))
+
+
+def test_modes_that_other_modes_follow(session, outputs, likelihoods):
+    """Their ancestry names modes that the image before did not have."""
+    one = session()
+    for index in range(5):
+        message = likelihoods.message(index)
+        if index == 2:
+            message.ancestry_ids = [7, 8]
+        assert one.take(MIXTURE, message).faults == ()
+    one.finish()
+    assert weights_of(outputs) == pytest.approx([0.3] * 5, abs=0.2)
+
+
+def test_modes_that_begin_within_a_track(session, outputs, likelihoods):
+    """A lost track is found again: weights are told, and nothing that they continue."""
+    one = session()
+    for index in range(8):
+        before = None if index == 4 else index - 1
+        handled = one.take(MIXTURE, likelihoods.message(index, before=before))
+        assert handled.faults == handled.warnings == ()
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(index) for index in range(8)]
+    assert weights_of(outputs) == pytest.approx([0.3] * 8, abs=0.2)
+
+
+def test_another_number_of_modes_in_each_image(session, outputs, likelihoods):
+    """One mode, two, one: where ancestry is not told, and where a mode has no weight."""
+    one = session()
+    for index in range(9):
+        mixture = likelihoods.mixture(index)
+        if index % 3 == 0:
+            mixture = mixture[:1].normalised()
+        weights = [1.0, 0.0] if index % 3 == 1 else None
+        message = likelihoods.message(index, mixture=mixture, weights=weights, chain=index != 5)
+        assert one.take(MIXTURE, message).faults == ()
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(index) for index in range(9)]
+    for message in read(outputs, 'smoothed_pose_mixture'):
+        content = pose_mixture_of(message)
+        assert content.weights.sum() == pytest.approx(1.0, abs=1e-9)
+        assert np.isfinite(content.joint_covariances).all()
+
+
+def test_all_modes_are_wrong_for_a_second(session, outputs, likelihoods):
+    """Somebody who faces the other way, 2 m beside: found again within a second."""
+    yaw = likelihoods.body.dof_names.index('root_z')
+    one = session(fixed_lag=0.5, prior=motion_prior)
+    for index in range(40):
+        mixture = likelihoods.mixture(index)
+        means = mixture.means.copy()
+        means[:, 0] += 2.0 * (10 <= index < 20)
+        means[:, yaw] += 2.5 * (10 <= index < 20)
+        message = likelihoods.message(index, mixture=replace(mixture, means=means))
+        assert one.take(MIXTURE, message).faults == ()
+    one.finish()
+    found = [pose_mixture_of(m) for m in read(outputs, 'smoothed_pose_mixture')]
+    assert len(found) == 40
+    for content in found:
+        assert np.isfinite(content.means).all()
+        assert np.linalg.eigvalsh(content.covariances).min() > 0.0
+    beside = [abs(content.means[0, 0]) for content in (*found[:6], *found[30:])]
+    assert max(beside) < 0.05
+    turned = [abs(content.means[0, yaw]) for content in (*found[:6], *found[30:])]
+    assert max(turned) < 0.1

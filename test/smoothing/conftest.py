@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing import LinearGaussianDynamics
+from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.smoothing import ImageModes, LinearGaussianDynamics, Link
 
+INDEPENDENT = CueErrors(1.0, 0.0)
 Modes = Callable[..., list[GaussianMixture]]
 
 
@@ -81,3 +83,63 @@ def exact():
 @pytest.fixture
 def walk() -> LinearGaussianDynamics:
     return LinearGaussianDynamics.random_walk([1.0, 2.0])
+
+
+def make_chained(
+    mixtures: Sequence[GaussianMixture],
+    stamps: Sequence[int] | None = None,
+    *,
+    hops: float = 0.0,
+    origins: Sequence[np.ndarray] | None = None,
+    errors: CueErrors = INDEPENDENT,
+) -> list[ImageModes]:
+    """Images of a filter whose modes have the weights of the mixtures.
+
+    Args:
+        stamps: ns; None: a second apart.
+        hops: probability that a mode continues each of the others, where `origins` are not told.
+    """
+    result = []
+    for t, mixture in enumerate(mixtures):
+        k = len(mixture)
+        own = hops + (1.0 - k * hops) * np.eye(k) if t else np.empty((k, 0))
+        weights = mixture.weights / mixture.weights.sum()
+        link = Link(weights, own if origins is None else origins[t])
+        stamp = t * 10**9 if stamps is None else int(stamps[t])
+        result.append(ImageModes(stamp, link, mixture, errors))
+    return result
+
+
+def make_dense(mixtures, path, dynamics, intervals, first=None):
+    """Means (T, n) and covariances (T, n, T, n) of the states along modes, by dense algebra.
+
+    Args:
+        first: mean and precision of the first state; None: those of the dynamics.
+    """
+    times, n, d = len(path), dynamics.state_dimension, dynamics.dimension
+    precision, pull = np.zeros((times, n, times, n)), np.zeros((times, n))
+    at, known = first or (dynamics.initial_mean, dynamics.initial_precision)
+    precision[0, :, 0], pull[0] = known, known @ at
+    for t, interval in enumerate(intervals):
+        a, q = dynamics.transition(float(interval))
+        inverse = np.linalg.inv(q)
+        precision[t, :, t] += a.T @ inverse @ a
+        precision[t + 1, :, t + 1] += inverse
+        precision[t + 1, :, t] -= inverse @ a
+        precision[t, :, t + 1] -= a.T @ inverse
+    for t, (mixture, k) in enumerate(zip(mixtures, path, strict=True)):
+        inverse = np.linalg.inv(mixture.covariances[k])
+        precision[t, :d, t, :d] += inverse
+        pull[t, :d] += inverse @ mixture.means[k]
+    covariance = np.linalg.inv(precision.reshape(times * n, -1))
+    return (covariance @ pull.reshape(-1)).reshape(times, n), covariance.reshape(times, n, times, n)
+
+
+@pytest.fixture
+def chained():
+    return make_chained
+
+
+@pytest.fixture
+def dense():
+    return make_dense

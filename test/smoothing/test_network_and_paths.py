@@ -17,9 +17,6 @@ from hmt_ros.smoothing.embedded_network import (
     k_best_paths,
     paths_through_nodes,
 )
-from hmt_ros.smoothing.likelihood import merged_modes, or_missed
-from hmt_ros.smoothing.mixture_smoother import PathSmoother
-from hmt_ros.smoothing.mode_sequence import ModeSequence
 
 INTERVALS = np.array([0.5, 1.0, 0.5, 1.0])
 
@@ -121,17 +118,6 @@ def test_merging_keeps_the_moments_and_leaves_no_close_pair(modes):
             assert offset @ np.linalg.solve(middle, offset) >= 4.0
 
 
-def test_a_first_state_is_a_layer_of_its_own(modes, walk):
-    mixtures = modes(2.0, times=3)
-    sequence = ModeSequence(tuple(mixtures[1:]), walk, np.ones(2), mixtures[0])
-    whole = ModeSequence(tuple(mixtures), walk, np.ones(2))
-    for a, b in zip(sequence.network.links, whole.network.links):
-        np.testing.assert_allclose(a, b)
-    paths = sequence.paths(5)
-    np.testing.assert_allclose(sequence.states(paths), whole.states(paths))
-    assert sequence.likelihood.times == whole.likelihood.times == 3
-
-
 def test_paths_through_every_node_are_the_best_that_visit_it(modes, walk):
     network = embedded_network(modes(2.0, times=4), walk, np.ones(3))
     every = list(itertools.product(range(3), repeat=4))
@@ -145,44 +131,3 @@ def test_paths_through_every_node_are_the_best_that_visit_it(modes, walk):
         visiting = np.array([path[t] == k for path in every])
         best = found.log_values[found.nodes[:, t] == k].max()
         assert best == pytest.approx(values[visiting].max())
-
-
-def test_the_highest_mode_leads_those_that_are_merged():
-    """Two modes of one explanation: the wide one has more mass, the sharp one explains more."""
-    sharp, wide, far = [[1e-4]], [[1e-2]], [[1e-2]]
-    heights = np.array([1.0, 0.1, 0.5])
-    deviations = np.array([0.01, 0.1, 0.1])
-    masses = heights * deviations
-    mixture = GaussianMixture(masses / masses.sum(), [[0.0], [0.05], [9.0]], [sharp, wide, far])
-    assert mixture.weights[1] == pytest.approx(mixture.weights[0])
-    found = merged_modes(mixture, 3.0)
-    assert len(found) == 2
-    near = int(np.argmin(np.abs(found.means[:, 0])))
-    assert found.means[near, 0] == pytest.approx(0.05 * 0.1 / 1.1)
-    # What was merged is as high as both were, against the other one.
-    high = found.weights / np.sqrt(found.covariances[:, 0, 0])
-    assert high[near] / high[1 - near] == pytest.approx(1.1 / 0.5)
-    assert merged_modes(mixture, 0.0) is mixture
-
-
-def test_a_mode_that_was_missed_is_wide():
-    mixture = GaussianMixture([0.4, 0.6], [[0.0], [1.0]], [[[0.01]], [[0.02]]])
-    found = or_missed(mixture, np.array([4.0]))
-    np.testing.assert_allclose(found.weights, [0.396, 0.594, 0.01])
-    np.testing.assert_allclose(found.means[:, 0], [0.0, 1.0, 1.0])
-    np.testing.assert_allclose(found.covariances[:, 0, 0], [0.01, 0.02, 4.02])
-
-
-def test_an_image_that_missed_the_pose_is_passed_over(walk):
-    """All modes of one image are far away: without a wide one the path has to go there."""
-    place = np.array([0.0, 0.0])
-
-    def image(at):
-        return GaussianMixture([1.0], [at], [1e-3 * np.eye(2)])
-
-    images = [image(place), image(place), image(place + 30.0), image(place), image(place)]
-    torn = PathSmoother(walk, max_trajectories=8).smooth(images)
-    assert np.abs(torn.means[0, 2]).min() > 25.0
-    wide = [or_missed(one, np.full(2, 1e3)) for one in images]
-    whole = PathSmoother(walk, max_trajectories=8).smooth(wide)
-    assert np.abs(whole.means[0]).max() < 0.2

@@ -10,8 +10,7 @@ import pytest
 from hmt_ros.body import load_body
 from hmt_ros.body.ground_terms import sole_jacobians, sole_points
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing import LinearGaussianDynamics, resting_points
-from hmt_ros.smoothing.mixture_smoother import PathSmoother
+from hmt_ros.smoothing import LinearGaussianDynamics, MotionSmoother, resting_points
 from hmt_ros.smoothing.resting_points import (
     SLIP,
     RestingPoints,
@@ -125,7 +124,7 @@ def test_a_body_without_feet_has_nothing_that_rests(monkeypatch):
 
 
 @pytest.mark.parametrize('speed', [0.0, 1.0])
-def test_a_smoother_holds_what_rests(rng, speed):
+def test_a_smoother_holds_what_rests(rng, chained, speed):
     """What trembles on a spot stands still; what moves goes where it went without."""
     dynamics = LinearGaussianDynamics.random_walk([0.5, 0.5])
     stamps = [round(t * DT * 1e9) for t in range(40)]
@@ -134,8 +133,9 @@ def test_a_smoother_holds_what_rests(rng, speed):
     mixtures = [
         GaussianMixture([1.0], [[way[t], 0.0] + noise[t]], [1e-3 * np.eye(2)]) for t in range(40)
     ]
-    free = PathSmoother(dynamics, points=line).smooth(mixtures, stamps_ns=stamps)
-    held = PathSmoother(dynamics, points=line, resting=POINT).smooth(mixtures, stamps_ns=stamps)
+    images = chained(mixtures, stamps)
+    free = MotionSmoother(dynamics, points=line).smooth(images)
+    held = MotionSmoother(dynamics, points=line, resting=POINT).smooth(images)
 
     def slides(found):
         return np.abs(np.diff(found.means[0].sum(1)) - speed * DT).mean()
@@ -147,7 +147,7 @@ def test_a_smoother_holds_what_rests(rng, speed):
     assert np.isfinite(held.marginal(3).log_density(held.means[:1, 3])).all()
 
 
-def test_one_pose_alone_has_nothing_to_rest_against():
+def test_one_pose_alone_has_nothing_to_rest_against(chained):
     dynamics = LinearGaussianDynamics.random_walk([0.5, 0.5])
     one = GaussianMixture([1.0], [[0.0, 0.0]], [np.eye(2)])
-    assert PathSmoother(dynamics, resting=POINT).smooth([one]).times == 1
+    assert MotionSmoother(dynamics, resting=POINT).smooth(chained([one])).times == 1

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body.motion_prior import motion_prior
+from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
@@ -259,6 +260,29 @@ def test_start_from_a_mixture(human32, camera, black, motion, keypoints_of, mixt
         assert best_error(human32, posterior, human32, motion[i]) < 0.06
 
 
+def test_a_mode_goes_on_whatever_is_proposed(
+    human32, camera, black, motion, keypoints_of, monkeypatch
+):
+    """A limb and its flip have one image; only where the first one is anything is proposed."""
+
+    def first_alone(search, base, sources, rng):
+        return sources.proposed(np.zeros(1, dtype=int), base.x[:1], np.zeros((1, 32), dtype=bool))
+
+    flips = enumerate_flips(human32, motion[6:7], 'left_arm')[0]
+    wrists = human32.relative_joints(flips)[:, human32.joint_names.index('left_wrist')]
+    far = np.linalg.norm(wrists - wrists[0], axis=1).argmax()
+    both = flips[[0, far]]
+    monkeypatch.setattr('hmt_ros.tracking.filter.propose', lambda _, *given: first_alone(*given))
+    tracker = Tracker(human32, camera, keypoint_settings())
+    tracker.reset(GaussianMixture(np.full(2, 0.5), both, np.tile(0.01 * np.eye(32), (2, 1, 1))))
+    for i in range(3):
+        posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, motion[6], 1.0, i))
+    found = human32.relative_joints(posterior.means)[:, human32.joint_names.index('left_wrist')]
+    assert np.linalg.norm(wrists[far] - wrists[0]) > 0.2
+    for wrist in wrists[[0, far]]:
+        assert np.linalg.norm(found - wrist, axis=1).min() < 0.1
+
+
 def test_modes_move_on_where_nothing_is_seen(human37, camera, black, motion, keypoints_of):
     """Keypoints of 10^5 px say nothing: modes go where their velocities take them."""
     free = replace(ONLY_KEYPOINTS, prior_weight=0.0, self_intersection_sigma=np.inf)
@@ -337,7 +361,7 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert max(misfits[:3]) < 0.1
     assert min(misfits[3:found]) > UNDECIDED[KEYPOINTS]
     assert max(misfits[found:]) < 0.1
-    assert min(errors[3:found]) > 0.1
+    assert min(errors[3:found]) > 0.08
     assert max(errors[found:]) < 0.065
     # The place too, not only the posture.
     assert np.abs(posterior.means[:, :3] - other[:3]).max(1).min() < 0.25
@@ -389,9 +413,9 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
                 break
         assert statuses[-2] is Status.LOST
         assert (statuses[-1] is Status.TRACKING) == given
-        errors[given] = best_error(tracker.estimate.body, posterior, human32, other)
+        errors[given] = best_error(tracker.estimate.body, posterior[:1], human32, other)
     # Five keypoints hold little: the prior of the angles draws the pose away from the prediction.
-    assert errors[True] < 0.97 * errors[False]
+    assert errors[True] < 0.6 * errors[False]
 
 
 def test_nothing_becomes_certain_while_a_lost_track_is_sought(
@@ -439,7 +463,7 @@ def test_who_jumps_is_found_where_the_keypoints_are(human32, started, black, mot
         errors.append(best_error(tracker.estimate.body, posterior, human32, pose))
         lost.append(tracker.estimate.status is Status.LOST)
     found = lost.index(True) + 1
-    assert min(errors[3:found]) > 0.1
+    assert min(errors[3:found]) > 0.08
     assert max(errors[found:]) < 0.065
 
 

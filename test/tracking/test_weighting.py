@@ -38,13 +38,17 @@ def log_transition(body, pose, expected, dt):
 
 def transition(body, pose, expected, all_poses, dt):
     """p(x_k | x_j), equation (2)."""
-    every = [np.exp(log_transition(body, x, expected, dt)) for x in all_poses]
-    return np.exp(log_transition(body, pose, expected, dt)) / (sum(every) + np.exp(-END_NATS))
+
+    def share(x):
+        crowd = sum(np.exp(log_transition(body, x, other, dt)) for other in all_poses)
+        return np.exp(log_transition(body, x, expected, dt)) / crowd
+
+    return share(pose) / (sum(share(x) for x in all_poses) + np.exp(-END_NATS))
 
 
 def log_priors(continuity, poses):
     """log sum_k w_k p(x_n | x_k), (N,)."""
-    histories = continuity.log_histories(continuity.log_transitions(poses))
+    histories = continuity.log_histories(poses)
     return np.logaddexp.reduce(histories, axis=0)
 
 
@@ -115,6 +119,23 @@ def test_copies_of_a_continuation_do_not_multiply_the_mass_of_a_mode(human32, po
     assert weights[1:].sum() == pytest.approx(0.3, rel=0.1)
     # Each alone would have as much as the mode itself.
     assert np.exp(continuity.rated(near)) == pytest.approx(0.3, rel=0.1)
+
+
+def test_copies_of_a_motion_draw_no_weight_from_another(human32, poses_near):
+    """An arm and another one, a second of images: one is found once, the other as many times."""
+    a, dt = poses_near(1, 1)[0], 1.0 / 30.0
+    b, near = a.copy(), 0.005
+    b[human32.skeleton.chain_dofs['left_arm'][0]] += 0.8
+    copies = np.array([b + near * k / human32.dimension**0.5 for k in range(-3, 4)])
+    poses = np.concatenate([a[None], copies])
+    weights = np.concatenate([[0.5], np.full(7, 0.5 / 7)])
+    for _ in range(30):
+        continuity = Continuity(human32, poses, np.log(weights), dt)
+        weights = np.exp(normalised(log_priors(continuity, poses)))
+    assert weights[0] == pytest.approx(0.5, abs=0.1)
+    # There is a way from the one to the other.
+    ways = np.exp(continuity.log_histories(poses) - np.log(weights)[:, None])
+    assert ways[0, 1:].sum() > 0.01
 
 
 @pytest.mark.parametrize('dt', [1e-9, 1000.0])

@@ -1,0 +1,276 @@
+"""symmetric: do two motions with one image and one prior both keep their weight?
+
+A person 60 m from a camera with a lens of 9,000 px, or 12 m from one of 1,800 px, moves a limb.
+Flips of that limb have the same image in every image. Of random poses and their flips one pair
+makes a case: the ends of the limb are far apart as long as it moves, and where both poses are
+fitted to the image of the one; the priors of both motions, and these fits, differ least. So both
+are motions of the model that is tracked, and neither is the better one. The tracker is given
+keypoints alone, whose noise lasts, and no experts. It starts from both poses, half each, or from
+its own start: the keypoints of the first images. Each of its modes counts for the motion whose limb
+is nearer. Shares are of the images in which there is a track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.clips import table
+from benchmarks.command import benchmark_parser, run_benchmark
+from benchmarks.machine import description
+from benchmarks.runs import JOINTS, in_processes, keypoints_only
+from hmt_ros.body import Camera, load_body
+from hmt_ros.flips.interpretation_tree import enumerate_flips
+from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.pose_energy import PoseEnergy
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.energy import Derivatives
+from hmt_ros.tracking import Tracker, TrackerSettings
+from hmt_ros.tracking.track_state import Estimate
+
+ENDS = {'right_arm': 'wrist', 'left_arm': 'wrist', 'left_leg': 'ankle', 'right_leg': 'ankle'}
+# Distances of the person, m; focal lengths in proportion make all images the same size.
+DISTANCES, FOCAL_LENGTH = (60.0, 12.0), 150.0
+NOISES, SEEDS = (3.0, 6.0), 5  # px
+SAID = 3.0  # px that the detector says that it errs by
+RATE, LENGTH = 30.0, 40  # images a second, images
+LASTING = 0.2  # s that the noise of keypoints lasts
+# Random poses, those tried as motions, least distance of the ends of the limb, m, and of the start.
+POSES, TRIED, APART, START_SIGMA = 4000, 100, 0.3, 0.05
+LIKELY = 0.05  # part of the energy of the prior that counts beside its difference
+BOTH = 0.05  # weight that each motion keeps
+OWN, GIVEN = 'own start', 'both given'
+BODY = load_body('human37')
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Two motions with one image.
+
+    Attributes:
+        limb: name of the chain that is flipped.
+        distance: of the person, m.
+        seed: of the motion, the noise and the tracker.
+        noise: of the keypoints, px.
+        motions: (2, T, d) poses, the true motion and the flipped one.
+        prior: energy of the prior of the flipped motion, less that of the true one, nats an image.
+    """
+
+    limb: str
+    distance: float
+    seed: int
+    noise: float
+    motions: Array
+    prior: float
+
+    @property
+    def camera(self) -> Camera:
+        """That sees the person."""
+        return camera_at(self.distance)
+
+    def keypoints(self) -> Iterator[Keypoints]:
+        """Of every image; the noise is AR(1)."""
+        rng, rho = np.random.default_rng(self.seed), np.exp(-1.0 / (RATE * LASTING))
+        error = rng.normal(size=(len(JOINTS), 2))
+        for joints in BODY.joint_positions(self.motions[0]):
+            yield _keypoints(self.camera, joints, self.noise * error)
+            error = rho * error + np.sqrt(1.0 - rho**2) * rng.normal(size=error.shape)
+
+
+class Image(NamedTuple):
+    """What the tracker says of image t."""
+
+    t: int
+    stamp: int
+    posterior: GaussianMixture
+    likelihood: GaussianMixture
+    estimate: Estimate
+
+
+def cases(
+    limbs: Sequence[str] = tuple(ENDS),
+    seeds: Sequence[int] = range(SEEDS),
+    distances: Sequence[float] = DISTANCES,
+    noises: Sequence[float] = NOISES,
+) -> Iterator[Case]:
+    """All combinations; two noises share their motions."""
+    for distance in distances:
+        for limb in limbs:
+            for seed in seeds:
+                motions = _motions(limb, distance, seed)
+                for noise in noises:
+                    yield Case(limb, distance, seed, noise, *motions)
+
+
+def _keypoints(camera: Camera, joints: Array, error: Array | float = 0.0) -> Keypoints:
+    pixels = camera.project(joints[BODY.skeleton.joint_index(JOINTS)]) + error
+    said = np.tile(SAID**2 * np.eye(2), (len(JOINTS), 1, 1))
+    return Keypoints(JOINTS, pixels, said, np.ones(len(JOINTS)))
+
+
+def camera_at(distance: float) -> Camera:
+    """That shows a person at a distance, m, as large as at any other."""
+    focal = FOCAL_LENGTH * distance
+    return Camera(focal, focal, 319.5, 239.5, 640, 480)
+
+
+def _motions(limb: str, distance: float, seed: int) -> tuple[Array, float]:
+    """The pair of motions of a case with the least difference of priors.
+
+    Raises:
+        ValueError: there is none, or their images differ.
+    """
+    body, camera, rng = BODY, camera_at(distance), np.random.default_rng(seed)
+    likelihood = ImageLikelihood(body, camera)
+    prior = PoseEnergy(likelihood, likelihood.priors)
+    own = body.skeleton.chain_dofs[limb]
+    end = body.joint_names.index(f'{limb.split("_")[0]}_{ENDS[limb]}')
+
+    def energy(poses: Array) -> Array:
+        return prior.energy(poses, derivatives=Derivatives.NONE).value
+
+    def distances(one: Array, other: Array) -> Array:
+        gap = body.relative_joints(one) - body.relative_joints(other)
+        return np.linalg.norm(gap[:, end], axis=1)
+
+    poses = np.tile(np.clip(body.prior_mean, body.lower, body.upper), (POSES, 1))
+    poses[:, :3] = 0.0, 0.0, distance
+    poses[:, own] += 1.2 * body.prior_sigma[own] * rng.normal(size=(POSES, len(own)))
+    poses = np.clip(poses, body.lower, body.upper)
+    flips, parents = enumerate_flips(body, poses, limb)
+    before = energy(poses)[parents]
+    cost = np.abs(energy(flips) - before) + LIKELY * before
+    far = distances(poses[parents], flips) > APART
+    found = []
+    for i in np.argsort(np.where(far, cost, np.inf))[:TRIED]:
+        pair = np.stack([poses[parents[i]], flips[i]])
+        seen = Observation(keypoints=_keypoints(camera, body.joint_positions(pair)[0]))
+        optima = PoseEnergy(likelihood, (*likelihood.seen(seen), *likelihood.priors)).minimise(pair)
+        motions = _moved(*pair, limb)
+        if motions is None or distances(*optima.x[:, None])[0] < APART:
+            continue
+        if distances(*motions).min() > APART:
+            change = energy(motions[1]) - energy(motions[0])
+            unequal = np.abs(change).mean() + abs(optima.value[1] - optima.value[0])
+            found.append((unequal, change.mean(), motions))
+    if not found:
+        raise ValueError(f'no two motions of the {limb} for the seed {seed}')
+    _, value, motions = min(found, key=lambda x: x[0])
+    pixels = camera.project(body.joint_positions(motions.reshape(-1, body.dimension)))
+    if np.abs(pixels[:LENGTH] - pixels[LENGTH:]).max() > 1.0:
+        raise ValueError(f'the flip of the {limb} for the seed {seed} has another image')
+    return motions, float(value)
+
+
+def _moved(pose: Array, flip: Array, limb: str) -> Array | None:
+    """A motion (2, T, d) from a pose, and that from its flip; None: the flip leaves the limits."""
+    own, times = BODY.skeleton.chain_dofs[limb], np.arange(LENGTH) / RATE
+    path, other = np.tile(pose, (LENGTH, 1)), np.tile(flip, (LENGTH, 1))
+    path[:, own] += 0.1 * np.sin(np.pi * times[:, None] + np.arange(len(own)))
+    path[:, own] -= 0.1 * np.sin(np.arange(len(own)))
+    path[:, 0] += 0.1 * times
+    path = np.clip(path, BODY.lower, BODY.upper)
+    flips, parents = enumerate_flips(BODY, path, limb)
+    joints = BODY.relative_joints(flips)
+    last = BODY.relative_joints(flip[None])[0]
+    for t in range(LENGTH):
+        (rows,) = np.nonzero(parents == t)
+        gaps = np.linalg.norm(joints[rows] - last, axis=2).max(1)
+        nearest = rows[gaps.argmin()]
+        if gaps.min() > APART / 2:
+            return None
+        other[t], last = flips[nearest], joints[nearest]
+    return np.stack([path, other])
+
+
+def tracked(case: Case, *, given: bool, **changes: Any) -> Iterator[Image]:
+    """What the tracker says of the images of a case.
+
+    Args:
+        case: it.
+        given: whether the tracker starts from both poses, half each.
+        changes: settings of the tracker.
+    """
+    settings = replace(keypoints_only(TrackerSettings(lifter='')), **changes)
+    tracker = Tracker(BODY, case.camera, settings, None, case.seed)
+    if given:
+        covariance = START_SIGMA**2 * np.eye(BODY.dimension)
+        means = case.motions[:, 0]
+        tracker.reset(GaussianMixture(np.full(2, 0.5), means, np.tile(covariance, (2, 1, 1))))
+    blank = np.zeros((case.camera.height, case.camera.width, 3), dtype=np.uint8)
+    for t, keypoints in enumerate(case.keypoints()):
+        stamp = round((t + 1) * 1e9 / RATE)
+        posterior, likelihood = tracker.step(blank, stamp, keypoints)
+        if posterior is not None and likelihood is not None:
+            yield Image(t, stamp, posterior, likelihood, tracker.estimate)
+
+
+def shares(means: Array, weights: Array, case: Case, t: int) -> Array:
+    """Weights (2,) of the true and the flipped motion at image t, of poses (K, d)."""
+    own = BODY.skeleton.chain_joints[case.limb]
+    joints = BODY.relative_joints(means)[:, None, own]
+    motions = BODY.relative_joints(case.motions[:, t])[:, own]
+    nearer = np.linalg.norm(joints - motions, axis=3).mean(2).argmin(1)
+    return np.bincount(nearer, weights, 2) / weights.sum()
+
+
+def of_case(case: Case, **changes: Any) -> dict[str, Any]:
+    """Weights of both motions from either start; `changes` as of `tracked`."""
+    result: dict[str, Any] = {
+        name: getattr(case, name) for name in ('limb', 'distance', 'seed', 'noise', 'prior')
+    }
+    for start, given in ((GIVEN, True), (OWN, False)):
+        seen = tracked(case, given=given, **changes)
+        weights = np.array(
+            [shares(one.posterior.means, one.posterior.weights, case, one.t) for one in seen]
+        )
+        result[start] = {'true': weights[:, 0], 'both': weights.min(1) > BOTH}
+    return result
+
+
+def measure(*, quick: bool = False) -> dict[str, Any]:
+    """What `of_case` finds of all cases; of one where it must be quick."""
+    chosen = list(cases(['right_arm'], [0], DISTANCES[:1], NOISES[:1]) if quick else cases())
+    found = in_processes(of_case, chosen, 1 if quick else 0, 'symmetric')
+    for one in found:
+        for start in (GIVEN, OWN):
+            one[start] = {name: float(x.mean()) for name, x in one[start].items()}
+    return {'machine': description(), 'cases': found}
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """Means by distance, limb and noise, and over all cases."""
+    rows = [
+        ['limb', 'distance, m', 'noise, px', 'priors differ, nats', *(
+            f'{start}: {what}'
+            for start in (GIVEN, OWN)
+            for what in ('weight of the true motion', f'both above {100 * BOTH:.0f} %')
+        )],
+    ]  # fmt: skip
+    groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for one in result['cases']:
+        name = one['limb'].replace('_', ' '), f'{one["distance"]:g}', f'{one["noise"]:g}'
+        groups.setdefault(name, []).append(one)
+    for name, own in [*groups.items(), (('all', '', ''), result['cases'])]:
+        rows.append([*name, f'{np.mean([abs(x["prior"]) for x in own]):.2f}'])
+        for start in (GIVEN, OWN):
+            true = ' '.join(f'{x[start]["true"]:.2f}' for x in own)
+            if name[0] == 'all':
+                true = f'{np.mean([x[start]["true"] for x in own]):.2f}'
+            rows[-1] += [true, f'{100 * np.mean([x[start]["both"] for x in own]):.0f} %']
+    return table(rows, markdown=markdown)
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the command; returns its exit code."""
+    parser = benchmark_parser('symmetric', __doc__, quick='one case')
+    options = parser.parse_args(arguments)
+    measured = partial(measure, quick=options.quick)
+    return run_benchmark('symmetric', measured, as_text, as_json=options.json)
