@@ -4,10 +4,10 @@
     F(q) = E_q[log q(X) - log p(X, R)],    q = sum_i a_i N(M_i, s_i^2 S_i)                      (2)
 
 The distinct motions of a window start descents on (1) within limits, with one prior for all: that
-of the liveliest among them, with the feet held that rest in the heaviest. Of optima that are one
-motion the most probable is kept; (2) is over these. What it adapts is chosen on clips
-(docs/smoothing.md): the chain of the filter's modes weighs motions better than (2), so an optimum
-has the weight of the motions that came to it.
+of the liveliest among them, where states begin anew if those of one do, with the feet held that
+rest in the heaviest. Of optima that are one motion the most probable is kept; (2) is over these.
+What it adapts is chosen on clips (docs/smoothing.md): the chain of the filter's modes weighs
+motions better than (2), so an optimum has the weight of the motions that came to it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 from hmt_ros.smoothing.mixture_smoother import trajectory_mixture
-from hmt_ros.smoothing.motion_smoother import MotionSmoother, SmoothedMotions
+from hmt_ros.smoothing.motion_smoother import ANEW, MotionSmoother, SmoothedMotions
 from hmt_ros.smoothing.motions import SECOND_NS, grouped, path_distances
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import refine
@@ -62,10 +62,10 @@ def refined_on_images(
         raise ValueError(f'{images.times} images for {motions.times} times')
     d = motions.dimension
     chosen = _first_of_each(smoother, motions, motions.states, motions.weights, LEAST)[0]
-    liveliness = float(found.liveliness[chosen].max())
-    dynamics = replace(smoother.dynamics, diffusion=liveliness * smoother.dynamics.diffusion)
     intervals = np.diff(motions.stamps_ns) / SECOND_NS
-    prior = dynamics.prior(intervals)
+    begins = found.begins[chosen, 1:].any(axis=0)
+    noise = np.where(begins, ANEW, found.liveliness[chosen].max())
+    prior = smoother.dynamics.prior(intervals, noise=noise)
     if smoother.resting is not None and len(intervals):
         first = chosen[0]
         covariances = found.evidence.covariances[first]
@@ -112,6 +112,7 @@ def refined_on_images(
         result,
         free_energy=fitted.free_energy,
         free_energy_fresh=fitted.fresh,
+        strays=motions.strays,
         disagreements=None if motions.disagreements is None else motions.disagreements[which],
     )
 
@@ -128,6 +129,6 @@ def _first_of_each(
     points = smoother.points_of(states[:, :, : motions.dimension]).swapaxes(0, 1)
     nodes = np.broadcast_to(np.arange(len(states))[:, None], states.shape[:2])
     distances = path_distances(nodes, list(points), motions.stamps_ns)
-    labels = grouped(weights, distances, MOST, least)
+    labels = grouped(weights, *distances, MOST, least)
     first = np.unique(labels, return_index=True)[1]
     return first, np.bincount(labels, weights).astype(np.float64)
