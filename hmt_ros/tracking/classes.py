@@ -150,16 +150,16 @@ def weigh_ways(
     return result, facing
 
 
-def across_ways(
+def log_turned(
     body: Body, modes: Modes, predicted: Array, poses: Array, transitions: Array, dt: float
 ) -> Array:
-    """log t (K, N) of the ancestry of poses (N, d), equation (6); arguments as of `weigh_ways`."""
+    """What (6) adds to log t (K, N) of poses (N, d); arguments as of `weigh_ways`."""
     if not body.trunk_pairs:
-        return transitions
+        return np.zeros_like(transitions)
     other = modes.back[:, None] != ways(body, poses, modes.poses[0])
     turns = np.minimum(transitions, log_turns(body, predicted, poses, dt))
     turned = np.logaddexp(turns, -body.symmetries['reversal'].price(dt))
-    return np.where(other, turned, transitions)
+    return np.where(other, turned - transitions, 0.0)
 
 
 def log_turns(body: Body, first: Array, last: Array, dt: float) -> Array:

@@ -26,9 +26,9 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.classes import (
-    across_ways,
     best_of_the_other_way,
     first_facing,
+    log_turned,
     seen_exchanges,
     ways,
     weigh_ways,
@@ -264,10 +264,10 @@ class MixtureFilter:
             np.asarray(~optimised.hypotheses.jumped.all(1)),
             search.dt,
         )
-        linked = across_ways(
+        histories = histories + log_turned(
             self.body, search.modes, search.continuity.predicted, poses, transitions, search.dt
         )
-        return optimised, log_weights, facing, search.continuity.log_histories(linked)
+        return optimised, log_weights, facing, histories
 
     def _select(
         self,
