@@ -111,7 +111,7 @@ def evidence_of_motions(
     weights: Array,
     labels: Index,
     mixtures: Sequence[GaussianMixture],
-    points: Sequence[Array],
+    points: Sequence[Array] | None = None,
 ) -> MotionEvidence:
     """What images say of each motion.
 
@@ -119,17 +119,18 @@ def evidence_of_motions(
         nodes: (N, T) modes of the paths.
         weights, labels: (N,) of the paths, and the motion of each.
         mixtures: T likelihoods, with covariances S_k / b.
-        points: T arrays (K_t, P, 3) of their modes, m.
+        points: T arrays (K_t, P, 3) of their modes, m; None: any modes are one Gaussian.
     """
     count, times, d = int(labels.max()) + 1, len(mixtures), mixtures[0].dimension
     means = np.empty((count, times, d))
     covariances, apart = np.empty((2, count, times, d, d))
-    for t, (mixture, places) in enumerate(zip(mixtures, points, strict=True)):
+    for t, mixture in enumerate(mixtures):
         shares = np.zeros((count, len(mixture)))
         np.add.at(shares, (labels, nodes[:, t]), weights)
-        heaviest = places[shares.argmax(1)]
-        away = np.linalg.norm(heaviest[:, None] - places, axis=3).mean(2)
-        shares[away > OPPOSITE] = 0.0
+        if points is not None:
+            heaviest = points[t][shares.argmax(1)]
+            away = np.linalg.norm(heaviest[:, None] - points[t], axis=3).mean(2)
+            shares[away > OPPOSITE] = 0.0
         shares /= shares.sum(1, keepdims=True)
         means[:, t] = shares @ mixture.means
         offsets = mixture.means - means[:, t, None]

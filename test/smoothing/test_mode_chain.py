@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from hmt_ros.smoothing import Link, backward_paths, backward_weights
+from hmt_ros.smoothing import Link, drawn_paths, backward_weights
 from hmt_ros.smoothing.mode_chain import reachable_origins
 
 COUNTS = (3, 4, 2, 5, 3)
@@ -54,18 +54,18 @@ def test_backward_weights_are_the_sums_over_all_paths(seed):
 def test_one_image_is_a_chain():
     links = make_chain((4,))
     np.testing.assert_array_equal(backward_weights(links)[0], links[0].weights)
-    nodes, weights = backward_paths(links, 10, seed=0)
+    nodes, weights = drawn_paths(links, 10, seed=0)
     np.testing.assert_allclose(marginals(nodes, weights, (4,))[0], links[0].weights, atol=1e-15)
 
 
 @pytest.mark.parametrize('seed', range(3))
 def test_paths_are_drawn_from_the_chain(seed):
     links = make_chain(seed=1)
-    nodes, weights = backward_paths(links, 4000, seed)
-    assert 4000 <= len(nodes) == len(weights) < 4000 + COUNTS[-1]
+    nodes, weights = drawn_paths(links, 4000, seed)
+    assert 4000 <= len(nodes) == len(weights) < 4000 + COUNTS[0]
     assert weights.sum() == pytest.approx(1.0, abs=1e-12)
-    newest = np.bincount(nodes[:, -1], weights)
-    np.testing.assert_allclose(newest, links[-1].weights, atol=1e-15, rtol=1e-12)
+    oldest, wanted = np.bincount(nodes[:, 0], weights), backward_weights(links)[0]
+    np.testing.assert_allclose(oldest, wanted, atol=1e-15, rtol=1e-12)
     for found, wanted in zip(marginals(nodes, weights), backward_weights(links), strict=True):
         np.testing.assert_allclose(found, wanted, atol=0.01)
     # Whole paths too, not their modes alone.
@@ -77,13 +77,13 @@ def test_paths_are_drawn_from_the_chain(seed):
         assert shares[tuple(path.tolist())] == pytest.approx(mass, abs=0.01)
 
 
-def test_few_paths_keep_the_weights_of_the_newest_modes():
-    """Each light mode begins a path, with its own weight."""
-    chain = make_chain((3, 5))
-    weights = np.array([0.9, 0.0, 1e-9, 0.07, 0.03 - 1e-9])
-    nodes, shares = backward_paths([chain[0], chain[1]._replace(weights=weights)], 8, seed=0)
-    assert set(nodes[:, 1].tolist()) == {0, 2, 3, 4}
-    np.testing.assert_allclose(np.bincount(nodes[:, 1], shares), weights, atol=1e-15, rtol=1e-12)
+def test_few_paths_keep_the_weights_of_the_oldest_modes():
+    """Each mode that is possible given later images begins a path, however light it is."""
+    chain, origins = make_chain((5,)), np.array([[0.9, 0.0, 1e-9, 0.07, 0.03 - 1e-9]])
+    nodes, shares = drawn_paths([*chain, Link(np.ones(1), origins)], 8, seed=0)
+    assert set(nodes[:, 0].tolist()) == {0, 2, 3, 4}
+    found = np.bincount(nodes[:, 0], shares)
+    np.testing.assert_allclose(found, origins[0], atol=1e-15, rtol=1e-12)
 
 
 def test_systematic_paths_are_nearer_than_independent_ones():
@@ -91,13 +91,13 @@ def test_systematic_paths_are_nearer_than_independent_ones():
     branch = Link(np.ones(1), np.array([[0.5, 0.5]]))
     links = [Link(np.array([0.5, 0.5]), np.empty((2, 0))), branch]
     for seed in range(20):
-        nodes, _ = backward_paths(links, 128, seed)
+        nodes, _ = drawn_paths(links, 128, seed)
         assert abs(int(nodes[:, 0].sum()) - 64) <= 1
 
 
 def test_the_same_seed_draws_the_same_paths():
     links = make_chain()
-    one, same, other = (backward_paths(links, 200, seed) for seed in (3, 3, 4))
+    one, same, other = (drawn_paths(links, 200, seed) for seed in (3, 3, 4))
     for a, b in zip(one, same, strict=True):
         np.testing.assert_array_equal(a, b)
     assert (one[0] != other[0]).any()

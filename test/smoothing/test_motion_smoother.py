@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.smoothing import LinearGaussianDynamics, MotionSmoother, SlidingWindow
+from hmt_ros.smoothing.mode_chain import backward_weights
 from hmt_ros.smoothing.motion_smoother import Past
 
 FAST = LinearGaussianDynamics.constant_velocity([2.0, 1.0], 0.8)
@@ -79,10 +80,10 @@ def test_motions_have_the_weight_of_all_their_paths(modes, walk, chained):
     images = chained(modes(3.0, times=3), hops=0.2)
     found = MotionSmoother(walk, max_motions=27).smooth(images)
     assert len(found) > 8
-    newest = images[-1].link.weights
-    last = np.abs(found.means[:, -1, None] - images[-1].mixture.means).sum(2).argmin(1)
-    # The states of a path end near the mode where it ends.
-    np.testing.assert_allclose(np.bincount(last, found.weights), newest, atol=0.02)
+    oldest = backward_weights([image.link for image in images])[0]
+    first = np.abs(found.means[:, 0, None] - images[0].mixture.means).sum(2).argmin(1)
+    # The states of a path begin near the mode where it begins.
+    np.testing.assert_allclose(np.bincount(first, found.weights), oldest, atol=0.02)
     few = MotionSmoother(walk, max_motions=2).smooth(images)
     assert len(few) == 2
     assert few.weights.sum() == pytest.approx(1.0, abs=1e-12)
@@ -140,7 +141,13 @@ def test_joint_densities_are_those_of_prior_and_images(modes, chained, known):
     past = None
     if known:
         rng = np.random.default_rng(1)
-        past = Past(np.eye(3), rng.normal(size=(3, 4)), np.array([np.eye(4)] * 3), np.ones(3))
+        past = Past(
+            np.eye(3),
+            rng.normal(size=(3, 4)),
+            np.array([np.eye(4)] * 3),
+            np.ones(3),
+            np.zeros((3, 2, 1)),
+        )
     found = smoother.smoothed(window, past)
     differ = []
     for m in range(len(found.trajectories)):
