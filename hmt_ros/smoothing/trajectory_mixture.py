@@ -9,7 +9,7 @@ velocities, they are integrated out of everything that is returned.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -89,10 +89,6 @@ class TrajectoryMixture:
 
     def __len__(self) -> int:
         return len(self.weights)
-
-    def widened(self, factor: float) -> TrajectoryMixture:
-        """The same with covariances that are a factor as large."""
-        return replace(self, inflation=np.sqrt(factor) * self.inflation)
 
     @property
     def times(self) -> int:
