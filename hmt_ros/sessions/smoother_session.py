@@ -59,6 +59,7 @@ from hmt_ros.sessions.track import resembles
 from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MotionSmoother, SlidingWindow, TrajectoryMixture
 from hmt_ros.smoothing.image_refinement import refined_on_images
+from hmt_ros.smoothing.likelihood import MixtureLikelihood
 from hmt_ros.smoothing.resting_points import RestingPoints
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
@@ -155,6 +156,12 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         for message in likelihoods(load_body(self.parameters.body_model or 'human37')):
             other.take(MIXTURE, message)
         other.smooth_span()
+        of, items = other.kept
+        assert of is not None
+        # The kernels of refinement; those of images are the filter's.
+        smoother, modes = other._smoother(of.body), [one.modes for one in items]
+        mixtures = MixtureLikelihood.of([one.mixture for one in modes])
+        refined_on_images(smoother, smoother.motions(modes), mixtures)
         other.finish()
 
     def share(self, images: SeenImages) -> None:
