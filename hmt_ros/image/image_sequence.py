@@ -4,8 +4,9 @@
 
 Errors of images last, so a cue g of an image counts with its share a_g of the time since the image
 before (`inference.error_model`), as in the filter; an exchange of sides counts whole. Along a
-motion a lasting error does no harm: by `of_changes` cues count with their shares of changes, and
-covariances grow by `CueErrors.lasting` afterwards; the prior of a pose judges poses, not changes.
+motion a lasting error does no harm: by `of_changes` the terms of the image count with their share
+of changes, and covariances grow by `CueErrors.lasting` afterwards. Keypoints count as before: their
+errors wander, and a motion would follow.
 
 Each image has the lengths and the flesh that its own poses were found with: later estimates of
 these move the root along the line of sight, which neighbours would take for motion.
@@ -71,12 +72,12 @@ class ImageSequence:
         """The sequence of images with these stamps (T,); nothing was seen before the first.
 
         Args:
-            of_changes: whether cues count with their shares of changes.
+            of_changes: whether the terms of the image count with their share of changes.
         """
         intervals = [np.inf, *(seconds(b - a) for a, b in pairwise(stamps_ns))]
         shares = [
             {
-                name: errors.of_changes(dt) if of_changes and name != 'prior' else errors.share(dt)
+                name: errors.of_changes(dt) if of_changes and name == 'image' else errors.share(dt)
                 for name, errors in ERRORS.items()
             }
             for dt in intervals
