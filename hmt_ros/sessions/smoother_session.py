@@ -38,6 +38,7 @@ import numpy as np
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.body.mirror import clear_level, free_limits, relevelled, without_turns
 from hmt_ros.body.motion_prior import motion_prior
+from hmt_ros.body.resting_points import RestingPoints
 from hmt_ros.image.image_sequence import ImageSequence
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
@@ -60,7 +61,6 @@ from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MotionSmoother, SlidingWindow, TrajectoryMixture
 from hmt_ros.smoothing.image_refinement import refined_on_images
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
-from hmt_ros.smoothing.resting_points import RestingPoints
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of

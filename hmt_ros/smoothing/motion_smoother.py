@@ -21,25 +21,26 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmt_ros.body.resting_points import RestingPoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
 from hmt_ros.inference.error_model import TOGETHER, CueErrors
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
-from hmt_ros.smoothing.mode_chain import Link, backward_weights, drawn_paths
+from hmt_ros.inference.mode_chain import Link, backward_weights, drawn_paths
 from hmt_ros.smoothing.motions import (
+    SAME_MOTION,
     SECOND_NS,
     MotionEvidence,
     evidence_of_motions,
     grouped,
     path_distances,
 )
-from hmt_ros.smoothing.resting_points import RestingPoints
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states
 
 # Paths that are drawn from the chain.
-PATHS = 128
+PATHS = 96
 # Values of lambda, and the median distance from the modes, m, from which on the next is tried.
 LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
 # Distance from which on the modes of an image are taken for wrong, m, and looks at that.
@@ -52,7 +53,7 @@ ANEW = 1e6
 # Distance from all motions from which on a mode is a stray, m.
 STRAY = 0.06
 # Least weight of a motion of more than one image, and of one whose resting feet are held.
-LEAST, LEAST_HELD = 0.01, 0.05
+LEAST, LEAST_HELD = 0.01, 0.1
 
 
 class ImageModes(NamedTuple):
@@ -289,26 +290,30 @@ class MotionSmoother:
             lower=low[:d],
             upper=high[:d],
             disagreements=evidence.disagreements,
-            strays=() if self.points is None else self._strays(images, states[:, :, :d]),
         )
+        if self.points is not None:
+            trajectories = self._with_weights_in_time(trajectories, images, shares)
         liveliness = np.array([one.liveliness for one in found])
         begins = np.array([one.begins for one in found])
         return SmoothedMotions(trajectories, shares, evidence, liveliness, begins, first)
 
-    def _strays(self, images: Sequence[WindowImage], poses: Array) -> tuple[GaussianMixture, ...]:
-        """The modes of T images that are near no motion, of poses (M, T, d)."""
-        result = []
+    def _with_weights_in_time(
+        self, found: TrajectoryMixture, images: Sequence[WindowImage], shares: Sequence[Array]
+    ) -> TrajectoryMixture:
+        """The trajectories with the weights of the modes that each is nearest to, at each time."""
         smoothed = backward_weights([image.modes.link for image in images])
-        for image, weights, places in zip(
-            images, smoothed, self.points_of(poses).swapaxes(0, 1), strict=True
-        ):
-            away = _distances(places[:, None], image.points).min(0)
-            stray = np.flatnonzero((away > STRAY) & (weights > 0.0))
-            modes = image.modes.mixture[stray]
-            result.append(
-                GaussianMixture(weights[stray], modes.means, image.alone * modes.covariances)
-            )
-        return tuple(result)
+        every = self.points_of(found.means).swapaxes(0, 1)
+        weights, strays = np.zeros((found.times, len(found))), []
+        for t, (image, own, places) in enumerate(zip(images, smoothed, every, strict=True)):
+            away = _distances(image.points[:, None], places)
+            nearest = away.min(1, keepdims=True)
+            parts = np.where(away <= nearest + SAME_MOTION / 2, shares[t] + 1e-6 * found.weights, 0)
+            stray = nearest[:, 0] > STRAY
+            parts *= np.where(stray, 0.0, own / parts.sum(1))[:, None]
+            weights[t], alone = parts.sum(0), np.flatnonzero(stray & (own > 0.0))
+            modes = image.modes.mixture[alone]
+            strays.append(GaussianMixture(own[alone], modes.means, image.alone * modes.covariances))
+        return replace(found, weights_in_time=weights, strays=tuple(strays))
 
     def _first(self, past: Past, nodes: Index, weights: Array, labels: Index) -> FirstStates:
         """The first state of each motion, by its paths there."""
@@ -369,7 +374,8 @@ class MotionSmoother:
             # Covariances ignore what rests: rest is a decision, the same from image to image.
             poses = np.clip(states, *self.limits())[:, :d]
             resting = self.resting.held(prior, poses, evidence.covariances[m], intervals)
-            states = _conditioned(resting, precisions, means)[0]
+            if resting is not prior:
+                states = _conditioned(resting, precisions, means)[0]
         return MotionStates(states, factor, float(gained - seen), liveliness, trust, begins)
 
     def _away(self, states: Array, places: Array) -> Array:

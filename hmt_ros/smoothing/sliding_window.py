@@ -17,7 +17,7 @@ import numpy as np
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.smoothing.mode_chain import Link
+from hmt_ros.inference.mode_chain import Link
 from hmt_ros.smoothing.motion_smoother import (
     ImageModes,
     MotionSmoother,

@@ -24,9 +24,6 @@ from hmt_ros.inference.block_tridiagonal import (
     BlockTridiagonal,
 )
 
-# Probability at least that some motion is near the pose.
-LEAST_COVERED = 0.1
-
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryMixture:
@@ -48,6 +45,8 @@ class TrajectoryMixture:
         lower, upper: (d,) limits; samples beyond them are projected onto them.
         disagreements: (M, T, d, d) of the modes that motions stand for, beside the density of the
             trajectories: part of marginals alone. None: components are no motions.
+        weights_in_time: (T, M) probability of the modes that each motion is near, at each time;
+            None: the weights.
         strays: T mixtures of modes that no motion is near, with their probabilities: part of
             marginals, whose last components they are. Empty: there are none.
 
@@ -69,6 +68,7 @@ class TrajectoryMixture:
     lower: Array | float = -np.inf
     upper: Array | float = np.inf
     disagreements: Array | None = None
+    weights_in_time: Array | None = None
     strays: tuple[GaussianMixture, ...] = ()
 
     def __post_init__(self) -> None:
@@ -135,19 +135,19 @@ class TrajectoryMixture:
         return np.asarray(np.gradient(self.means, seconds, axis=1))
 
     def marginal(self, t: int) -> GaussianMixture:
-        """The density of the pose at index t: a component for each trajectory, and the strays."""
+        """The density of the pose at index t: a component for each trajectory, and the strays.
+
+        Of motions the heaviest leads at every time, see `led_by_first`: what outweighs it for an
+        image is flicker.
+        """
         covariances = np.array([self.covariances_of(i)[t] for i in range(len(self))])
-        poses = GaussianMixture(self.weights, self.means[:, t], covariances)
-        if not self.strays or not len(strays := self.strays[t]):
+        weights = self.weights if self.weights_in_time is None else self.weights_in_time[t]
+        poses = GaussianMixture(weights, self.means[:, t], covariances)
+        if self.strays:
+            poses = joined(poses, self.strays[t])
+        if self.weights_in_time is None:
             return poses
-        # The heaviest motion stays the heaviest component: it leads the point estimate.
-        covered = max(1.0 - float(strays.weights.sum()), LEAST_COVERED) * self.weights
-        lighter = np.minimum(strays.weights, covered.max())
-        return GaussianMixture(
-            np.concatenate([covered, lighter]),
-            np.concatenate([poses.means, strays.means]),
-            np.concatenate([poses.covariances, strays.covariances]),
-        ).normalised()
+        return replace(poses, weights=led_by_first(poses.weights))
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws trajectories (n, T, d), projected onto the limits."""
@@ -225,3 +225,24 @@ class TrajectoryMixture:
             'free_energy': self.free_energy,
             'identities': np.array(self.identities, dtype=np.uint32) if self.identities else None,
         }
+
+
+def joined(one: GaussianMixture, other: GaussianMixture) -> GaussianMixture:
+    """The components of both."""
+    return GaussianMixture(
+        np.concatenate([one.weights, other.weights]),
+        np.concatenate([one.means, other.means]),
+        np.concatenate([one.covariances, other.covariances]),
+    )
+
+
+def led_by_first(weights: Array) -> Array:
+    """Weights (K,) that sum to the same, of which none is above the first.
+
+    What others weigh above a level goes to the first, which then has that level.
+    """
+    heavier = -np.sort(-weights[1:][weights[1:] > weights[0]])
+    levels = (weights[0] + np.cumsum(heavier)) / np.arange(2, len(heavier) + 2)
+    enough = np.append(levels[:-1] >= heavier[1:], True)
+    level = levels[int(np.argmax(enough))] if len(heavier) else weights[0]
+    return np.concatenate([[level], np.minimum(weights[1:], level)])

@@ -1,6 +1,6 @@
 """Weights of the modes of an image, smoothed over the L images after it.
 
-They are those of forward filtering, backward smoothing (`smoothing.mode_chain`) in a window of the
+They are those of forward filtering, backward smoothing (`inference.mode_chain`) in a window of the
 image and the L after it. The evidence of an image for mode k, or for the way that it faces
 (`classes`), is a factor of w_k alone. So the lagged weights agree with the published ones, which
 are those of L = 0: they are the sum over all histories of the modes. Where a mode stands for
@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.smoothing.mode_chain import Link, backward_weights
+from hmt_ros.inference.mode_chain import Link, backward_weights
 
 
 class Lagged(NamedTuple):

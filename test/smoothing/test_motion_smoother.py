@@ -11,9 +11,10 @@ from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.inference.mode_chain import backward_weights
 from hmt_ros.smoothing import LinearGaussianDynamics, MotionSmoother, SlidingWindow
-from hmt_ros.smoothing.mode_chain import backward_weights
 from hmt_ros.smoothing.motion_smoother import Past
+from hmt_ros.smoothing.trajectory_mixture import led_by_first
 
 FAST = LinearGaussianDynamics.constant_velocity([2.0, 1.0], 0.8)
 UNEVEN = np.cumsum([0.0, 0.1, 0.05, 0.4, 0.1])
@@ -233,3 +234,71 @@ def test_stamps_that_do_not_increase_are_refused(modes, walk, chained):
     for stamps in ([0, 5, 5], [0, 5, 4]):
         with pytest.raises(ValueError, match='stamps must increase'):
             MotionSmoother(walk).smooth(chained(modes(1.0, times=3), stamps))
+
+
+def as_limbs(poses: np.ndarray) -> np.ndarray:
+    """One point a pose, at its first variable, m."""
+    return np.stack([poses[:, 0], 0.0 * poses[:, 0], 0.0 * poses[:, 0]], axis=1)[:, None]
+
+
+def jumping(chained, places, **kwargs):
+    """Images of one mode, at places (T,) of a walk along one variable, 30 a second."""
+    mixtures = [GaussianMixture([1.0], [[x]], [[[4e-4]]]) for x in places]
+    stamps = [round(1e9 * t / 30) for t in range(len(places))]
+    walk = LinearGaussianDynamics.random_walk([3e-3])
+    return MotionSmoother(walk, points=as_limbs, **kwargs).smooth(chained(mixtures, stamps))
+
+
+def test_states_begin_anew_where_the_chain_goes_over_to_another_pose(chained):
+    """Before it and after it they stay with the modes; a single image is passed over."""
+    found = jumping(chained, [0.0] * 8 + [0.8] * 8)
+    np.testing.assert_allclose(found.means[0, :, 0], [0.0] * 8 + [0.8] * 8, atol=0.01)
+    alone = jumping(chained, [0.0] * 8 + [0.8] + [0.0] * 7)
+    assert np.abs(alone.means[0, :, 0]).max() < 0.1
+
+
+def test_modes_that_are_opposite_are_no_one_gaussian(chained):
+    """A motion keeps its pose in an image where a third of its paths pass another, far away."""
+    mixtures, stamps = [], [round(1e9 * t / 30) for t in range(16)]
+    for t in range(16):
+        both = [[0.0], [0.8]] if t == 8 else [[0.0], [0.0]]
+        mixtures.append(GaussianMixture([0.7, 0.3], both, [[[1e-4]]] * 2))
+    walk = LinearGaussianDynamics.random_walk([0.3])
+    smoother = MotionSmoother(walk, points=as_limbs)
+    found = smoother.smooth(chained(mixtures, stamps, hops=0.5))
+    assert len(found) == 1
+    assert np.abs(found.means[0, :, 0]).max() < 0.05
+    assert found.disagreements[0, 8, 0, 0] < 1e-3
+    # The density of that image knows of it, and the motion leads all the same.
+    marginal = found.marginal(8)
+    assert marginal.means[1:, 0].tolist() == [0.8]
+    stray = backward_weights([x.link for x in chained(mixtures, stamps, hops=0.5)])[8][1]
+    assert marginal.weights[1] == pytest.approx(stray, abs=1e-12)
+    assert len(found.marginal(4)) == 1
+
+
+def test_motions_weigh_what_the_modes_near_them_do(chained):
+    """At every time, whatever the number of paths is that were drawn."""
+    mixtures = [GaussianMixture([0.55, 0.45], [[0.0], [0.4]], [[[1e-4]]] * 2)] * 16
+    stamps = [round(1e9 * t / 30) for t in range(16)]
+    images = chained(mixtures, stamps, hops=0.03)
+    walk = LinearGaussianDynamics.random_walk([0.3])
+    found = MotionSmoother(walk, points=as_limbs).smooth(images)
+    for t, wanted in enumerate(backward_weights([image.link for image in images])):
+        near = np.abs(found.means[:, t, 0, None] - [0.0, 0.4]).argmin(1)
+        weights = np.bincount(near, found.weights_in_time[t], minlength=2)
+        np.testing.assert_allclose(weights, wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('weights', 'wanted'),
+    [
+        ([0.5, 0.3, 0.2], [0.5, 0.3, 0.2]),
+        ([0.2, 0.6, 0.2], [0.4, 0.4, 0.2]),
+        ([0.1, 0.5, 0.4], [1 / 3, 1 / 3, 1 / 3]),
+        ([0.0, 1.0], [0.5, 0.5]),
+        ([1.0], [1.0]),
+    ],
+)
+def test_the_first_component_leads(weights, wanted):
+    np.testing.assert_allclose(led_by_first(np.array(weights)), wanted, atol=1e-12)

@@ -7,16 +7,16 @@ import itertools
 import numpy as np
 import pytest
 
-from hmt_ros.body import load_body
+from hmt_ros.body import load_body, resting_points
 from hmt_ros.body.ground_terms import sole_jacobians, sole_points
-from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing import LinearGaussianDynamics, MotionSmoother, resting_points
-from hmt_ros.smoothing.resting_points import (
+from hmt_ros.body.resting_points import (
     SLIP,
     RestingPoints,
     _smoothed_chain,
     rest_probabilities,
 )
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.smoothing import LinearGaussianDynamics, MotionSmoother
 
 DT = 1 / 30
 

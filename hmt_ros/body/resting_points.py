@@ -70,21 +70,22 @@ class RestingPoints:
         count, d = poses.shape
         points, jacobians = self.points(poses), self.jacobians(poses)
         rests = rest_probabilities(points, jacobians, covariances, intervals)
+        if not (rests >= LEAST).any():
+            return prior
+        weights = np.where(rests >= LEAST, rests, 0.0) / (SLIP * intervals[:, None])
+        weights = np.repeat(weights, 3, axis=1)[:, :, None]
+        each = jacobians.reshape(count, -1, d)
+        before, after = each[:-1], each[1:]
+        # p(x_{t+1}) - p(x_t) as a linear function of both poses.
+        places = points.reshape(count, -1, 1) - each @ poses[:, :, None]
+        rest = weights * (places[1:] - places[:-1])
         diagonal, lower = prior.precision.diagonal.copy(), prior.precision.lower.copy()
         information = prior.information.copy()
-        for t in range(count - 1):
-            some = np.flatnonzero(rests[t] >= LEAST)
-            before = jacobians[t, some].reshape(-1, d)
-            after = jacobians[t + 1, some].reshape(-1, d)
-            moved = (points[t + 1, some] - points[t, some]).reshape(-1)
-            # p(x_{t+1}) - p(x_t) as a linear function of both poses.
-            rest = moved - after @ poses[t + 1] + before @ poses[t]
-            weights = np.repeat(rests[t, some], 3) / (SLIP * intervals[t])
-            diagonal[t, :d, :d] += before.T @ (weights[:, None] * before)
-            diagonal[t + 1, :d, :d] += after.T @ (weights[:, None] * after)
-            lower[t, :d, :d] -= after.T @ (weights[:, None] * before)
-            information[t, :d] += before.T @ (weights * rest)
-            information[t + 1, :d] -= after.T @ (weights * rest)
+        diagonal[:-1, :d, :d] += before.swapaxes(1, 2) @ (weights * before)
+        diagonal[1:, :d, :d] += after.swapaxes(1, 2) @ (weights * after)
+        lower[:, :d, :d] -= after.swapaxes(1, 2) @ (weights * before)
+        information[:-1, :d] += (before.swapaxes(1, 2) @ rest)[:, :, 0]
+        information[1:, :d] -= (after.swapaxes(1, 2) @ rest)[:, :, 0]
         return replace(prior, precision=BlockTridiagonal(diagonal, lower), information=information)
 
 

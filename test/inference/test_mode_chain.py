@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
+from hmt_ros.inference.mode_chain import reachable_origins
 from hmt_ros.smoothing import Link, backward_weights, drawn_paths
-from hmt_ros.smoothing.mode_chain import reachable_origins
 
 COUNTS = (3, 4, 2, 5, 3)
 
