@@ -79,11 +79,18 @@ def refined_on_images(
         tolerance=TOLERANCE,
     )
     optima = optima[np.argsort(optima.energies, kind='stable')]
-    came = motions.weights[chosen][optima.starts]
-    kept, weights = _first_of_each(smoother, motions, optima.states, came, 0.0)
-    optima, total = optima[kept], float(weights.sum())
+    origin = chosen[optima.starts]
+    kept, labels = _first_of_each(smoother, motions, optima.states, motions.weights[origin], 0.0)
+    optima, others = optima[kept], np.setdiff1d(np.arange(len(motions)), chosen)
+    # Which component each motion has become.
+    count = len(kept)
+    into = np.zeros((len(motions), count + len(others)))
+    into[origin, labels] = 1.0
+    into[others, count + np.arange(len(others))] = 1.0
+    weights = motions.weights @ into
+    total = float(weights[:count].sum())
     fitted = minimise_free_energy(
-        weights / total,
+        weights[:count] / total,
         optima.states,
         optima.factors,
         prior,
@@ -95,8 +102,8 @@ def refined_on_images(
         seed=smoother.seed,
         max_iterations=ITERATIONS,
     )
-    others = np.setdiff1d(np.arange(len(motions)), chosen)
-    weights = np.concatenate([total * fitted.weights, motions.weights[others]])
+    into[:, :count] *= total * fitted.weights / weights[:count]
+    weights = motions.weights @ into
     result = trajectory_mixture(
         weights,
         np.concatenate([optima.states, motions.states[others]]),
@@ -107,13 +114,16 @@ def refined_on_images(
         motions.stamps_ns,
         *low_high,
     )
-    which = np.concatenate([chosen[optima.starts], others])[np.argsort(-weights, kind='stable')]
+    order = np.argsort(-weights, kind='stable')
+    which = np.concatenate([origin[kept], others])[order]
+    in_time, apart = motions.weights_in_time, motions.disagreements
     return replace(
         result,
         free_energy=fitted.free_energy,
         free_energy_fresh=fitted.fresh,
         strays=motions.strays,
-        disagreements=None if motions.disagreements is None else motions.disagreements[which],
+        weights_in_time=None if in_time is None else in_time @ into[:, order],
+        disagreements=None if apart is None else apart[which],
     )
 
 
@@ -123,12 +133,11 @@ def _first_of_each(
     states: Array,
     weights: Array,
     least: float,
-) -> tuple[Index, Array]:
-    """The first of states (N, T, n) that are one motion, for each motion, and the weight of all."""
+) -> tuple[Index, Index]:
+    """The first of states (N, T, n) that are one motion, for each motion; and the motion (N,)."""
     assert motions.stamps_ns is not None
     points = smoother.points_of(states[:, :, : motions.dimension]).swapaxes(0, 1)
     nodes = np.broadcast_to(np.arange(len(states))[:, None], states.shape[:2])
     distances = path_distances(nodes, list(points), motions.stamps_ns)
     labels = grouped(weights, *distances, MOST, least)
-    first = np.unique(labels, return_index=True)[1]
-    return first, np.bincount(labels, weights).astype(np.float64)
+    return np.unique(labels, return_index=True)[1], labels

@@ -9,7 +9,7 @@ velocities, they are integrated out of everything that is returned.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
