@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, NoReturn
 from hmt_ros.inference.arrays import Image
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic, opens_with_header
 from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.seen_images import SeenImages
 from hmt_ros.sessions.session import Session, kind_of
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import deserialise
@@ -238,12 +239,14 @@ class EstimatingThreads:
     Attributes:
         poses: for what leads to the pose.
         later: for what can wait for it.
+        seen_images: that the filter keeps for the smoother.
     """
 
     def __init__(self) -> None:
         changed = threading.Condition()
         self.poses = EstimatingThread(changed)
         self.later = EstimatingThread(changed, after=self.poses)
+        self.seen_images = SeenImages()
         self._pictures: deque[tuple[Any, Image]] = deque(maxlen=SHARED)
 
     def decode(self, message: Any) -> Image:

@@ -222,6 +222,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             read_installed_messages(msgtype, needed_by)
         session: AnySession = self.SESSION(settings, *functions)
         session.decode_image = self._threads.decode
+        session.share(self._threads.seen_images)
         return session
 
     def _answer(self, response: Any, field: str, make: Callable[[AnySession], Any]) -> Any:

@@ -40,7 +40,8 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
     ) -> Any:
         # Mixtures that come meanwhile wait, in the middleware or in the queue.
         def smooth(session: SmootherSession) -> Any:
-            return session.smooth_span(time_ns(request.from_time), time_ns(request.to_time))
+            span = time_ns(request.from_time), time_ns(request.to_time)
+            return session.smooth_span(*span, self.get_logger().info)
 
         return self._answer(response, 'trajectories', smooth)
 

@@ -24,6 +24,7 @@ from scipy.special import entr
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.declared_parameters import NodeParameters
 from hmt_ros.sessions.handled import Handled, HandlingLog, Output
+from hmt_ros.sessions.seen_images import SeenImages
 from hmt_ros.sessions.stamp_order import Stamped, StampOrder, Turn
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.messages.headers import SECOND_NS, time_ns
@@ -182,6 +183,9 @@ class Session(ABC, Generic[Parameters, State]):
 
     def _set_up(self) -> None:
         """Makes the state of a kind of session; raises ValueError as the class does."""
+
+    def share(self, images: SeenImages) -> None:
+        """Takes the store of images of its process, before the first message."""
 
     def prepare(self) -> None:
         """Compiles, or loads, the code for messages; nothing is estimated or published.

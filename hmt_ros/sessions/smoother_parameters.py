@@ -8,8 +8,12 @@ from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_WINDOW,
     NodeParameters,
+    check_choices,
     parameter_field,
 )
+
+# When motions are refined on images.
+NEVER, ASKED, AT_END = REFINEMENTS = ('never', 'asked', 'end')
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,11 @@ class SmootherParameters(NodeParameters):
         fixed_lag: Time by which a smoothed pose is older than the newest image, s, at any rate of
             images. It may be a fifth more; 0 is filtering.
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
+        refine_on_images: When up to four distinct motions of the last window_length mixtures are
+            refined on the images themselves, 'never', 'asked' (in the answers of ~/smooth_window)
+            or 'end' (at the end of the stream as well, which then publishes them on
+            trajectory_mixture). It takes seconds, and 256 MB at most. The filter must be in the
+            same process (person_node, replay) and publish in the frame of the camera.
         max_hypotheses: Maximum number of motions, the components of both mixtures.
         resting_feet: If true, feet that rest do not slide between images. The frame of the mixtures
             must then stand still (a still camera, or publish_in_fixed_frame of the filter).
@@ -37,6 +46,7 @@ class SmootherParameters(NodeParameters):
     body_model: str = parameter_field('', NEXT_WINDOW)
     fixed_lag: float = parameter_field(0.5, NEXT_WINDOW, (0.0, 3600.0))
     window_length: int = parameter_field(47, AT_ONCE, (1, 10_000))
+    refine_on_images: str = parameter_field(ASKED, AT_ONCE)
     max_hypotheses: int = parameter_field(8, NEXT_WINDOW, (1, 1024))
     resting_feet: bool = parameter_field(True, NEXT_WINDOW)
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
@@ -44,3 +54,6 @@ class SmootherParameters(NodeParameters):
     publish_tf: bool = parameter_field(False, AT_ONCE)
     frame_prefix: str = parameter_field('smoothed/', AT_ONCE)
     queue_size: int = parameter_field(100, AT_ONCE, (1, 1000))
+
+    def __post_init__(self) -> None:
+        check_choices(self, refine_on_images=REFINEMENTS)

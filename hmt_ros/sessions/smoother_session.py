@@ -29,7 +29,7 @@ The rules, besides those of `Session`:
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -39,10 +39,12 @@ from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.body.mirror import clear_level, free_limits, relevelled, without_turns
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.body.resting_points import RestingPoints
+from hmt_ros.image.image_sequence import ImageSequence
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.image_evidence import Evidence, KeptMixtures, continued, evidence_of
 from hmt_ros.sessions.named_file import named_file, public_line
+from hmt_ros.sessions.seen_images import SeenImages
 from hmt_ros.sessions.session import Session, SessionState
 from hmt_ros.sessions.smoothed_messages import (
     TOPICS,
@@ -53,10 +55,12 @@ from hmt_ros.sessions.smoothed_messages import (
     trajectory_content,
     window_messages,
 )
-from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.smoother_parameters import AT_END, NEVER, SmootherParameters
 from hmt_ros.sessions.track import resembles
 from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MotionSmoother, SlidingWindow, TrajectoryMixture
+from hmt_ros.smoothing.image_refinement import refined_on_images
+from hmt_ros.smoothing.likelihood import MixtureLikelihood
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
@@ -68,7 +72,7 @@ from msg_tools.messages.pose_mixtures import (
 )
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
-MIXTURE = 'likelihood_mixture'
+MIXTURE, TRAJECTORIES = 'likelihood_mixture', 'trajectory_mixture'
 NOBODY = 'nobody'  # status while nobody is in view
 # Change of a length from one mixture to the next above which it is another person's, m.
 SAME_PERSON = 0.02
@@ -116,6 +120,10 @@ class SmootherState(SessionState):
         ]
 
 
+def untold(text: str) -> None:
+    """Nobody is told."""
+
+
 class SmootherSession(Session[SmootherParameters, SmootherState]):
     """Smooths the poses of one person; see `Session` for arguments and attributes.
 
@@ -139,6 +147,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._resolved: tuple[Any, SmoothedBody] | None = None
         self._gaps, self._longest_gap = 0, 0.0
         self._first_identity = 1
+        self._images = SeenImages()
         self.restart()
 
     def prepare(self) -> None:
@@ -147,13 +156,31 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         for message in likelihoods(load_body(self.parameters.body_model or 'human37')):
             other.take(MIXTURE, message)
         other.smooth_span()
+        of, items = other.kept
+        assert of is not None
+        # The kernels of refinement; those of images are the filter's.
+        smoother, modes = other._smoother(of.body), [one.modes for one in items]
+        mixtures = MixtureLikelihood.of([one.mixture for one in modes])
+        refined_on_images(smoother, smoother.motions(modes), mixtures)
         other.finish()
+
+    def share(self, images: SeenImages) -> None:
+        """See `Session`."""
+        self._images = images
+        self._want_images()
+
+    def _want_images(self) -> None:
+        p = self.parameters
+        self._images.wanted = 0 if p.refine_on_images == NEVER else p.window_length
 
     # Inputs.
 
     def _end(self) -> int:
         """Publishes the poses that are still open; the next mixture begins a new window."""
         stamp = self._newest or 0
+        asked = self.parameters.refine_on_images == AT_END and self._wanted(TRAJECTORIES)
+        if asked and self.kept.items:
+            self._publish(TRAJECTORIES, stamp, self.smooth_span(tell=self._log.tell))
         self._end_window()
         self._orders.clear()
         return stamp
@@ -198,6 +225,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 'mixture before that are within reach',
             )
         self._begin_track(of)
+        self._want_images()
         evidence = self._chained(_levelled(evidence, of.body), content, of.body)
         p = self.parameters
         if self._newest is not None:
@@ -349,13 +377,16 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         ):
             self._publish(topic, pose.stamp_ns, made)
 
-    def smooth_span(self, from_ns: int = 0, to_ns: int = 0) -> Any:
+    def smooth_span(
+        self, from_ns: int = 0, to_ns: int = 0, tell: Callable[[str], None] = untold
+    ) -> Any:
         """Smooths the kept mixtures of a span of time, all at once.
 
         May be called by any thread, at any time.
 
         Args:
             from_ns, to_ns: first and last stamp, inclusive; 0: the oldest, the newest.
+            tell: is told whether images have refined the motions, and why not.
 
         Returns:
             hmt_msgs/TrajectoryMixture with covariances.
@@ -363,13 +394,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         Raises:
             ValueError: there is none in the span, or they can not be smoothed.
         """
-        found, of = self.smoothed_span(from_ns, to_ns)
+        found, of = self.smoothed_span(from_ns, to_ns, tell)
         shapes = _shapes((one.modes.stamp_ns, one.shape) for one in self.kept.items)
         content = trajectory_content(found, of, covariances=True, shapes=shapes)
         return trajectory_mixture_message(self._messages, content)
 
     def smoothed_span(
-        self, from_ns: int = 0, to_ns: int = 0
+        self, from_ns: int = 0, to_ns: int = 0, tell: Callable[[str], None] = untold
     ) -> tuple[TrajectoryMixture, SmoothedBody]:
         """The trajectories of a span of time, and their person; see `smooth_span`."""
         of, items = self.kept
@@ -384,7 +415,23 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 first, last = (items[i].modes.stamp_ns for i in (0, -1))
                 kept = f'those from {first} to {last} ns are kept'
             raise ValueError(f'no mixture from {from_ns} to {to_ns} ns: {kept}')
-        return self._smoother(of.body).smooth(chosen), of
+        smoother = self._smoother(of.body)
+        found = smoother.motions(chosen)
+        if self.parameters.refine_on_images == NEVER:
+            tell('smoothed without images, as refine_on_images says')
+            return found.trajectories, of
+        stamps = [modes.stamp_ns for modes in chosen]
+        images = [one.levelled(of.body.level) for one in self._images.of(stamps) if one is not None]
+        if len(images) < len(stamps):
+            tell(
+                f'smoothed without images: {len(stamps) - len(images)} of {len(stamps)} are not '
+                'kept, as the filter runs in another process or publishes in fixed_frame, or as '
+                f'they take more than {self._images.most_mb:g} MB'
+            )
+            return found.trajectories, of
+        tell(f'motions are refined on {len(images)} images')
+        sequence = ImageSequence.of(images, stamps, of_changes=True)
+        return refined_on_images(smoother, found, sequence), of
 
     # State.
 

@@ -27,6 +27,7 @@ from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.focal_length import with_depth_error
 from hmt_ros.sessions.handled import HandlingLog, Output
 from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
+from hmt_ros.sessions.seen_images import SeenImages
 from hmt_ros.sessions.track_messages import (
     TOPICS_OF_NODE,
     TrackedImage,
@@ -76,6 +77,7 @@ class Shared:
         answering: held while outputs for robots are made: those of the watchdog never follow the
             answer to a newer image.
         answered: number of answers to images that went to robots.
+        seen_images: of the only person, in the frame of the camera, for a smoother.
     """
 
     frames: CameraFrames
@@ -84,6 +86,7 @@ class Shared:
     wanted: Callable[[str], bool]
     answering: threading.Lock = field(default_factory=threading.Lock)
     answered: int = 0
+    seen_images: SeenImages = field(default_factory=SeenImages)
 
 
 class Seen(NamedTuple):
@@ -193,6 +196,9 @@ class Track:
                     'to the colour camera',
                 )
             published = None
+            kept = self._shared.seen_images
+            if kept.wanted and not (self.person or parameters.publish_in_fixed_frame):
+                kept.add(stamp, tracker.estimate.shown)
             if posterior is not None and likelihood is not None:
                 posterior = with_depth_error(posterior, parameters.focal_length_sigma)
                 published = self._publish(tracker, waiting, posterior, likelihood)

@@ -35,6 +35,7 @@ from hmt_ros.sessions.image_inputs import (
 )
 from hmt_ros.sessions.keypoint_inputs import KeypointReader, keypoints_input
 from hmt_ros.sessions.named_file import public_line
+from hmt_ros.sessions.seen_images import SeenImages
 from hmt_ros.sessions.session import PublishedTopic, SessionState
 from hmt_ros.sessions.track import Seen, Shared, Track
 from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
@@ -137,6 +138,10 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
     def prepare(self) -> None:
         """See `Session`."""
         warm_up_tracking()
+
+    def share(self, images: SeenImages) -> None:
+        """See `Session`."""
+        self._shared.seen_images = images
 
     @property
     def answered(self) -> int:

@@ -182,43 +182,6 @@ def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
     return Paths(nodes, values[order])
 
 
-def paths_through_nodes(network: EmbeddedNetwork) -> Paths:
-    """For every node at every time the best path through it; without repetitions, best first.
-
-    The paths between ends agree in the middle of a long sequence: they show the probable
-    trajectories, but not the alternatives of a single pose.
-    """
-    forward, ahead = [network.nodes[0]], []
-    for links, nodes in zip(network.links, network.nodes[1:]):
-        each = forward[-1][:, None] + links
-        ahead.append(each.argmax(0))
-        forward.append(each.max(0) + nodes)
-    backward, behind = [np.zeros(len(network.nodes[-1]))], []
-    for links, nodes in zip(network.links[::-1], network.nodes[:0:-1]):
-        each = links + nodes + backward[-1]
-        behind.append(each.argmax(1))
-        backward.append(each.max(1))
-    backward, behind = backward[::-1], behind[::-1]
-    found, values = [], []
-    for t, (before, after) in enumerate(zip(forward, backward)):
-        paths = np.empty((len(before), network.times), dtype=np.intp)
-        paths[:, t] = np.arange(len(before))
-        for u in range(t, 0, -1):
-            paths[:, u - 1] = ahead[u - 1][paths[:, u]]
-        for u in range(t, network.times - 1):
-            paths[:, u + 1] = behind[u][paths[:, u]]
-        found.append(paths)
-        values.append(before + after)
-    return distinct_paths(Paths(np.concatenate(found), np.concatenate(values)))
-
-
-def distinct_paths(paths: Paths) -> Paths:
-    """Without repetitions, the best first."""
-    _, first = np.unique(paths.nodes, axis=0, return_index=True)
-    first = first[np.isfinite(paths.log_values[first])]
-    return paths[first[np.argsort(-paths.log_values[first], kind='stable')]]
-
-
 def diverse_subset(paths: Paths, count: int, penalty: float = 2.0) -> Paths:
     """Paths that are probable and differ from each other, in the order of choice.
 

@@ -50,8 +50,6 @@ class MixtureSmoother:
         max_trajectories: components of the result at most.
         adapt: variables of the descent of the free energy, some of `ADAPTABLE`; empty: no descent.
         max_iterations: of the descent of the free energy.
-        through_modes: whether, besides the best paths between the ends, those through every single
-            mode are starts: more alternatives for each pose, fewer for the whole motion.
 
     Raises:
         ValueError: settings out of range.
@@ -63,7 +61,6 @@ class MixtureSmoother:
     max_trajectories: int = 64
     adapt: Sequence[str] = ADAPTABLE
     max_iterations: int = 15
-    through_modes: bool = False
 
     def __post_init__(self) -> None:
         if self.max_trajectories < 1:
@@ -125,7 +122,7 @@ class MixtureSmoother:
 
     def paths(self, sequence: ModeSequence) -> Paths:
         """The paths that trajectories start from."""
-        return sequence.paths(self.max_trajectories, through_modes=self.through_modes)
+        return sequence.paths(self.max_trajectories)
 
     def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> TrajectoryGaussians:
         """Distinct optima, found from the paths, and paths beside them if they are few."""
@@ -228,7 +225,7 @@ class MixtureSmoother:
         """The mixture that is closest to the posterior, from the candidates on."""
         iterations = self.max_iterations if self.adapt else 0
         found = self._descended(candidates, prior, likelihood, seed, iterations)
-        result = self._mixture(
+        result = trajectory_mixture(
             found.weights,
             found.states,
             candidates.factors,
@@ -236,41 +233,9 @@ class MixtureSmoother:
             prior,
             likelihood,
             stamps_ns,
+            *self._limits(),
         )
         return replace(result, free_energy=found.free_energy, free_energy_fresh=found.fresh)
-
-    def _mixture(
-        self,
-        weights: Array,
-        states: Array,
-        factors: Sequence[BlockCholesky],
-        inflation: Array,
-        prior: TrajectoryPrior,
-        likelihood: SequenceLikelihood,
-        stamps_ns: Sequence[int] | None,
-    ) -> TrajectoryMixture:
-        """The components, heaviest first, with their log joint densities."""
-        low, high = self._limits()
-        order = np.argsort(-weights, kind='stable')
-        states = states[order]
-        count, times, _ = states.shape
-        energies, _ = prior.energy(states)
-        at = np.tile(np.arange(times), count)
-        poses = states[:, :, : prior.dimension].reshape(-1, prior.dimension)
-        seen = likelihood.energy(poses, at, derivatives=Derivatives.NONE).value
-        d = self.dynamics.dimension
-        return TrajectoryMixture(
-            weights=weights[order],
-            states=states,
-            factors=tuple(factors[i] for i in order),
-            inflation=inflation[order],
-            log_joint=-(energies + seen.reshape(count, times).sum(1)),
-            free_energy=np.empty(0),
-            dimension=d,
-            stamps_ns=None if stamps_ns is None else tuple(int(stamp) for stamp in stamps_ns),
-            lower=low[:d],
-            upper=high[:d],
-        )
 
     def _limits(self) -> tuple[Array, Array]:
         return limits_of_states(
@@ -279,6 +244,45 @@ class MixtureSmoother:
             self.dynamics.dimension,
             self.dynamics.state_dimension,
         )
+
+
+def trajectory_mixture(
+    weights: Array,
+    states: Array,
+    factors: Sequence[BlockCholesky],
+    inflation: Array,
+    prior: TrajectoryPrior,
+    likelihood: SequenceLikelihood,
+    stamps_ns: Sequence[int] | None,
+    low: Array,
+    high: Array,
+) -> TrajectoryMixture:
+    """The components, heaviest first, with their log joint densities.
+
+    Args:
+        weights, states, factors, inflation, stamps_ns: as for `TrajectoryMixture`.
+        prior, likelihood: of the states, and of the poses.
+        low, high: (n,) limits of the states.
+    """
+    order = np.argsort(-weights, kind='stable')
+    states = states[order]
+    count, times, _ = states.shape
+    energies, _ = prior.energy(states)
+    at = np.tile(np.arange(times), count)
+    d = prior.dimension
+    seen = likelihood.energy(states[:, :, :d].reshape(-1, d), at, derivatives=Derivatives.NONE)
+    return TrajectoryMixture(
+        weights=weights[order],
+        states=states,
+        factors=tuple(factors[i] for i in order),
+        inflation=inflation[order],
+        log_joint=-(energies + seen.value.reshape(count, times).sum(1)),
+        free_energy=np.empty(0),
+        dimension=d,
+        stamps_ns=None if stamps_ns is None else tuple(int(stamp) for stamp in stamps_ns),
+        lower=low[:d],
+        upper=high[:d],
+    )
 
 
 def with_refined_parts(

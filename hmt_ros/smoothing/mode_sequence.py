@@ -35,11 +35,9 @@ from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing.embedded_network import (
     EmbeddedNetwork,
     Paths,
-    distinct_paths,
     diverse_subset,
     embedded_network,
     k_best_paths,
-    paths_through_nodes,
 )
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
 
@@ -76,24 +74,14 @@ class ModeSequence:
         """The embedded network."""
         return embedded_network(self.mixtures, self.dynamics, self.intervals)
 
-    def paths(self, count: int, *, through_modes: bool = False) -> Paths:
+    def paths(self, count: int) -> Paths:
         """At most `count` paths that are probable and differ from each other.
 
-        The best of each pair of ends; where that makes less, further ones of the same pairs. With
-        `through_modes` the best path through every single mode is a candidate too.
+        The best of each pair of ends; where that makes less, further ones of the same pairs.
         """
         pairs = len(self.network.nodes[0]) * len(self.network.nodes[-1])
         per_pair = 1 if pairs >= count else -(-CANDIDATES * count // pairs)
-        found = k_best_paths(self.network, per_pair)
-        if through_modes:
-            more = paths_through_nodes(self.network)
-            found = distinct_paths(
-                Paths(
-                    np.concatenate([found.nodes, more.nodes]),
-                    np.concatenate([found.log_values, more.log_values]),
-                )
-            )
-        return diverse_subset(found, count)
+        return diverse_subset(k_best_paths(self.network, per_pair), count)
 
     def states(self, paths: Paths) -> Array:
         """States (P, T, n) along the modes of paths; velocities are differences of neighbours."""

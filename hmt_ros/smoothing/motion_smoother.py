@@ -234,6 +234,10 @@ class MotionSmoother:
         return WindowImage(modes, counted, points, modes.errors.lasting(dt), alone)
 
     def smooth(self, sequence: Sequence[ImageModes]) -> TrajectoryMixture:
+        """The trajectories of a whole sequence; see `motions`."""
+        return self.motions(sequence).trajectories
+
+    def motions(self, sequence: Sequence[ImageModes]) -> SmoothedMotions:
         """The motions of a whole sequence.
 
         Raises:
@@ -243,7 +247,7 @@ class MotionSmoother:
             raise ValueError('no images to smooth')
         stamps = [None, *(modes.stamp_ns for modes in sequence)]
         images = [self.image(modes, before) for modes, before in zip(sequence, stamps)]
-        return self.smoothed(images).trajectories
+        return self.smoothed(images)
 
     def smoothed(self, images: Sequence[WindowImage], past: Past | None = None) -> SmoothedMotions:
         """The motions of the images of a window."""

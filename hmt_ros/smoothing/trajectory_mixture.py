@@ -90,10 +90,6 @@ class TrajectoryMixture:
     def __len__(self) -> int:
         return len(self.weights)
 
-    def widened(self, factor: float) -> TrajectoryMixture:
-        """The same with covariances that are a factor as large."""
-        return replace(self, inflation=np.sqrt(factor) * self.inflation)
-
     @property
     def times(self) -> int:
         """T."""

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hmt_ros.body.body import Body
+from hmt_ros.image.image_sequence import SeenImage
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS, seconds
 from hmt_ros.inference.markov_chain import MarkovChain
@@ -133,6 +134,7 @@ class Estimate:
         published: the modes of the posterior: limbs that no image shows are as people hold them.
         point_estimate: (d,) the pose of the likeliest motion; empty without a track.
         likelihood: of the last image that was tracked.
+        shown: what the last image shows, as far as it is believed; None: nothing of the person.
         foreseen: whether the last image showed nothing of the person: a prediction is published.
         misfit: share of the last image that no mode explains.
         evaluations: number of evaluations of the likelihood in the last image.
@@ -162,6 +164,7 @@ class Estimate:
     published: Modes
     point_estimate: Array
     likelihood: Likelihood
+    shown: SeenImage | None
     foreseen: bool
     misfit: float
     evaluations: int

@@ -24,6 +24,7 @@ from hmt_ros.body.mirror import relevelled
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.experts.lifter import KeypointHistory, lifted_positions, load_lifter
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.image_sequence import SeenImage
 from hmt_ros.image.lifted_poses import pooled
 from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.sampling import ImageMap
@@ -478,8 +479,11 @@ class Tracker:
             observation: that the modes were fitted to; None: they were not.
         """
         state, track = self._state, self._track
-        before, modes = state.stamp, track.modes
+        before, modes, posterior = state.stamp, track.modes, track.posterior
         state.stamp, foreseen = stamp, state.begun and observation is None
+        shown = None
+        if observation is not None:
+            shown = SeenImage(posterior.likelihood, observation, posterior.known)
         if foreseen:
             track.point.expect(track.person, track.dynamics, state.age(stamp))
             observation = Observation()
@@ -487,15 +491,15 @@ class Tracker:
             modes = replace(modes, origins=np.eye(len(modes)))
         if observation is not None:
             self._likelihood = likelihood_modes(
-                modes, track.posterior, observation, track.shape, (before, self._likelihood)
+                modes, posterior, observation, track.shape, (before, self._likelihood)
             )
-        self.estimate = self._estimate(foreseen=foreseen)
+        self.estimate = self._estimate(shown, foreseen=foreseen)
         if observation is None:
             return None, None
         expected = self.estimate.forecaster.at(stamp) if foreseen else self.estimate.posterior
         return expected, self._likelihood.mixture
 
-    def _estimate(self, *, foreseen: bool = False) -> Estimate:
+    def _estimate(self, shown: SeenImage | None = None, *, foreseen: bool = False) -> Estimate:
         state, track, ground, pose = self._state, self._track, self._ground, self._track.point.pose
         return Estimate(
             status=state.status,
@@ -508,6 +512,7 @@ class Tracker:
             published=track.published,
             point_estimate=np.empty(0) if pose is None else pose,
             likelihood=self._likelihood,
+            shown=shown,
             foreseen=foreseen,
             misfit=track.misfit,
             evaluations=sum(track.spent),

@@ -38,6 +38,7 @@ class StubTracker:
     made: list[StubTracker] = []  # noqa: RUF012
     empty: set[int] = set()  # noqa: RUF012  # stamps of images without a person
     fault: Exception | None = None
+    shown: Any = None
 
     def __init__(
         self, body, camera, settings=None, background=None, seed=0, known_ground=None,

@@ -1,8 +1,8 @@
-"""The images themselves as observations: keypoints of a walking person, smoothed."""
+"""The images themselves as observations: energies as the filter has them, and a walk smoothed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,56 +10,110 @@ import pytest
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import Camera, load_body
+from hmt_ros.image.image_sequence import ImageSequence, SeenImage
 from hmt_ros.image.likelihood import ImageLikelihood
-from hmt_ros.image.observation import Observation
-from hmt_ros.image.pose_energy import PoseEnergy
+from hmt_ros.image.observation import Beliefs, Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.energy import Derivatives, Energy
+from hmt_ros.inference.energy import Derivatives
+from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
+from hmt_ros.tracking import TrackerSettings
+from hmt_ros.tracking.ground import GroundEstimator, KnownGround
+from hmt_ros.tracking.posterior import Posterior
 
 NAMES = ('pelvis', 'neck', 'left_knee', 'right_knee', 'left_ankle', 'right_ankle', 'left_elbow',
          'right_elbow', 'left_wrist', 'right_wrist')  # fmt: skip
-
-
-@dataclass(frozen=True)
-class ImageSequence:
-    """p(r_t | x_t) of the images themselves, the likelihood that the tracker minimises (VMS 5)."""
-
-    likelihood: ImageLikelihood
-    observations: list[Observation]
-
-    @property
-    def times(self) -> int:
-        return len(self.observations)
-
-    def energy(self, x, rows, *, derivatives=Derivatives.POSITIVE) -> Energy:
-        n, d = x.shape
-        value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
-        for t in np.unique(rows):
-            at = rows == t
-            terms = (*self.likelihood.seen(self.observations[t]), *self.likelihood.priors)
-            found = PoseEnergy(self.likelihood, terms).energy(x[at])
-            value[at], gradient[at], hessian[at] = found
-        return Energy(value, gradient, hessian)
+STAMPS = tuple(100_000_000 * t for t in range(5))
+CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
 
 
 @pytest.fixture(scope='module')
 def walk():
     """Poses (5, d), their body, and the images as keypoints with noise of 2 px."""
     body = load_body('human37')
-    camera = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
     poses = procedural_motion('walk', body, 0.8, 10.0, 3, viewpoint=Viewpoint(distance=3.2))[:5]
     rng = np.random.default_rng(0)
     at = [body.joint_names.index(name) for name in NAMES]
     observations = []
     for joints in body.joint_positions(poses):
-        pixels = camera.project(joints[at]) + 2.0 * rng.normal(size=(len(at), 2))
+        pixels = CAMERA.project(joints[at]) + 2.0 * rng.normal(size=(len(at), 2))
         covariances = np.tile(4.0 * np.eye(2), (len(at), 1, 1))
         observations.append(
             Observation(keypoints=Keypoints(NAMES, pixels, covariances, np.ones(len(at))))
         )
-    return body, ImageSequence(ImageLikelihood(body, camera), observations), poses
+    likelihood = ImageLikelihood(body, CAMERA)
+    images = [SeenImage(likelihood, one) for one in observations]
+    return body, ImageSequence.of(images, STAMPS), poses
+
+
+@pytest.fixture(scope='module')
+def believed(walk):
+    """A filter's energies, and the images with silhouettes and beliefs, before a known floor."""
+    body, sequence, poses = walk
+    ground = GroundEstimator(KnownGround(np.array([0.0, -1.0, 0.0]), 1.1))
+    posterior = Posterior(body, CAMERA, TrackerSettings(), ground=ground)
+    rng = np.random.default_rng(2)
+    images = []
+    for pose, image in zip(poses, sequence.images):
+        left, top = CAMERA.project(body.joint_positions(pose[None])[0]).min(0).astype(int)
+        right, bottom = CAMERA.project(body.joint_positions(pose[None])[0]).max(0).astype(int)
+        mask = np.zeros((240, 320), dtype=bool)
+        mask[max(top, 0) : bottom, max(left, 0) : right] = True
+        picture = rng.integers(0, 255, (240, 320, 3), dtype=np.uint8)
+        seen = observe(picture, mask, image.observation.keypoints)
+        beliefs = Beliefs(0.7, np.array([0.9, 0.6, 0.8]), 0.5)
+        seen = replace(seen, beliefs=beliefs, magnification=100.0)
+        images.append(SeenImage(posterior.likelihood, seen, posterior.known))
+    return posterior, images
+
+
+def test_energies_are_those_by_which_the_filter_weighs(walk, believed):
+    _, _, poses = walk
+    posterior, images = believed
+    sequence = ImageSequence.of(images, STAMPS)
+    nearby = poses + 0.02 * np.random.default_rng(3).normal(size=poses.shape)
+    both, rows = np.concatenate([poses, nearby]), np.tile(np.arange(5), 2)
+    found = sequence.energy(both, rows, derivatives=Derivatives.NONE)
+    assert found.gradient is None
+    wanted = []
+    for pose, t in zip(both, rows):
+        unknown = np.full((1, 4), np.nan)
+        dt = np.inf if t == 0 else 0.1
+        wanted.append(posterior.evidence(pose[None], images[t].observation, unknown, dt)[0])
+    np.testing.assert_allclose(found.value, wanted, rtol=1e-12)
+    assert np.ptp(found.value[rows > 0]) > 0.1
+
+
+def test_derivatives_are_those_of_the_energy(walk, believed):
+    # Of keypoints and priors: the points of a contour slide along the flesh as the pose changes.
+    body, sequence, poses = walk
+    images = [replace(one, known=believed[0].known) for one in sequence.images]
+    sequence = ImageSequence.of(images, STAMPS)
+    rng = np.random.default_rng(4)
+    x = np.clip(poses[1:3] + 0.05 * rng.normal(size=(2, body.dimension)), body.lower, body.upper)
+    rows = np.array([1, 2])
+    _, gradient, hessian = sequence.energy(x, rows, derivatives=Derivatives.EXACT)
+    step = 1e-6
+    for _ in range(6):
+        way = rng.normal(size=body.dimension)
+        ahead, behind = (sequence.energy(x + s * step * way, rows).value for s in (1.0, -1.0))
+        np.testing.assert_allclose(
+            (ahead - behind) / (2.0 * step), gradient @ way, rtol=2e-3, atol=1e-2
+        )
+    positive = sequence.energy(x, rows).hessian
+    assert (np.linalg.eigvalsh(positive) > -1e-6 * np.abs(positive).max()).all()
+    assert hessian.shape == positive.shape
+
+
+def test_of_changes_images_count_more_and_all_else_as_before(walk):
+    _, sequence, _ = walk
+    changes = ImageSequence.of(sequence.images, STAMPS, of_changes=True)
+    for t, (share, of_changes) in enumerate(zip(sequence.shares, changes.shares)):
+        for name, errors in ERRORS.items():
+            lasting = errors.lasting(0.1 if t else np.inf) if name == 'image' else 1.0
+            assert of_changes[name] == pytest.approx(lasting * share[name])
+    assert changes.shares[1]['image'] > sequence.shares[1]['image']
 
 
 def test_smoothing_on_images_explains_them_better_and_within_limits(walk):

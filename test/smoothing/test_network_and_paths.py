@@ -15,7 +15,6 @@ from hmt_ros.smoothing.embedded_network import (
     diverse_subset,
     embedded_network,
     k_best_paths,
-    paths_through_nodes,
 )
 
 INTERVALS = np.array([0.5, 1.0, 0.5, 1.0])
@@ -116,18 +115,3 @@ def test_merging_keeps_the_moments_and_leaves_no_close_pair(modes):
             offset = found.means[i] - found.means[j]
             middle = 0.5 * (found.covariances[i] + found.covariances[j])
             assert offset @ np.linalg.solve(middle, offset) >= 4.0
-
-
-def test_paths_through_every_node_are_the_best_that_visit_it(modes, walk):
-    network = embedded_network(modes(2.0, times=4), walk, np.ones(3))
-    every = list(itertools.product(range(3), repeat=4))
-    values = np.array([log_value(network, np.array(path)) for path in every])
-    found = paths_through_nodes(network)
-    assert len(np.unique(found.nodes, axis=0)) == len(found)
-    np.testing.assert_allclose(
-        found.log_values, [log_value(network, path) for path in found.nodes], rtol=1e-12
-    )
-    for t, k in itertools.product(range(4), range(3)):
-        visiting = np.array([path[t] == k for path in every])
-        best = found.log_values[found.nodes[:, t] == k].max()
-        assert best == pytest.approx(values[visiting].max())

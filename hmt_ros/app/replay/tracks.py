@@ -26,7 +26,9 @@ from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.image_inputs import COMPRESSED_TYPE, IMAGE_TYPE, PREDICTION
 from hmt_ros.sessions.people_session import session_of
+from hmt_ros.sessions.seen_images import SeenImages
 from hmt_ros.sessions.session import FINISH
+from hmt_ros.sessions.smoother_parameters import AT_END
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
@@ -119,6 +121,10 @@ class OfflineTrack(PlayedTrack):
         self._filter = kind(parameters.filter, self._publish, _is_recorded)
         if parameters.smoother is not None:
             self._smoother = SmootherSession(parameters.smoother, self._publish)
+            if parameters.smoother.refine_on_images == AT_END:
+                images = SeenImages()
+                self._filter.share(images)
+                self._smoother.share(images)
 
     def __exit__(self, *_: object) -> None:
         """See `PlayedTrack`; nothing is open."""

@@ -1,0 +1,132 @@
+"""The images of a sequence themselves as observations of a motion: p(r_t | x_t) (VMS 5).
+
+    E_t(x) = a_i E_image(x) + E_keypoints(x; a_k, a_l) + a_p (E_prior(x) + E_known(x))
+
+Errors of images last, so a cue g of an image counts with its share a_g of the time since the image
+before (`inference.error_model`), as in the filter; an exchange of sides counts whole. Along a
+motion a lasting error does no harm: by `of_changes` the terms of the image count with their share
+of changes, and covariances grow by `CueErrors.lasting` afterwards. Keypoints count as before: their
+errors wander, and a motion would follow.
+
+Each image has the lengths and the flesh that its own poses were found with: later estimates of
+these move the root along the line of sight, which neighbours would take for motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from hmt_ros.body.ground_terms import GroundTerm
+from hmt_ros.body.pose_terms import FrameTerm
+from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.pose_energy import PoseEnergy
+from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.energy import Derivatives, Energy, add_energies
+from hmt_ros.inference.error_model import ERRORS, seconds
+
+
+@dataclass(frozen=True, eq=False)
+class SeenImage:
+    """What an image shows of a person, as far as it is believed.
+
+    Attributes:
+        likelihood: of images of this person.
+        observation: of the image.
+        known: further terms of the pose: gravity, floor.
+    """
+
+    likelihood: ImageLikelihood
+    observation: Observation
+    known: tuple[FrameTerm | GroundTerm, ...] = ()
+
+    def levelled(self, level: Array) -> SeenImage:
+        """The same, of poses whose root angles are measured against other axes."""
+        body = self.likelihood.body
+        if np.array_equal(body.level, level):
+            return self
+        return replace(self, likelihood=replace(self.likelihood, body=body.levelled(level)))
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSequence:
+    """-log p(r_t | x_t) of T images; an `EnergyTerm` whose rows are times.
+
+    Attributes:
+        images: T of them.
+        shares: T times the shares a_g by name of the cue.
+    """
+
+    images: Sequence[SeenImage]
+    shares: Sequence[dict[str, float]]
+
+    @classmethod
+    def of(
+        cls, images: Sequence[SeenImage], stamps_ns: Sequence[int], *, of_changes: bool = False
+    ) -> ImageSequence:
+        """The sequence of images with these stamps (T,); nothing was seen before the first.
+
+        Args:
+            of_changes: whether the terms of the image count with their share of changes.
+        """
+        intervals = [np.inf, *(seconds(b - a) for a, b in pairwise(stamps_ns))]
+        shares = [
+            {
+                name: errors.of_changes(dt) if of_changes and name == 'image' else errors.share(dt)
+                for name, errors in ERRORS.items()
+            }
+            for dt in intervals
+        ]
+        return cls(images, shares)
+
+    @property
+    def times(self) -> int:
+        """T."""
+        return len(self.images)
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the rows are times. Asked for a gradient, it returns a Hessian too."""
+        n, d = x.shape
+        asked = n if derivatives else 0
+        value, gradient, hessian = np.empty(n), np.empty((asked, d)), np.empty((asked, d, d))
+        for t in np.unique(rows).tolist():
+            at = rows == t
+            parts = [
+                _scaled(term.energy(x[at], derivatives=derivatives), share)
+                for term, share in self._terms[t]
+            ]
+            found = add_energies(parts)
+            value[at] = found.value
+            if derivatives:
+                gradient[at], hessian[at] = found.derivatives()
+        return Energy(value, gradient, hessian) if derivatives else Energy(value)
+
+    @cached_property
+    def _terms(self) -> list[list[tuple[PoseEnergy, float]]]:
+        """The sums of terms of each time, and the factors on them."""
+        result = []
+        for image, share in zip(self.images, self.shares, strict=True):
+            # Whoever asks may do so from several threads, which are shared out already.
+            likelihood = replace(image.likelihood, threads=1)
+            seen = likelihood.seen(
+                image.observation, share=share['keypoints'], lifted_share=share['lifted']
+            )
+            rest = (*likelihood.priors, *image.known)
+            sums = (seen[:1], share['image']), (seen[1:], 1.0), (rest, share['prior'])
+            result.append([(PoseEnergy(likelihood, terms), a) for terms, a in sums if terms])
+        return result
+
+
+def _scaled(energy: Energy, factor: float) -> Energy:
+    """An energy times a factor."""
+    value, gradient, hessian = energy
+    if gradient is None or hessian is None:
+        return Energy(factor * value)
+    return Energy(factor * value, factor * gradient, factor * hessian)

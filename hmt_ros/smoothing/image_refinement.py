@@ -1,0 +1,143 @@
+"""Motions refined on what the images themselves show (VMS 5 and 6).
+
+    E(X) = -log p(x_1) - sum_t log p(x_t | x_(t-1)) - sum_t log p(r_t | x_t)                    (1)
+    F(q) = E_q[log q(X) - log p(X, R)],    q = sum_i a_i N(M_i, s_i^2 S_i)                      (2)
+
+The distinct motions of a window start descents on (1) within limits, with one prior for all: that
+of the liveliest among them, where states begin anew if those of one do, with the feet held that
+rest in the heaviest. Of optima that are one motion the most probable is kept; (2) is over these.
+What it adapts is chosen on clips (docs/smoothing.md): the chain of the filter's modes weighs
+motions better than (2), so an optimum has the weight of the motions that came to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.smoothing.likelihood import SequenceLikelihood
+from hmt_ros.smoothing.mixture_smoother import trajectory_mixture
+from hmt_ros.smoothing.motion_smoother import ANEW, MotionSmoother, SmoothedMotions
+from hmt_ros.smoothing.motions import SECOND_NS, grouped, path_distances
+from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
+from hmt_ros.smoothing.trajectory_refinement import refine
+from hmt_ros.smoothing.variational_mixture import minimise_free_energy
+
+# Motions that are refined at most, and the least share of weight of one.
+MOST, LEAST = 4, 0.01
+# Steps of a descent at most, and the gain of a step that ends it, nats.
+STEPS, TOLERANCE = 30, 0.01
+# Samples of each optimum, and iterations, of the descent of the free energy.
+SAMPLES, ITERATIONS = 4, 15
+
+
+def refined_on_images(
+    smoother: MotionSmoother,
+    found: SmoothedMotions,
+    images: SequenceLikelihood,
+    *,
+    adapt: Sequence[str] = ('inflation',),
+) -> TrajectoryMixture:
+    """The motions of a window, of which those that are distinct are refined.
+
+    Args:
+        smoother: that has found them.
+        found: motions of a whole sequence, of whose past nothing is known.
+        images: of the window, one for each time.
+        adapt: what the free energy adapts, some of 'weights' and 'inflation'.
+
+    Returns:
+        The distinct optima, and the motions beside these as they were; with the free energy of the
+        optima.
+
+    Raises:
+        ValueError: another number of images.
+    """
+    motions, low_high = found.trajectories, smoother.limits()
+    assert motions.stamps_ns is not None
+    if images.times != motions.times:
+        raise ValueError(f'{images.times} images for {motions.times} times')
+    d = motions.dimension
+    chosen = _first_of_each(smoother, motions, motions.states, motions.weights, LEAST)[0]
+    intervals = np.diff(motions.stamps_ns) / SECOND_NS
+    begins = found.begins[chosen, 1:].any(axis=0)
+    noise = np.where(begins, ANEW, found.liveliness[chosen].max())
+    prior = smoother.dynamics.prior(intervals, noise=noise)
+    if smoother.resting is not None and len(intervals):
+        first = chosen[0]
+        covariances = found.evidence.covariances[first]
+        prior = smoother.resting.held(prior, motions.means[first], covariances, intervals)
+    optima = refine(
+        motions.states[chosen],
+        prior,
+        images,
+        *(limit[:d] for limit in low_high),
+        max_iterations=STEPS,
+        tolerance=TOLERANCE,
+    )
+    optima = optima[np.argsort(optima.energies, kind='stable')]
+    origin = chosen[optima.starts]
+    kept, labels = _first_of_each(smoother, motions, optima.states, motions.weights[origin], 0.0)
+    optima, others = optima[kept], np.setdiff1d(np.arange(len(motions)), chosen)
+    # Which component each motion has become.
+    count = len(kept)
+    into = np.zeros((len(motions), count + len(others)))
+    into[origin, labels] = 1.0
+    into[others, count + np.arange(len(others))] = 1.0
+    weights = motions.weights @ into
+    total = float(weights[:count].sum())
+    fitted = minimise_free_energy(
+        weights[:count] / total,
+        optima.states,
+        optima.factors,
+        prior,
+        images,
+        adapt=adapt,
+        low=low_high[0],
+        high=low_high[1],
+        samples=SAMPLES,
+        seed=smoother.seed,
+        max_iterations=ITERATIONS,
+    )
+    into[:, :count] *= total * fitted.weights / weights[:count]
+    weights = motions.weights @ into
+    result = trajectory_mixture(
+        weights,
+        np.concatenate([optima.states, motions.states[others]]),
+        [*optima.factors, *(motions.factors[i] for i in others)],
+        np.concatenate([fitted.inflation, motions.inflation[others]]),
+        prior,
+        images,
+        motions.stamps_ns,
+        *low_high,
+    )
+    order = np.argsort(-weights, kind='stable')
+    which = np.concatenate([origin[kept], others])[order]
+    in_time, apart = motions.weights_in_time, motions.disagreements
+    return replace(
+        result,
+        free_energy=fitted.free_energy,
+        free_energy_fresh=fitted.fresh,
+        strays=motions.strays,
+        weights_in_time=None if in_time is None else in_time @ into[:, order],
+        disagreements=None if apart is None else apart[which],
+    )
+
+
+def _first_of_each(
+    smoother: MotionSmoother,
+    motions: TrajectoryMixture,
+    states: Array,
+    weights: Array,
+    least: float,
+) -> tuple[Index, Index]:
+    """The first of states (N, T, n) that are one motion, for each motion; and the motion (N,)."""
+    assert motions.stamps_ns is not None
+    points = smoother.points_of(states[:, :, : motions.dimension]).swapaxes(0, 1)
+    nodes = np.broadcast_to(np.arange(len(states))[:, None], states.shape[:2])
+    distances = path_distances(nodes, list(points), motions.stamps_ns)
+    labels = grouped(weights, *distances, MOST, least)
+    return np.unique(labels, return_index=True)[1], labels
