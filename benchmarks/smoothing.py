@@ -319,7 +319,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     ends = 'the 95 % interval over clips and seeds'
     parts = (
         f'Errors of the heaviest component, mm, and the mean over clips of what they differ from '
-        f"the filter's by, %, with {ends}; all images: {result['seeds']} seeds.",
+        f"the filter's by, %, with {ends}. Seeds: {result['seeds']}, at lower rates 1.",
         table(error_rows(result), left=2, markdown=markdown),
         f'Log density of the true joints, nats a joint, and the difference from the filter, with '
         f'{ends}; components that are {1e3 * APART:.0f} mm apart and have more than '
