@@ -170,7 +170,7 @@ def measure(
     entries = [entry_of(key, scores) for key, scores in found.items()]
     groups = {title: [x for x in entries if group_of(x['clip']) == title] for title in GROUPS}
     groups[TOGETHER] = groups[OF_CHOSEN] + groups[OF_OTHERS]
-    means = {title: means_of(groups[title]) for title in GROUP_ORDER if groups[title]}
+    means = {title: means_of(groups[title]) for title in GROUP_ORDER}
     return {'machine': description(), 'seeds': seeds, 'clips': entries, 'means': means}
 
 
@@ -355,7 +355,7 @@ def error_rows(result: dict[str, Any]) -> list[list[str]]:
     columns += [Column(f'{way}, %', f'{way} {PERCENT}', '+.1f') for way in (LIVE, OFFLINE)]
     rows = [['inputs', 'images a second', *(x.head for x in columns)]]
     for group, means in result['means'].items():
-        rows.append([group, *[''] * (len(rows[0]) - 1)])
+        rows += [[group, *[''] * (len(rows[0]) - 1)]] if means else []
         rows += [
             [one['inputs'], f'{one["rate"]:g}' if one['rate'] else 'all']
             + [_cell(column, one) for column in columns]
@@ -389,7 +389,7 @@ def motion_rows(result: dict[str, Any]) -> list[list[str]]:
     columns = (*MOTION, CPU)
     rows = [['inputs', '', *(x.head for x in columns)]]
     for group, means in result['means'].items():
-        rows.append([group, *[''] * (len(rows[0]) - 1)])
+        rows += [[group, *[''] * (len(rows[0]) - 1)]] if means else []
         rows += [
             [one['inputs'], way, *(_cell(_of(way, column), one) for column in columns)]
             for one in means
