@@ -1,15 +1,9 @@
 """smoothing: what the smoother of the node makes of clips with known truth, live and offline.
 
 The tracker follows every clip with images, with keypoints as well, and with keypoints alone,
-gravity given and not, at the rate of the clip and at lower ones. What it says of each image goes
-through a `SmootherSession` with the defaults of the node, live, and through its smoother once, over
-the whole clip. Beside it stand
-
-- the filter;
-- the simplest smoother: the joints of the filter's heaviest mode, averaged over time with the
-  Gaussian kernel that is best in the mean over the clips;
-- the limit of what any choice of modes can bring: at each time the mode of the filter that is
-  nearest to the truth, averaged in the same way. It knows the truth; no method does.
+gravity given where the clip tells it, at the rate of the clip and at lower ones. What it says of
+each image goes through a `SmootherSession` with the defaults of the node, live, and through its
+smoother once, over the whole clip. The filter stands beside both, scored at the same images.
 """
 
 from __future__ import annotations
@@ -17,30 +11,30 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.clips import Clip, at_rate, find_clips, read_clip, table
 from benchmarks.command import benchmark_parser, run_benchmark
 from benchmarks.machine import description
-from benchmarks.runs import (
-    GIVEN,
-    GRAVITIES,
-    IMAGES,
-    INPUTS,
-    Record,
-    Seen,
-    in_processes,
-    recorded,
-    tracked,
+from benchmarks.runs import GIVEN, IMAGES, INPUTS, Record, Seen, in_processes, recorded, tracked
+from benchmarks.tracking_means import (
+    GROUPS,
+    OF_APART,
+    OF_CHOSEN,
+    OF_OTHERS,
+    Key,
+    entry_of,
+    group_of,
+    means_of,
 )
-from benchmarks.tracking_means import GROUPS, group_of
-from benchmarks.tracking_scores import heaviest_joints, scores_of
+from benchmarks.tracking_scores import scores_of
+from benchmarks.tracking_tables import Column
 from hmt_ros.body import Body
 from hmt_ros.body.mirror import propagated
 from hmt_ros.inference import GaussianMixture
@@ -65,26 +59,32 @@ from msg_tools.messages.pose_mixtures import (
 
 Array = NDArray[np.float64]
 
-FILTER, LIVE, OFFLINE = 'filter', 'live', 'offline'
-AVERAGED, NEAREST = 'filter, averaged', 'nearest modes, averaged'
+FILTER, LIVE, OFFLINE = WAYS = 'filter', 'live', 'offline'
 # Images a second; 0: all of a clip.
 RATES = (0.0, 8.0, 3.0)
 # Mixtures that are kept for smoothing over the whole clip.
 KEPT = 10_000
-# Distance of the joints of two modes, in the mean, from which on they are counted apart, m.
-APART = 0.03
-# Standard deviations of the kernels that joints are averaged with, images.
-KERNELS = (1.0, 2.0, 3.0, 4.0, 6.0)
-SCORES = (
-    'heaviest_mm',
-    'best_mm',
-    'acceleration',
-    'feet',
-    'root_percent',
-    'joint_coverage_90',
-    'absolute_coverage_90',
+# Distance of the joints of two modes, in the mean, from which on they are counted apart, m, and the
+# weight that a mode must have.
+APART, LIKELY = 0.03, 0.01
+TOGETHER = 'Both'
+GROUP_ORDER = (OF_CHOSEN, OF_OTHERS, TOGETHER, OF_APART)
+ERROR = Column('heaviest, mm', 'heaviest_mm', '.1f')
+BEST = Column('best, mm', 'best_mm', '.1f')
+DENSITY = Column('log density', 'density', '.2f')
+DISTINCT = Column('distinct', 'distinct', '.1f')
+CPU = Column('CPU, ms', 'cpu_ms', '.1f')
+MOTION = (
+    Column('joint 90 %', 'joint_coverage_90', factor=100.0),
+    Column('absolute 90 %', 'absolute_coverage_90', factor=100.0),
+    Column('acceleration', 'acceleration', '.1f'),
+    Column('feet, m/s', 'feet', '.2f'),
+    Column('root, %', 'root_percent', '.1f'),
+    Column('log(K w)', 'weights', '.2f'),
 )
-MODES, MS = 'modes', 'ms'
+# Of `scores_of`.
+SCORES = tuple(x.key for x in (ERROR, BEST, *MOTION))
+PERCENT = 'percent'  # of the filter's error
 SMOOTHED = 'smoothed_pose_mixture'
 QUICK = 12  # images
 
@@ -94,33 +94,52 @@ class Work(NamedTuple):
 
     folder: Path
     inputs: str
-    gravity: str
     rate: float
+    seed: int
     limit: int | None
 
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
     parser = benchmark_parser('smoothing', __doc__, quick=f'{QUICK} images of one clip')
-    parser.add_argument('--clips', type=Path, help='folder of the clips')
+    parser.add_argument('--markdown', action='store_true', help='tables for a Markdown page')
+    parser.add_argument('--clips', type=Path, metavar='DIR', help='folder of the clips')
     parser.add_argument('--names', nargs='+', default=(), metavar='NAME', help='some of the clips')
-    options = parser.parse_args(argv)
-    return run_benchmark(
-        'smoothing',
-        lambda: measure(options.clips, options.names, quick=options.quick),
-        as_text,
-        as_json=options.json,
+    parser.add_argument('--inputs', nargs='+', choices=INPUTS, default=INPUTS)
+    parser.add_argument(
+        '--rates',
+        type=float,
+        nargs='+',
+        metavar='HZ',
+        default=RATES,
+        help='images a second at most; 0: all images',
     )
+    parser.add_argument(
+        '--seeds', type=int, default=1, metavar='N', help='of the tracker, where all images count'
+    )
+    o = parser.parse_args(argv)
+    measured = partial(measure, o.clips, o.names, o.inputs, o.rates, o.seeds, quick=o.quick)
+    text = partial(as_text, markdown=o.markdown)
+    return run_benchmark('smoothing', measured, text, as_json=o.json)
 
 
 def measure(
-    clips: Path | None = None, names: Sequence[str] = (), *, quick: bool = False
+    clips: Path | None = None,
+    names: Sequence[str] = (),
+    inputs: Sequence[str] = INPUTS,
+    rates: Sequence[float] = RATES,
+    seeds: int = 1,
+    *,
+    quick: bool = False,
 ) -> dict[str, Any]:
     """Scores by clip, and their means over groups of clips.
 
     Args:
         clips: folder of the clips; None: the development clips, or bags/.
         names: of some of them; empty: all.
+        inputs: some of `runs.INPUTS`.
+        rates: images a second at most; 0: all images.
+        seeds: number of seeds of the tracker where all images are taken; one at lower rates.
         quick: a few images of one clip.
 
     Raises:
@@ -131,106 +150,75 @@ def measure(
         folders = [x for x in folders if x.name in names]
     if not folders:
         raise ValueError(f'{source}: none of the clips {list(names)} is there')
-    inputs, gravities, rates, limit = INPUTS, GRAVITIES, RATES, None
+    limit = None
     if quick:
-        folders, inputs, gravities, rates, limit = folders[:1], (IMAGES,), (GIVEN,), (0.0,), QUICK
+        folders, inputs, rates, seeds, limit = folders[:1], (IMAGES,), (0.0,), 1, QUICK
     work = [
-        Work(folder, given, known, rate, limit)
-        for rate in rates for given in inputs for known in gravities for folder in folders
+        Work(folder, given, rate, seed, limit)
+        for rate in rates
+        for given in inputs
+        for folder in folders
         if given == IMAGES or (folder / 'keypoints_mediapipe.npz').is_file()
-    ]  # fmt: skip
-    found = in_processes(of_clip, work, 1 if quick else 0, 'smoothing')
-    entries = [
-        {
-            'clip': one.folder.name, 'inputs': one.inputs, 'gravity': one.gravity,
-            'rate': one.rate, 'scores': scores,
-        }
-        for one, scores in zip(work, found, strict=True)
-    ]  # fmt: skip
-    means = []
-    for rate in rates:
-        for group in GROUPS:
-            for given in inputs:
-                for known in gravities:
-                    kind = {'inputs': given, 'gravity': known, 'rate': rate}
-                    own = [
-                        x['scores'] for x in entries
-                        if group_of(x['clip']) == group and kind.items() <= x.items()
-                    ]  # fmt: skip
-                    if own:
-                        means.append({'clips': group, **kind, 'scores': mean(own)})
-    return {'machine': description(), 'clips': entries, 'means': means}
+        for seed in range(1 if rate else seeds)
+    ]
+    found: dict[Key, list[dict[str, float]]] = {}
+    for one, scores in zip(
+        work, in_processes(of_clip, work, 1 if quick else 0, 'smoothing'), strict=True
+    ):
+        key = (one.folder.name, one.inputs, one.rate, GIVEN)
+        found.setdefault(key, []).append(scores)
+    entries = [entry_of(key, scores) for key, scores in found.items()]
+    groups = {title: [x for x in entries if group_of(x['clip']) == title] for title in GROUPS}
+    groups[TOGETHER] = groups[OF_CHOSEN] + groups[OF_OTHERS]
+    means = {title: means_of(groups[title]) for title in GROUP_ORDER}
+    return {'machine': description(), 'seeds': seeds, 'clips': entries, 'means': means}
 
 
-def mean(scores: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """Means over clips by way; of kernels the one that is best in the mean."""
-    result = {
-        way: {name: _known_mean([x[way][name] for x in scores]) for name in scores[0][way]}
-        for way in scores[0]
-    }
-    for way in (AVERAGED, NEAREST):
-        kernels = [name for name in result if name.startswith(way)]
-        best = min(kernels, key=lambda name: result[name]['heaviest_mm'])
-        for name in kernels:
-            if name != best:
-                del result[name]
-    return result
+def of_clip(work: Work) -> dict[str, float]:
+    """Scores of one clip, `filter heaviest_mm` and so on.
 
-
-def _known_mean(values: Sequence[float]) -> float:
-    """The mean of the values that are known; NaN: none is."""
-    known = [x for x in values if np.isfinite(x)]
-    return float(np.mean(known)) if known else float('nan')
-
-
-def of_clip(work: Work) -> dict[str, dict[str, float]]:
-    """Scores of one clip by way."""
+    Of the smoother also the difference of each from the filter, `live heaviest_mm change`, and of
+    its errors in % of the filter's, `live percent`.
+    """
     clip = at_rate(read_clip(work.folder, work.limit), work.rate)
-    seen = tracked(clip, work.inputs, work.gravity)
-    mixtures = {FILTER: {x.stamp: x.posterior for x in seen}}
-    found, ms = smoothed(seen, clip.views)
-    mixtures |= found
-    records = {way: record_of(clip, seen, found) for way, found in mixtures.items()}
-    result = {}
-    for way, record in records.items():
-        scores = scores_of(record)
-        result[way] = {name: float(scores[name]) for name in SCORES}
-        result[way] |= {MODES: modes_apart(record), MS: ms if way == LIVE else float('nan')}
-    own = records[FILTER]
-    plain = {AVERAGED: heaviest_joints(own), NEAREST: nearest_joints(own)}
-    for way, joints in plain.items():
-        for width in KERNELS:
-            smooth = gaussian_filter1d(joints, width, axis=0)
-            one = replace(
-                own, joints=smooth[:, None], weights=np.ones((len(smooth), 1)), point=smooth
-            )
-            result[f'{way} over {width:g} images'] = {
-                'heaviest_mm': float(scores_of(one)['heaviest_mm'])
-            }
+    seen = tracked(clip, work.inputs, GIVEN, work.seed)
+    mixtures, cpu = smoothed(seen, clip.views)
+    mixtures[FILTER] = {x.stamp: x.posterior for x in seen}
+    shared = set.intersection(*map(set, mixtures.values()))
+    rows = [x for x in seen if x.stamp in shared]
+    found = {way: _scores(record_of(clip, rows, mixtures[way])) for way in WAYS}
+    result = {f'{way} {name}': x for way in WAYS for name, x in found[way].items()}
+    own = found[FILTER]
+    for way in (LIVE, OFFLINE):
+        result |= {f'{way} {name} change': x - own[name] for name, x in found[way].items()}
+        result[f'{way} {PERCENT}'] = 100.0 * (found[way][ERROR.key] / own[ERROR.key] - 1.0)
+    result[f'{LIVE} {CPU.key}'] = cpu
     return result
+
+
+def _scores(record: Record) -> dict[str, float]:
+    """Of the tables, besides processor time."""
+    scores = scores_of(record)
+    joints = record.joint_levels.shape[1]
+    return {
+        **{name: float(scores[name]) for name in SCORES},
+        DENSITY.key: -float(scores['negative_log_likelihood']) / joints,
+        DISTINCT.key: modes_apart(record),
+    }
 
 
 def modes_apart(record: Record) -> float:
-    """How many modes of an image are apart by `APART`, in the mean over images."""
+    """How many likely modes of an image are apart by `APART`, in the mean over images."""
     relative = record.joints - record.joints[:, :, :1]
     counts = []
     for joints, weights in zip(relative, record.weights, strict=True):
-        some = joints[weights > 0]
+        some = joints[weights > LIKELY]
 
         def distances(i: int, some: Array = some) -> Array:
             return np.asarray(np.nanmean(np.linalg.norm(some - some[i], axis=2), axis=1))
 
-        counts.append(len(leaders(weights[weights > 0], distances, APART)))
+        counts.append(len(leaders(weights[weights > LIKELY], distances, APART)))
     return float(np.mean(counts))
-
-
-def nearest_joints(record: Record) -> Array:
-    """Joints (T, J, 3) of the modes that are nearest to the truth."""
-    away = (record.joints - record.joints[:, :, :1]) - (record.true - record.true[:, :1])[:, None]
-    known = np.isfinite(record.true).all((0, 2))
-    errors = np.linalg.norm(away, axis=3)[:, :, known].mean(2)
-    nearest = np.where(record.weights > 0, errors, np.inf).argmin(1)
-    return np.asarray(record.joints[np.arange(len(nearest)), nearest])
 
 
 def smoothed(
@@ -238,7 +226,7 @@ def smoothed(
 ) -> tuple[dict[str, dict[int, GaussianMixture]], float]:
     """What the node publishes, and what it makes of all images together, by way and stamp.
 
-    Also the median time that it takes over an image, ms.
+    Also the mean processor time that the node takes over an image, ms.
 
     Args:
         seen: of the images.
@@ -267,17 +255,26 @@ def smoothed(
             at_best = replace(one.posterior[[0]], covariances=told.shape_covariance[None])
             shapes[one.stamp] = in_world(one.body, at_best)[0].covariances[0]
         content = PoseMixture.of_body(
-            one.body, likelihood, MixtureKind.LIKELIHOOD, one.stamp, 'camera',
-            state=TrackState.TRACKING, track_id=1, error_share=told.errors.independent,
-            error_time=told.errors.time, shape_covariance=shapes[one.stamp],
-            identities=told.identities, posterior_weights=told.posterior_weights,
-            ancestry=told.origins, ancestry_stamp_ns=told.ancestry_stamp or 0,
+            one.body,
+            likelihood,
+            MixtureKind.LIKELIHOOD,
+            one.stamp,
+            'camera',
+            state=TrackState.TRACKING,
+            track_id=1,
+            error_share=told.errors.independent,
+            error_time=told.errors.time,
+            shape_covariance=shapes[one.stamp],
+            identities=told.identities,
+            posterior_weights=told.posterior_weights,
+            ancestry=told.origins,
+            ancestry_stamp_ns=told.ancestry_stamp or 0,
             ancestry_ids=told.ancestors,
-        )  # fmt: skip
+        )
         message = pose_mixture_message(messages, content)
-        start = time.perf_counter()
+        start = time.process_time()
         handled = session.take(MIXTURE, message)
-        spent.append(time.perf_counter() - start)
+        spent.append(time.process_time() - start)
         if handled.faults:
             raise ValueError(handled.faults[0])
     whole, _ = session.smoothed_span()
@@ -294,7 +291,7 @@ def smoothed(
         way: {t: _seen_again(x, bodies[t], frames.get(t)) for t, x in of_way.items()}
         for way, of_way in result.items()
     }
-    return placed, 1e3 * float(np.median(spent))
+    return placed, 1e3 * float(np.mean(spent))
 
 
 def _seen_again(mixture: GaussianMixture, body: Body, frame: FixedFrame | None) -> GaussianMixture:
@@ -311,7 +308,7 @@ def _seen_again(mixture: GaussianMixture, body: Body, frame: FixedFrame | None) 
 
 def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixture]) -> Record:
     """Mixtures by stamp, with the truth; their point estimate is the heaviest mode."""
-    rows = [x for x in seen if x.stamp in mixtures and x.stamp in clip.truth.joints]
+    rows = [x for x in seen if x.stamp in clip.truth.joints]
     found = [mixtures[x.stamp] for x in rows]
     points = [one.means[one.weights.argmax()] for one in found]
     return recorded(clip, [x.body for x in rows], found, points, [x.stamp for x in rows], 0)
@@ -319,50 +316,84 @@ def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixt
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """Tables for people."""
-    tables = (error_rows(result), motion_rows(result))
-    return '\n\n'.join(table(rows, left=2, markdown=markdown) for rows in tables)
+    ends = 'the 95 % interval over clips and seeds'
+    parts = (
+        f'Errors of the heaviest component, mm, and the mean over clips of what they differ from '
+        f"the filter's by, %, with {ends}. Seeds: {result['seeds']}, at lower rates 1.",
+        table(error_rows(result), left=2, markdown=markdown),
+        f'Log density of the true joints, nats a joint, and the difference from the filter, with '
+        f'{ends}; components that are {1e3 * APART:.0f} mm apart and have more than '
+        f'{100 * LIKELY:.0f} % of the weight; error of the best component, mm. All images.',
+        table(density_rows(result), left=2, markdown=markdown),
+        'True joints in 90 % regions, relative to the pelvis and in the frame of the camera; '
+        'accelerations over the true ones; feet that stand; distance of the root; log(K w) of the '
+        'component nearest to the truth; processor time of an image in the node. All images.',
+        table(motion_rows(result), left=2, markdown=markdown),
+    )
+    return '\n\n'.join(parts)
+
+
+def _of(way: str, column: Column) -> Column:
+    """A column of a way."""
+    return column._replace(head=f'{way}: {column.head}', key=f'{way} {column.key}')
+
+
+def _cell(column: Column, entry: dict[str, Any]) -> str:
+    """Of a clip or, with an interval where it is a difference, of means over clips."""
+    value = entry.get(column.key)
+    if not isinstance(value, tuple):
+        return column.cell(value)
+    text = column.cell(value[0])
+    if not column.form.startswith('+') or value[1] is None:
+        return text
+    return f'{text} ({column.cell(value[1])} to {column.cell(value[2])})'
 
 
 def error_rows(result: dict[str, Any]) -> list[list[str]]:
-    """A table for people: errors of the heaviest pose by way, means over groups of clips, mm."""
-    ways = [FILTER, LIVE, OFFLINE, AVERAGED, NEAREST]
-    rows = [['inputs', 'gravity', 'images a second', *ways]]
-    for group in dict.fromkeys(x['clips'] for x in result['means']):
-        rows.append([group, *[''] * (len(rows[0]) - 1)])
-        for entry in result['means']:
-            if entry['clips'] == group:
-                found = {
-                    name.split(' over ')[0]: scores['heaviest_mm']
-                    for name, scores in entry['scores'].items()
-                }
-                rate = f'{entry["rate"]:g}' if entry['rate'] else 'all'
-                cells = [f'{found[way]:.1f}' for way in ways]
-                rows.append([entry['inputs'], entry['gravity'], rate, *cells])
+    """Errors of the heaviest component by way, means over groups of clips."""
+    columns = [_of(way, ERROR) for way in WAYS]
+    columns += [Column(f'{way}, %', f'{way} {PERCENT}', '+.1f') for way in (LIVE, OFFLINE)]
+    rows = [['inputs', 'images a second', *(x.head for x in columns)]]
+    for group, means in result['means'].items():
+        rows += [[group, *[''] * (len(rows[0]) - 1)]] if means else []
+        rows += [
+            [one['inputs'], f'{one["rate"]:g}' if one['rate'] else 'all']
+            + [_cell(column, one) for column in columns]
+            for one in means
+        ]
     return rows
 
 
+def density_rows(result: dict[str, Any]) -> list[list[str]]:
+    """Densities and components by clip and way, and means over the clips that have means."""
+    columns = [_of(way, DENSITY) for way in WAYS]
+    columns += [
+        Column(f'{way} - filter', f'{way} {DENSITY.key} change', '+.2f') for way in (LIVE, OFFLINE)
+    ]
+    columns += [_of(way, column) for column in (DISTINCT, BEST) for way in WAYS]
+    entries = result['clips'] + [{'clip': 'mean', **x} for x in result['means'][TOGETHER]]
+    full = [x for x in entries if not x['rate']]
+    return [
+        ['clip', 'inputs', *(x.head for x in columns)],
+        *(
+            [one['clip'], given, *(_cell(column, one) for column in columns)]
+            for given in INPUTS
+            for one in full
+            if one['inputs'] == given
+        ),
+    ]
+
+
 def motion_rows(result: dict[str, Any]) -> list[list[str]]:
-    """A table for people: what filter and smoother are besides, of all images, by group."""
-    rows = [
-        [
-            'inputs', 'gravity', '', 'best of 8, mm', 'modes apart', 'acceleration', 'feet, m/s',
-            'root, %', 'joint 90 %', 'in the camera', 'ms an image',
+    """What filter and smoother are besides, means over groups of clips."""
+    columns = (*MOTION, CPU)
+    rows = [['inputs', '', *(x.head for x in columns)]]
+    for group, means in result['means'].items():
+        rows += [[group, *[''] * (len(rows[0]) - 1)]] if means else []
+        rows += [
+            [one['inputs'], way, *(_cell(_of(way, column), one) for column in columns)]
+            for one in means
+            if not one['rate']
+            for way in WAYS
         ]
-    ]  # fmt: skip
-    for group in dict.fromkeys(x['clips'] for x in result['means']):
-        rows.append([group, *[''] * (len(rows[0]) - 1)])
-        for entry in result['means']:
-            if entry['clips'] != group or entry['rate']:
-                continue
-            for way in (FILTER, LIVE, OFFLINE):
-                s = entry['scores'][way]
-                cells = [
-                    f'{s["best_mm"]:.1f}', f'{s[MODES]:.1f}', f'{s["acceleration"]:.1f}',
-                    f'{s["feet"]:.2f}', f'{s["root_percent"]:.1f}',
-                ]  # fmt: skip
-                cells += [
-                    '-' if np.isnan(s[name]) else f'{100 * s[name]:.0f} %' for name in SCORES[-2:]
-                ]
-                cells.append('' if np.isnan(s[MS]) else f'{s[MS]:.1f}')
-                rows.append([entry['inputs'], entry['gravity'], way, *cells])
     return rows

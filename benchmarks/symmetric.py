@@ -8,6 +8,9 @@ are motions of the model that is tracked, and neither is the better one. The tra
 keypoints alone, whose noise lasts, and no experts. It starts from both poses, half each, or from
 its own start: the keypoints of the first images. Each of its modes counts for the motion whose limb
 is nearer. Shares are of the images in which there is a track.
+
+Beside the filter stand its chain given the images of the next half second (`backward_weights`), and
+what a `SmootherSession` with the defaults of the node publishes of an image, as much later.
 """
 
 from __future__ import annotations
@@ -15,14 +18,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, run_benchmark
 from benchmarks.machine import description
-from benchmarks.runs import JOINTS, in_processes, keypoints_only
+from benchmarks.runs import JOINTS, Seen, in_processes, keypoints_only
+from benchmarks.smoothing import FILTER, LIVE, smoothed
 from hmt_ros.body import Camera, load_body
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood
@@ -32,8 +37,9 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.energy import Derivatives
+from hmt_ros.inference.mode_chain import Link, backward_weights
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.tracking import Tracker, TrackerSettings
-from hmt_ros.tracking.track_state import Estimate
 
 ENDS = {'right_arm': 'wrist', 'left_arm': 'wrist', 'left_leg': 'ankle', 'right_leg': 'ankle'}
 # Distances of the person, m; focal lengths in proportion make all images the same size.
@@ -46,7 +52,11 @@ LASTING = 0.2  # s that the noise of keypoints lasts
 POSES, TRIED, APART, START_SIGMA = 4000, 100, 0.3, 0.05
 LIKELY = 0.05  # part of the energy of the prior that counts beside its difference
 BOTH = 0.05  # weight that each motion keeps
+# Weights of a motion that are even in the filter, and in what is published of them.
+EVEN, KEPT_EVEN = (0.4, 0.6), (0.25, 0.75)
 OWN, GIVEN = 'own start', 'both given'
+CHAIN = 'chain'
+WAYS = {FILTER: 'filter', CHAIN: 'filter, 0.5 s later', LIVE: 'published'}
 BODY = load_body('human37')
 
 
@@ -82,16 +92,6 @@ class Case:
         for joints in BODY.joint_positions(self.motions[0]):
             yield _keypoints(self.camera, joints, self.noise * error)
             error = rho * error + np.sqrt(1.0 - rho**2) * rng.normal(size=error.shape)
-
-
-class Image(NamedTuple):
-    """What the tracker says of image t."""
-
-    t: int
-    stamp: int
-    posterior: GaussianMixture
-    likelihood: GaussianMixture
-    estimate: Estimate
 
 
 def cases(
@@ -190,7 +190,7 @@ def _moved(pose: Array, flip: Array, limb: str) -> Array | None:
     return np.stack([path, other])
 
 
-def tracked(case: Case, *, given: bool, **changes: Any) -> Iterator[Image]:
+def tracked(case: Case, *, given: bool, **changes: Any) -> Iterator[Seen]:
     """What the tracker says of the images of a case.
 
     Args:
@@ -209,29 +209,51 @@ def tracked(case: Case, *, given: bool, **changes: Any) -> Iterator[Image]:
         stamp = round((t + 1) * 1e9 / RATE)
         posterior, likelihood = tracker.step(blank, stamp, keypoints)
         if posterior is not None and likelihood is not None:
-            yield Image(t, stamp, posterior, likelihood, tracker.estimate)
+            now = tracker.estimate
+            yield Seen(stamp, now.body, posterior, now.likelihood, now.point_estimate)
 
 
-def shares(means: Array, weights: Array, case: Case, t: int) -> Array:
-    """Weights (2,) of the true and the flipped motion at image t, of poses (K, d)."""
+def given_later(seen: Sequence[Seen]) -> dict[int, GaussianMixture]:
+    """The filter's modes by stamp, weighed by its chain as late as the node publishes."""
+    lag = round(SmootherParameters().fixed_lag * RATE)
+    result = {}
+    for i, one in enumerate(seen):
+        links = [Link(one.likelihood.posterior_weights, one.likelihood.origins)]
+        for before, after in pairwise(seen[i : i + lag + 1]):
+            if after.likelihood.ancestry_stamp != before.stamp:
+                break  # another track
+            links.append(Link(after.likelihood.posterior_weights, after.likelihood.origins))
+        modes = one.posterior[one.likelihood.modes]
+        result[one.stamp] = replace(modes, weights=backward_weights(links)[0])
+    return result
+
+
+def share(poses: GaussianMixture, case: Case, t: int) -> float:
+    """Weight of the true motion at image t."""
     own = BODY.skeleton.chain_joints[case.limb]
-    joints = BODY.relative_joints(means)[:, None, own]
+    joints = BODY.relative_joints(poses.means)[:, None, own]
     motions = BODY.relative_joints(case.motions[:, t])[:, own]
     nearer = np.linalg.norm(joints - motions, axis=3).mean(2).argmin(1)
-    return np.bincount(nearer, weights, 2) / weights.sum()
+    return float(poses.weights[nearer == 0].sum() / poses.weights.sum())
 
 
-def of_case(case: Case, **changes: Any) -> dict[str, Any]:
-    """Weights of both motions from either start; `changes` as of `tracked`."""
-    result: dict[str, Any] = {
-        name: getattr(case, name) for name in ('limb', 'distance', 'seed', 'noise', 'prior')
-    }
+def of_case(case: Case, **changes: Any) -> list[dict[str, Any]]:
+    """Weights (T,) of the true motion by way, from either start; `changes` as of `tracked`."""
+    result = []
     for start, given in ((GIVEN, True), (OWN, False)):
-        seen = tracked(case, given=given, **changes)
-        weights = np.array(
-            [shares(one.posterior.means, one.posterior.weights, case, one.t) for one in seen]
-        )
-        result[start] = {'true': weights[:, 0], 'both': weights.min(1) > BOTH}
+        seen = list(tracked(case, given=given, **changes))
+        published, _ = smoothed(seen)
+        found = {
+            FILTER: {x.stamp: x.posterior for x in seen},
+            CHAIN: given_later(seen),
+            LIVE: published[LIVE],
+        }
+        weights = {
+            way: [share(found[way][x.stamp], case, round(1e-9 * RATE * x.stamp) - 1) for x in seen]
+            for way in WAYS
+        }
+        names = ('limb', 'distance', 'seed', 'noise', 'prior')
+        result.append({'start': start, **{x: getattr(case, x) for x in names}, **weights})
     return result
 
 
@@ -239,33 +261,39 @@ def measure(*, quick: bool = False) -> dict[str, Any]:
     """What `of_case` finds of all cases; of one where it must be quick."""
     chosen = list(cases(['right_arm'], [0], DISTANCES[:1], NOISES[:1]) if quick else cases())
     found = in_processes(of_case, chosen, 1 if quick else 0, 'symmetric')
-    for one in found:
-        for start in (GIVEN, OWN):
-            one[start] = {name: float(x.mean()) for name, x in one[start].items()}
-    return {'machine': description(), 'cases': found}
+    return {'machine': description(), 'cases': [one for case in found for one in case]}
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Means by distance, limb and noise, and over all cases."""
-    rows = [
-        ['limb', 'distance, m', 'noise, px', 'priors differ, nats', *(
-            f'{start}: {what}'
-            for start in (GIVEN, OWN)
-            for what in ('weight of the true motion', f'both above {100 * BOTH:.0f} %')
-        )],
-    ]  # fmt: skip
+    """Means by start, distance, limb and noise, and over all cases of a start."""
+    said = (
+        f'Both motions above {100 * BOTH:.0f} %, by start; "even" are the images in which the '
+        f'filter gives a motion {EVEN[0]:g} to {EVEN[1]:g}, and of these those in which '
+        f'{KEPT_EVEN[0]:g} to {KEPT_EVEN[1]:g} is published.'
+    )
+    rows = [['start', 'limb', 'distance, m', 'noise, px', 'priors differ, nats']]
+    rows[0] += ['weight of the true motion', *WAYS.values(), 'even', 'published as even']
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-    for one in result['cases']:
-        name = one['limb'].replace('_', ' '), f'{one["distance"]:g}', f'{one["noise"]:g}'
-        groups.setdefault(name, []).append(one)
-    for name, own in [*groups.items(), (('all', '', ''), result['cases'])]:
-        rows.append([*name, f'{np.mean([abs(x["prior"]) for x in own]):.2f}'])
-        for start in (GIVEN, OWN):
-            true = ' '.join(f'{x[start]["true"]:.2f}' for x in own)
-            if name[0] == 'all':
-                true = f'{np.mean([x[start]["true"] for x in own]):.2f}'
-            rows[-1] += [true, f'{100 * np.mean([x[start]["both"] for x in own]):.0f} %']
-    return table(rows, markdown=markdown)
+    for start in (GIVEN, OWN):
+        own = [x for x in result['cases'] if x['start'] == start]
+        for one in own:
+            name = one['limb'].replace('_', ' '), f'{one["distance"]:g}', f'{one["noise"]:g}'
+            groups.setdefault((start, *name), []).append(one)
+        groups[start, 'all', '', ''] = own
+    for name, own in groups.items():
+        true = [np.mean(x[FILTER]) for x in own]
+        means = [f'{np.mean(true):.2f}'] if name[1] == 'all' else [f'{x:.2f}' for x in true]
+        rows.append([*name, f'{np.mean([abs(x["prior"]) for x in own]):.2f}', ' '.join(means)])
+        of_way = {way: np.concatenate([x[way] for x in own]) for way in WAYS}
+        shown = [np.minimum(x, 1.0 - x) > BOTH for x in of_way.values()]
+        even = _within(of_way[FILTER], EVEN)
+        kept = _within(of_way[LIVE][even], KEPT_EVEN)
+        rows[-1] += [f'{100 * x.mean():.0f} %' if len(x) else '-' for x in (*shown, even, kept)]
+    return f'{said}\n\n{table(rows, left=2, markdown=markdown)}'
+
+
+def _within(values: Array, ends: tuple[float, float]) -> Array:
+    return (ends[0] <= values) & (values <= ends[1])
 
 
 def main(arguments: list[str]) -> int:
