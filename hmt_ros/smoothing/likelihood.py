@@ -137,35 +137,28 @@ class LikelihoodPart:
         return self.whole.energy(x, rows + self.first, derivatives=derivatives)
 
 
-def counted(
-    mixture: GaussianMixture, share: float, of_changes: float | None = None
-) -> GaussianMixture:
-    """The likelihood of an observation of which only a share is new information.
+def counted(mixture: GaussianMixture, share: float) -> GaussianMixture:
+    """The likelihood of an observation of which only a share a is new information.
 
-        sum_k v_k N(m_k, S_k / b) / sum_k v_k,        v_k = w_k^a |S_k|^((1 - a) / 2)
+        sum_k v_k N(m_k, S_k / a) / sum_k v_k,        v_k = w_k^a |S_k|^((1 - a) / 2)
 
     Where errors last, each observation repeats a part of the information of those before, and
     counts with the share a (`inference.error_model`): near each mode the density is the power a of
-    w_k N(m_k, S_k), and b = a. Between poses that move, a lasting error does no harm: with b of
-    changes (`CueErrors.of_changes`) motions follow the observations closely, and the covariances of
-    the result are to be made b / a times as large (`SlidingWindow.step`).
+    w_k N(m_k, S_k).
 
     Args:
         mixture: the whole evidence; modes without weight are left out.
         share: a.
-        of_changes: b; None: a.
 
     Raises:
-        ValueError: a share that is not in (0, 1], or of changes that is not positive.
+        ValueError: a share that is not in (0, 1].
     """
     if not 0.0 < share <= 1.0:
         raise ValueError(f'the share of the evidence must lie in (0, 1], saw {share}')
-    if of_changes is not None and not 0.0 < of_changes < np.inf:
-        raise ValueError(f'the share of changes must be positive, saw {of_changes}')
     some = mixture[mixture.weights > 0]
     log_weights = share * np.log(some.weights) + 0.5 * (1.0 - share) * some.log_determinants
     weights = np.exp(log_weights - logsumexp(log_weights))
-    return GaussianMixture(weights, some.means, some.covariances / (of_changes or share))
+    return GaussianMixture(weights, some.means, some.covariances / share)
 
 
 def check_mixtures(mixtures: Sequence[GaussianMixture]) -> None:

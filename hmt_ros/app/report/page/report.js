@@ -297,8 +297,8 @@ function tellFreeEnergy() {
   element('free-energy-figures').hidden = !hasFreeEnergy;
   if (!hasFreeEnergy) {
     element('no-free-energy').hidden = false;
-    element('no-free-energy').textContent = 'None was recorded: the smoother computed the most probable paths in closed form. '
-      + 'replay --set smoother.method=variational refines them and records their free energy.';
+    element('no-free-energy').textContent = 'None was recorded: motions were smoothed in closed form. '
+      + 'replay --set smoother.refine_on_images=end refines them on the images at the end, and records their free energy.';
   }
   element('free-energy').setAttribute('aria-label', 'Free energy of each window over time');
   element('iterations').setAttribute('aria-label', 'Free energy over the iterations of the current window');
