@@ -1,13 +1,14 @@
 """Motions: paths through the modes of a window that stay together, and what images say of each.
 
-    d(a, b) = max over moments of mean_s min(mean_j |a_sj - b_sj|, c)                       (1)
+    d(a, b) = max over moments of mean_s min((mean_j |a_sj - b_sj|^2)^(1/2), c)             (1)
     z_t = sum_k r_k x_k,  R_t = sum_k r_k (S_k / b + (x_k - z_t)(x_k - z_t)')               (2)
 
 a_sj is the mean place of joint j over span s, a sixth of a second; a moment is three in a row.
-Paths closer than 30 mm are one motion. A span counts with c = 90 mm at most: what shows in one
-alone is no motion of its own, however far away it is, and is absorbed by the one nearest in time.
-Where a path comes from is a span before the first. Spans without an image do not count; where a
-window is shorter than a moment the mean is over the window.
+Paths closer than 30 mm are one motion; squares, so that a limb that differs is not lost among the
+joints that do not. A span counts with c = 90 mm at most: what shows in one alone is no motion of
+its own, however far away it is, and is absorbed by the one nearest in time. Where a path comes from
+is a span before the first. Spans without an image do not count; where a window is shorter than a
+moment the mean is over the window.
 
 A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each, of those
 within reach of the heaviest: a mean over opposite poses is no pose. b is the share by which the
@@ -29,7 +30,7 @@ SECOND_NS = 10**9
 # Distance of two paths below which they are one motion, and the most that a span counts with, m.
 SAME_MOTION, MOST_APART = 0.03, 0.09
 # Distance of two modes of an image from which on they are no one Gaussian, m.
-OPPOSITE = 0.15
+OPPOSITE = 0.1
 # Length of a span, s, and spans of a moment.
 SPAN, MOMENT = 1.0 / 6.0, 3
 
@@ -79,8 +80,9 @@ def path_distances(
 
 def _apart(places: Sequence[Array]) -> Array:
     """Distances (N, N) of paths over a span, of whose images places (N, P, 3) are given, m."""
-    joints = np.mean(places, axis=0).swapaxes(0, 1)
-    return np.asarray(sum(cdist(joint, joint) for joint in joints) / len(joints))
+    means = np.mean(places, axis=0)
+    flat = means.reshape(len(means), -1)
+    return np.asarray(cdist(flat, flat) / np.sqrt(means.shape[1]))
 
 
 def grouped(weights: Array, distances: Array, means: Array, most: int, least: float) -> Index:

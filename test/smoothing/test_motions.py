@@ -41,7 +41,7 @@ def by_definition(nodes, points, stamps):
                 places = [
                     np.mean([points[t][nodes[path, t]] for t in times], axis=0) for path in (a, b)
                 ]
-                far = np.linalg.norm(places[0] - places[1], axis=1).mean()
+                far = np.sqrt(np.square(places[0] - places[1]).sum(1).mean())
                 apart[span] = far
             means[a, b] = sum(apart.values()) / len(apart)
             oldest = max(apart)
