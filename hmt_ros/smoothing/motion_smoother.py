@@ -41,7 +41,7 @@ from hmt_ros.smoothing.trajectory_refinement import limits_of_states
 
 # Paths that are drawn from the chain.
 PATHS = 96
-# Values of lambda, and the median distance from the modes, m, from which on the next is tried.
+# Values of l, and the median distance from the modes, m, from which on the next is tried.
 LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
 # Distance from which on the modes of an image are taken for wrong, m, and looks at that.
 WRONG, WRONG_PASSES = 0.15, 3
@@ -51,7 +51,7 @@ FASTEST, TREMBLE = 3.0, 0.05
 NEIGHBOURS, FLICKER = 3, 0.1
 ANEW = 1e6
 # Distance from all motions from which on a mode is a stray, m.
-STRAY = 0.06
+STRAY = 0.05
 # Least weight of a motion of more than one image, and of one whose resting feet are held.
 LEAST, LEAST_HELD = 0.03, 0.1
 
