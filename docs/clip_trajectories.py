@@ -86,7 +86,7 @@ class ClipTrajectories:
         found: N motions, as the node has them.
         images: T of them, as observations.
         optima: M motions, of which the distinct ones are refined on the images.
-        origins: (M,) motion that is nearest to each.
+        origins: (M,) motion that each comes from.
         refined: (M,) whether they are refined.
         pair: two of them that are likely and stay apart longest.
     """
@@ -215,12 +215,9 @@ def clip_trajectories(name: str, inputs: str) -> ClipTrajectories:
     own = first_of(modes[window])
     images = ImageSequence.of(shown[window], [one.stamp_ns for one in own], of_changes=True)
     optima = refined_on_images(smoother, found, images)
-    places = joints_of(body, optima.means), joints_of(body, found.trajectories.means)
-    away = np.linalg.norm(places[0][:, None] - places[1], axis=-1).mean((2, 3))
-    refined = away.min(1) > 0.0
+    refined, origins = traced(body, optima.means, found.trajectories.means)
     weights = np.where(refined, optima.weights, 0.0) if refined.sum() > 1 else optima.weights
     pair = apart(body, weights, optima.means)[0]
-    origins = away.argmin(1)
     return ClipTrajectories(
         recording, inputs, body, own, smoother, found, images, optima, origins, refined, pair
     )
@@ -298,6 +295,19 @@ def joints_of(body: Body, poses: Array) -> Array:
     """Joints (..., J, 3) at poses (..., d), camera frame, m."""
     flat = body.joint_positions(poses.reshape(-1, poses.shape[-1]))
     return flat.reshape(*poses.shape[:-1], *flat.shape[1:])
+
+
+def traced(body: Body, optima: Array, motions: Array) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Whether optima (M, T, d) are refined, and the motion of (N, T, d) that each comes from, (M,).
+
+    It is the same motion or, if they are refined, the nearest of those that are not among the
+    optima.
+    """
+    away = np.linalg.norm(joints_of(body, optima)[:, None] - joints_of(body, motions), axis=-1)
+    away = away.mean((2, 3))
+    refined = away.min(1) > 0.0
+    away[np.ix_(refined, away.min(0) == 0.0)] = np.inf
+    return refined, away.argmin(1)
 
 
 def seen_from_shoulders(joints: Array, names: Sequence[str]) -> Array:

@@ -54,10 +54,16 @@ LINES = {
     DESK: ('#6b8f71', ':'),
     DEMONSTRATION: ('#8a6fb0', '-.'),
 }
+# Of those whose images may be shown.
+STRIPS = {'exercise': 'smoothing_strip.png', 'laugh': 'smoothing_optima.png'}
 SPECTRUM = (1, 8, TIMES)
 DARK, LIGHT, ACCENT = '#1f3a5f', '#9db4c8', '#c8553d'
 PAIR = (DARK, ACCENT)
-COLUMNS = 8
+COLUMNS = 6
+# Share of the paths of a motion that a mode which it visits has.
+WELL = 0.15
+# Half the width of torso and arms from above, m; the least width of a part of an image, of its height.
+REACH, LEAST_WIDTH = 0.7, 0.75
 # Of the trajectories that are drawn from the posterior.
 DRAWN, SEED = 64, 0
 
@@ -75,8 +81,9 @@ def main() -> int:
             return 0
         found = [clip_trajectories(name, inputs) for name, inputs in CLIPS.items()]
         draw_clips([*found, demonstration])
-        for one, file in zip(found, ('smoothing_strip.png', 'smoothing_optima.png'), strict=False):
-            draw_pair(one, file)
+        for one in found:
+            if one.name in STRIPS:
+                draw_pair(one, STRIPS[one.name])
     return 0
 
 
@@ -89,8 +96,11 @@ def draw_clips(found: Sequence[ClipTrajectories]) -> None:
     for ax, one in zip(axes, found, strict=True):
         draw_network(ax, one)
     axes[-1].set_xlabel('image')
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside upper center', ncols=3, frameon=False)
+    shown = axes[0].get_legend_handles_labels()
+    legend = figure.legend(*shown, loc='outside upper center', ncols=3, frameon=False)
+    for handle in legend.legend_handles[: len(shown[0]) - 3]:
+        handle.set_sizes([40.0])
+        handle.set_linewidths([1.0])
     save(figure, 'smoothing_network.png')
 
     figure, axes = plt.subplots(
@@ -100,27 +110,33 @@ def draw_clips(found: Sequence[ClipTrajectories]) -> None:
         draw_arm(column, one)
     axes[0, 0].set_ylabel('bent by, degrees')
     axes[1, 0].set_ylabel('depth from the shoulders, m')
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside upper center', ncols=3, frameon=False)
+    shown = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*shown, loc='outside upper center', ncols=3, frameon=False)
     save(figure, 'smoothing_angles.png')
 
     figure, axes = plt.subplots(2, 2, figsize=(8.4, 6.4), dpi=110, layout='constrained')
     for one in found:
         draw_numbers(axes, one)
     axes[0, 0].set(
-        xlabel='optimum', ylabel='degrees (m as rad)', ylim=(0, None),
+        xlabel='motion (filled: refined on images)', ylabel='degrees (m as rad)', ylim=(0, None),
         title='Difference of a variable, modes to optimum',
     )  # fmt: skip
     axes[0, 1].axhline(0, color='black', lw=0.5)
     axes[0, 1].set(
-        xlabel='optimum', ylabel='nats', title='-log likelihood an image, optimum minus modes'
+        xlabel='motion (filled: refined on images)',
+        ylabel='nats',
+        title='-log likelihood an image, optimum minus modes',
     )
     axes[1, 0].set(
-        xlabel='rank / size', ylabel='1 / rad², 1 / m²', title='Eigenvalues of the Hessian'
+        xlabel='rank / size',
+        ylabel='1 / rad², 1 / m²',
+        ylim=(None, 1e11),
+        title='Eigenvalues of the Hessian',
     )
     axes[1, 1].set(xlabel='iteration', ylabel='nats', title='Free energy, from its start')
-    axes[1, 0].legend(title=f'largest / smallest, {SPECTRUM} images', frameon=False)
-    axes[1, 1].legend(frameon=False)
+    axes[1, 0].legend(title=f'largest / smallest / 1000, {SPECTRUM} images', frameon=False)
+    shown = axes[1, 1].get_legend_handles_labels()
+    figure.legend(*shown, loc='outside upper center', ncols=4, frameon=False)
     for ax in (*axes[0], axes[1, 1]):
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     save(figure, 'smoothing_trajectories.png')
@@ -130,23 +146,23 @@ def draw_network(axes: Axes, found: ClipTrajectories) -> None:
     """All modes of each image by the depth of a joint, those that motions visit filled (VMS 2)."""
     names = found.body.joint_names
     joint = names.index(found_joint(found))
-    motions = [int(found.origins[i]) for i in found.pair]
-    counts = []
+    motions, counts = found.origins[[*found.pair]], []
     for t, (one, seen) in enumerate(zip(found.modes, found.visited(), strict=True)):
-        smoothed = found.weights[t]
         depths = seen_from_shoulders(found.joints(one.mixture.means), names)[:, joint, 2]
         counts.append((len(seen), int(seen.sum())))
-        kinds = [('modes that no path visits', ~seen, 'white', '#aaaaaa', 0)]
-        owners = found.found.shares[t].argmax(1)
-        others = seen & ~np.isin(owners, motions)
-        kinds.append(('visited by other motions', others, '#bbbbbb', '#888888', 1))
-        for which, (motion, colour) in enumerate(zip(motions, PAIR, strict=True)):
-            label = f'visited by motion {"AB"[which]}'
-            kinds.append((label, seen & (owners == motion), colour, colour, 2))
-        for label, own, face, edge, order in kinds:
+        smoothed = found.weights[t]
+        own = np.where(seen[:, None], found.found.shares[t][:, motions] * smoothed[:, None], 0.0)
+        a, b = (own > WELL * own.sum(0)).T
+        kinds = (
+            ('mode that no path visits', 8.0 * ~seen, 'white', '#aaaaaa'),
+            ('mode that paths visit, by its weight', (10 + 250 * smoothed) * seen, LIGHT, LIGHT),
+            ('that motion A visits', 14.0 * a, DARK, DARK),
+            ('that motion B visits', 50.0 * b, 'none', ACCENT),
+        )
+        for label, sizes, face, edge in kinds:
             axes.scatter(
-                np.full(own.sum(), t), depths[own], s=8 + 110 * smoothed[own], color=face,
-                edgecolors=edge, linewidths=0.6, zorder=order, label=label if t == 0 else None,
+                np.full(len(seen), t), depths, s=sizes, color=face, edgecolors=edge,
+                linewidths=np.where(sizes > 0, 1.0, 0.0), label=label if t == 0 else None,
             )  # fmt: skip
     joints = seen_from_shoulders(found.joints(found.optima.means), names)[:, :, joint, 2]
     for which, (i, colour) in enumerate(zip(found.pair, PAIR, strict=True)):
@@ -217,19 +233,18 @@ def draw_numbers(axes: np.ndarray, found: ClipTrajectories) -> None:
         for own, face in ((found.refined, colour), (~found.refined, 'white')):
             ax.scatter(rank[own], values[own], color=face, edgecolors=colour, s=26, zorder=3)
     spectra = [found.spectrum(images) for images in SPECTRUM]
-    ratios = ', '.join(f'{values[0] / values[-1]:.0f}' for values in spectra)
+    ratios = ', '.join(f'{values[0] / values[-1] / 1e3:.0f}' for values in spectra)
     for values, width in zip(spectra, (0.8, 1.4, 2.2), strict=True):
         label = f'{found.name}: {ratios}' if width > 2 else None
         share = np.linspace(0, 1, len(values))
         axes[1, 0].semilogy(share, values, **{**style, 'lw': width, 'label': label})
     descent = found.descent()
-    fallen = descent.free_energy - descent.free_energy[0]
+    fallen = descent.held_out - descent.held_out[0]
     axes[1, 1].plot(fallen, marker='.', **style)
-    held_out = descent.held_out - descent.held_out[0]
     print(  # noqa: T201
         f'{found.name}: {found.refined.sum()} refined of {len(moved)} motions, moved by '
         f'{moved.round(1)} degrees, -log likelihood {gains.round(2)} nats an image; eigenvalues '
-        f'{ratios}; free energy {fallen.round(1)}, on samples held out {held_out.round(1)}'
+        f'{ratios}; free energy {fallen.round(1)}'
     )
 
 
@@ -241,18 +256,18 @@ def draw_pair(found: ClipTrajectories, file: str) -> None:
     i, j = found.pair
     away = upper_distances(found.body, found.optima.means)[i, j]
     between = np.flatnonzero(away.max(1) > APART)
-    first, last = max(between[0] - 3, 0), min(between[-1] + 3, len(away) - 1)
-    columns = spread_columns(int(first), int(last), int(away.max(1).argmax()))
+    columns = spread(between, int(away.max(1).argmax()))
     weights, logs = found.optima.weights, found.optima.log_joint
     strips = {
         f'optimum {name},\n{100 * weights[k]:.0f} %': found.optima.means[k]
         for name, k in zip('AB', (i, j), strict=True)
     }
-    draw_strip(found, columns, strips, file, images=True)
+    draw_strip(found, columns, strips, file)
     print(  # noqa: T201
         f'{file}: {found.name} by {found.inputs} from {found.stamps[0] * 1e-9:.2f} s, optima of '
-        f'{weights[[i, j]].round(2)}, log p(X, R) of B {logs[j] - logs[i]:+.1f} nats; {found_joint(found)} '
-        f'apart by {away.max():.2f} m; {len(between)} of {len(away)} images beyond {APART} m'
+        f'{weights[[i, j]].round(2)}, log p(X, R) of B {logs[j] - logs[i]:+.1f} nats; '
+        f'{found_joint(found)} apart by {away.max():.2f} m; '
+        f'{len(between)} of {len(away)} images beyond {APART} m'
     )
 
 
@@ -262,58 +277,58 @@ def draw_samples(found: ClipTrajectories) -> None:
     away = upper_distances(found.body, drawn)
     between = away.mean((2, 3))
     i, j = np.unravel_index(int(np.argmax(between)), between.shape)
-    columns = spread_columns(0, len(found.modes) - 1, int(away[i, j].max(1).argmax()))
+    columns = spread(np.arange(len(found.modes)), int(away[i, j].max(1).argmax()))
     strips = {'one sample': drawn[i], 'another sample': drawn[j]}
-    draw_strip(found, columns, strips, 'smoothing_samples.png', images=True)
+    draw_strip(found, columns, strips, 'smoothing_samples.png')
     print(  # noqa: T201
         f'samples of {found.name}: torso and arms {1e3 * np.median(between[between > 0]):.0f} mm '
-        f'apart in the median, {1e3 * between[i, j]:.0f} mm at most, a joint {away[i, j].max():.2f} m'
+        f'apart in the median, {1e3 * between[i, j]:.0f} mm at most, a joint '
+        f'{away[i, j].max():.2f} m'
     )
 
 
-def spread_columns(first: int, last: int, shown: int) -> list[int]:
-    """Images of a span, of which the nearest is replaced by one that is to be shown."""
-    chosen = np.rint(np.linspace(first, last, COLUMNS)).astype(int)
+def spread(images: np.ndarray, shown: int) -> list[int]:
+    """Some of the images, of which the nearest is replaced by one that is to be shown."""
+    chosen = images[np.rint(np.linspace(0, len(images) - 1, COLUMNS)).astype(int)]
     chosen[np.abs(chosen - shown).argmin()] = shown
     return sorted(int(i) for i in chosen)
 
 
 def draw_strip(
-    found: ClipTrajectories, columns: Sequence[int], strips: dict[str, np.ndarray], file: str,
-    *, images: bool,
-) -> None:  # fmt: skip
-    """Poses over the images, and from above with the truth as a black skeleton."""
-    clip, names = found.recording.clip, found.recording.names
+    found: ClipTrajectories, columns: Sequence[int], strips: dict[str, np.ndarray], file: str
+) -> None:
+    """Two trajectories over the images, and torso and arms of both and the truth from above."""
+    clip, names = found.recording.clip, found.body.joint_names
     poses = np.array([*strips.values()])
     joints = found.joints(poses)
-    box = box_of(clip.camera.project(joints[:, columns].reshape(-1, 3)))
-    kinds = ['image'] * images + ['image', 'above'] * len(strips)
-    heights = [1.3 if kind == 'image' else 0.95 for kind in kinds]
+    left, right, bottom, top = box_of(clip.camera.project(joints[:, columns].reshape(-1, 3)))
+    more = max(0.0, LEAST_WIDTH * (bottom - top) - (right - left)) / 2
+    box = left - more, right + more, bottom, top
+    heights = [(box[2] - box[3]) / (box[1] - box[0])] * 3 + [1.0]
     figure, axes = plt.subplots(
-        len(kinds), len(columns), figsize=(8.4, sum(heights) + 0.4), dpi=90, layout='constrained',
+        4, len(columns), figsize=(8.4, 1.36 * sum(heights) + 0.3), dpi=90, layout='constrained',
         gridspec_kw={'height_ratios': heights},
     )  # fmt: skip
     by_stamp = dict(zip(clip.stamps, clip.images, strict=True))
-    own = found.body.joint_names
+    # Of both and of the truth: joints that are not drawn are unknown.
+    lines = [(joints[0], names, DARK, 3.4), (joints[1], names, ACCENT, 1.7)]
+    lines.append((found.truth, found.recording.names, 'black', 0.9))
     for column, index in enumerate(columns):
-        axes[0, column].set_title(f'{found.seconds[index]:.1f} s')
-        for row, title in enumerate(strips):
-            upper, lower = axes[2 * row + images, column], axes[2 * row + images + 1, column]
-            add_body(upper, found.body, poses[row, index], clip.camera, alpha=0.75)
-            add_body(lower, found.body, poses[row, index], None)
-            place = joints[row, index]
-            middle = place[0] - seen_from_shoulders(place, own)[0]
-            truth = seen_from_shoulders(found.truth[index], names) + middle - place[0]
-            add_skeleton(lower, truth[:, [0, 2]], names, 'black', 0.9)
-            frame_above(lower)
-            if column == 0:
-                upper.set_ylabel(title)
-                lower.set_ylabel('from above')
-        for axis, kind in zip(axes[:, column], kinds, strict=True):
-            if kind == 'image':
-                frame_image(axis, by_stamp[found.stamps[index]], box)
-    if images:
-        axes[0, 0].set_ylabel('image')
+        axes[0, column].set_title(f'{found.seconds[index]:.2f} s')
+        for row, axis in enumerate(axes[:3, column]):
+            if row:
+                add_body(axis, found.body, poses[row - 1, index], clip.camera, alpha=0.75)
+            frame_image(axis, by_stamp[found.stamps[index]], box)
+        for every, own, colour, width in lines:
+            places = seen_from_shoulders(every[index], own)[:, [0, 2]]
+            lower = [i for i, name in enumerate(own) if name not in (*UPPER, 'pelvis')]
+            places[lower] = np.nan
+            add_skeleton(axes[3, column], places, own, colour, width)
+        frame_above(axes[3, column])
+        axes[3, column].set(xlim=(-REACH, REACH), ylim=(-REACH, REACH))
+    labels = ('image', *strips, 'from above')
+    for axis, label, colour in zip(axes[:, 0], labels, ('black', *PAIR, 'black'), strict=True):
+        axis.set_ylabel(label, color=colour)
     save(figure, file)
 
 
