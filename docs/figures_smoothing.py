@@ -43,11 +43,11 @@ from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.ticker import MaxNLocator  # noqa: E402
 
 from benchmarks.clips import with_file  # noqa: E402
-from benchmarks.runs import IMAGES, KEYPOINTS  # noqa: E402
+from benchmarks.runs import BOTH, IMAGES, KEYPOINTS  # noqa: E402
 from hmt_ros.app.report.skeletons import save_picture  # noqa: E402
 
 # Clips of the development data, and what the tracker is given of each.
-CLIPS = {'exercise': IMAGES, 'laugh': KEYPOINTS, DESK: KEYPOINTS}
+CLIPS = {'exercise': BOTH, 'laugh': IMAGES, DESK: KEYPOINTS}
 LINES = {
     'exercise': ('#1f3a5f', '-'),
     'laugh': ('#c8553d', '--'),
@@ -62,7 +62,8 @@ PAIR = (DARK, ACCENT)
 COLUMNS = 6
 # Share of the paths of a motion that a mode which it visits has.
 WELL = 0.15
-# Half the width of torso and arms from above, m; the least width of a part of an image, of its height.
+# Half the width of torso and arms from above, m; width of a part of an image at least, of its
+# height.
 REACH, LEAST_WIDTH = 0.7, 0.75
 # Of the trajectories that are drawn from the posterior.
 DRAWN, SEED = 64, 0
@@ -155,9 +156,14 @@ def draw_network(axes: Axes, found: ClipTrajectories) -> None:
         a, b = (own > WELL * own.sum(0)).T
         kinds = (
             ('mode that no path visits', 8.0 * ~seen, 'white', '#aaaaaa'),
-            ('mode that paths visit, by its weight', (10 + 250 * smoothed) * seen, LIGHT, LIGHT),
-            ('that motion A visits', 14.0 * a, DARK, DARK),
-            ('that motion B visits', 50.0 * b, 'none', ACCENT),
+            (
+                'mode that paths visit, larger if heavier',
+                (10 + 250 * smoothed) * seen,
+                LIGHT,
+                LIGHT,
+            ),
+            ('visited by motion A', 14.0 * a, DARK, DARK),
+            ('visited by motion B', 50.0 * b, 'none', ACCENT),
         )
         for label, sizes, face, edge in kinds:
             axes.scatter(
