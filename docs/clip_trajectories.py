@@ -8,20 +8,16 @@ motions that are both likely stay apart longest.
 
 from __future__ import annotations
 
-import contextlib
-import io
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clips import ROOT, Clip, development_folder, read_clip, read_messages
+from benchmarks.clips import ROOT, Clip, development_folder, read_clip
 from benchmarks.runs import begun, stepped
-from hmt_ros.app import main as run_command
 from hmt_ros.body import Body
 from hmt_ros.body.mirror import free_limits, without_turns
 from hmt_ros.body.motion_prior import motion_prior
@@ -29,6 +25,7 @@ from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.image.image_sequence import ImageSequence, SeenImage
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.inference.mode_chain import backward_weights, drawn_paths
+from hmt_ros.sessions.camera_file import read_camera
 from hmt_ros.sessions.smoother_session import LIVELINESS
 from hmt_ros.smoothing import ImageModes, Link, MotionSmoother, TrajectoryMixture
 from hmt_ros.smoothing.image_refinement import refined_on_images
@@ -36,8 +33,6 @@ from hmt_ros.smoothing.likelihood import LikelihoodPart
 from hmt_ros.smoothing.motion_smoother import ANEW, PATHS, SmoothedMotions
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.smoothing.variational_mixture import VariationalMixture, minimise_free_energy
-from msg_tools.messages.camera_info import camera_from_info
-from msg_tools.messages.images import decode_image
 
 Array = NDArray[np.float64]
 
@@ -57,28 +52,12 @@ SAMPLES, ITERATIONS = 16, 15
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
-    """A clip, and where joints truly were.
-
-    Attributes:
-        clip: its own truth lacks joints that are not known in every image.
-        true: stamp -> (J, 3) m, camera frame; unknown ones are NaN.
-        names: (J,) of these joints.
-        whole: whether a subject file and all joints are there.
-    """
-
-    clip: Clip
-    true: Mapping[int, Array]
-    names: tuple[str, ...]
-    whole: bool
-
-
-@dataclass(frozen=True, eq=False)
 class ClipTrajectories:
     """A window of a clip, smoothed step by step.
 
     Attributes:
-        recording: of the clip.
+        clip: images.
+        truth: (T, J, 3) true joints of the body, see `from_shoulders`; unknown ones are NaN.
         inputs: what the tracker was given, see `benchmarks.runs`.
         body: of the person, as the tracker has it at last.
         modes: T of the filter.
@@ -91,10 +70,11 @@ class ClipTrajectories:
         pair: two of them that are likely and stay apart longest.
     """
 
-    recording: Recording
+    clip: Clip
+    truth: Array
     inputs: str
     body: Body
-    modes: tuple[ImageModes, ...]
+    modes: Sequence[ImageModes]
     smoother: MotionSmoother
     found: SmoothedMotions
     images: ImageSequence
@@ -104,33 +84,19 @@ class ClipTrajectories:
     pair: tuple[int, int]
 
     @property
-    def name(self) -> str:
-        """Of the clip."""
-        return self.recording.clip.name
-
-    @property
-    def stamps(self) -> list[int]:
-        """Times (T,), ns."""
-        return [one.stamp_ns for one in self.modes]
-
-    @property
     def seconds(self) -> Array:
         """Times (T,) from the first image on, s."""
-        return (np.array(self.stamps) - self.stamps[0]) * 1e-9
+        stamps = np.array([one.stamp_ns for one in self.modes])
+        return (stamps - stamps[0]) * 1e-9
 
     @property
     def paths(self) -> Array:
         """Poses (M, T, d) of the modes that the optima come from."""
         return self.found.evidence.means[self.origins]
 
-    @property
-    def truth(self) -> Array:
-        """Joints (T, J, 3), camera frame, m."""
-        return np.array([self.recording.true[stamp] for stamp in self.stamps])
-
     def joints(self, poses: Array) -> Array:
-        """Joints (..., J, 3) at poses (..., d), camera frame, m."""
-        return joints_of(self.body, poses)
+        """Joints (..., J, 3) at poses (..., d), see `from_shoulders`."""
+        return from_shoulders(joints_of(self.body, poses), self.body.joint_names)
 
     @property
     def weights(self) -> list[Array]:
@@ -199,8 +165,8 @@ def clip_trajectories(name: str, inputs: str) -> ClipTrajectories:
     Raises:
         ValueError: the clip can not be read, the filter has lost the person.
     """
-    recording = read_recording(name)
-    body, modes, shown = followed(recording, inputs)
+    clip, true, names = read(name)
+    body, modes, shown = followed(clip, inputs)
     prior = motion_prior(body)
     smoother = MotionSmoother(
         replace(prior, diffusion=LIVELINESS * prior.diffusion),
@@ -208,23 +174,31 @@ def clip_trajectories(name: str, inputs: str) -> ClipTrajectories:
         points=body.relative_joints,
     )
     windows = [slice(a, a + TIMES) for a in range(0, len(modes) - TIMES + 1, STEP)]
-    motions = [smoother.motions(first_of(modes[window])) for window in windows]
+    motions = [smoother.motions(modes[window]) for window in windows]
     scores = [apart(body, x.trajectories.weights, x.trajectories.means)[1] for x in motions]
     best = int(np.argmax(scores))
     window, found = windows[best], motions[best]
-    own = first_of(modes[window])
-    images = ImageSequence.of(shown[window], [one.stamp_ns for one in own], of_changes=True)
+    stamps = [one.stamp_ns for one in modes[window]]
+    images = ImageSequence.of(shown[window], stamps, of_changes=True)
     optima = refined_on_images(smoother, found, images)
     refined, origins = traced(body, optima.means, found.trajectories.means)
     weights = np.where(refined, optima.weights, 0.0) if refined.sum() > 1 else optima.weights
     pair = apart(body, weights, optima.means)[0]
+    truth = np.full((TIMES, len(body.joint_names), 3), np.nan)
+    known = [name for name in names if name in body.joint_names]
+    into, own = ([of.index(name) for name in known] for of in (body.joint_names, names))
+    truth[:, into] = np.array([true[stamp] for stamp in stamps])[:, own]
+    truth = from_shoulders(truth, body.joint_names)
     return ClipTrajectories(
-        recording, inputs, body, own, smoother, found, images, optima, origins, refined, pair
-    )
+        clip, truth, inputs, body, modes[window], smoother, found, images, optima, origins, refined,
+        pair,
+    )  # fmt: skip
 
 
-def read_recording(name: str) -> Recording:
-    """The demonstration, or a clip of the development data.
+def read(name: str) -> tuple[Clip, Mapping[int, Array], Sequence[str]]:
+    """The demonstration, or a clip of the development data; with its true joints by stamp, m.
+
+    Joints that are not known are NaN; the truth of the clip itself may lack them.
 
     Raises:
         ValueError: files that can not be read.
@@ -232,38 +206,25 @@ def read_recording(name: str) -> Recording:
     folder = ROOT / 'bags' / name if name == DEMONSTRATION else development_folder() / name
     if name != DESK:
         clip = read_clip(folder)
-        return Recording(clip, clip.truth.joints, clip.truth.joint_names, True)
+        return clip, clip.truth.joints, clip.truth.joint_names
     with np.load(folder / 'truth.npz') as content:
-        stamps, joints = content['stamps'].tolist(), content['joints'].astype(float)
-        names = tuple(map(str, content['joint_names']))
-    with tempfile.TemporaryDirectory() as made:
-        bag = Path(made) / name
-        command = ['import-video', folder / f'{name}.mp4', '--camera', folder / 'camera.yaml']
-        with contextlib.redirect_stdout(io.StringIO()):
-            code = run_command([*map(str, command), '-o', str(bag), '--quiet'])
-        if code != 0:
-            raise ValueError(f'{folder}: import-video failed')
-        info, messages = read_messages(bag)
-    known = np.isfinite(joints).all((0, 2))
-    truth = Truth(
-        name,
-        tuple(np.array(names)[known]),
-        dict(zip(stamps, joints[:, known], strict=True)),
-    )
-    images = [decode_image(message) for message in messages]
-    camera = camera_from_info(info, images[0].shape[1::-1])
-    clip = Clip(folder, camera, stamps, images, truth, {}, None)
-    return Recording(clip, dict(zip(stamps, joints, strict=True)), names, False)
+        joints, names = content['joints'].astype(float), content['joint_names'].tolist()
+        true = dict(zip(content['stamps'].tolist(), joints, strict=True))
+    video = cv2.VideoCapture(str(folder / f'{name}.mp4'))
+    images = [np.asarray(video.read()[1], dtype=np.uint8) for _ in true]
+    camera = read_camera(folder / 'camera.yaml', images[0].shape[1::-1])
+    shoulders = {t: one[[names.index(x) for x in SHOULDERS]] for t, one in true.items()}
+    truth = Truth(name, SHOULDERS, shoulders)
+    return Clip(folder, camera, [*true], images, truth, {}, None), true, names
 
 
-def followed(recording: Recording, inputs: str) -> tuple[Body, list[ImageModes], list[SeenImage]]:
+def followed(clip: Clip, inputs: str) -> tuple[Body, list[ImageModes], list[SeenImage]]:
     """Body, modes and evidence of the images in which the tracker sees the person.
 
     Raises:
         ValueError: the chain of modes breaks.
     """
-    clip = recording.clip
-    tracker, keypoints = begun(clip, inputs, with_subject=recording.whole)
+    tracker, keypoints = begun(clip, inputs, with_subject=clip.subject.is_file())
     chain: list[ImageModes] = []
     shown: list[SeenImage] = []
     identities = np.empty(0, dtype=np.int64)
@@ -282,13 +243,6 @@ def followed(recording: Recording, inputs: str) -> tuple[Body, list[ImageModes],
         shown.append(estimate.shown)
         identities = told.identities
     return body, chain, shown
-
-
-def first_of(modes: Sequence[ImageModes]) -> tuple[ImageModes, ...]:
-    """Modes of which nothing is known before the first."""
-    begins = np.empty((len(modes[0].link.weights), 0))
-    first = modes[0]._replace(link=modes[0].link._replace(origins=begins))
-    return first, *modes[1:]
 
 
 def joints_of(body: Body, poses: Array) -> Array:
@@ -310,8 +264,11 @@ def traced(body: Body, optima: Array, motions: Array) -> tuple[NDArray[np.bool_]
     return refined, away.argmin(1)
 
 
-def seen_from_shoulders(joints: Array, names: Sequence[str]) -> Array:
-    """Joints (..., J, 3) relative to the middle of the shoulders, which all clips know, m."""
+def from_shoulders(joints: Array, names: Sequence[str]) -> Array:
+    """Joints (..., J, 3), camera frame, relative to the middle of the shoulders, m.
+
+    All clips know where these are.
+    """
     middle = joints[..., [names.index(name) for name in SHOULDERS], :].mean(-2, keepdims=True)
     return joints - middle
 

@@ -36,7 +36,6 @@ from clip_trajectories import (  # noqa: E402
     UPPER,
     ClipTrajectories,
     clip_trajectories,
-    seen_from_shoulders,
     upper_distances,
 )
 from matplotlib.axes import Axes  # noqa: E402
@@ -83,8 +82,8 @@ def main() -> int:
         found = [clip_trajectories(name, inputs) for name, inputs in CLIPS.items()]
         draw_clips([*found, demonstration])
         for one in found:
-            if one.name in STRIPS:
-                draw_pair(one, STRIPS[one.name])
+            if one.clip.name in STRIPS:
+                draw_pair(one, STRIPS[one.clip.name])
     return 0
 
 
@@ -100,8 +99,7 @@ def draw_clips(found: Sequence[ClipTrajectories]) -> None:
     shown = axes[0].get_legend_handles_labels()
     legend = figure.legend(*shown, loc='outside upper center', ncols=3, frameon=False)
     for handle in legend.legend_handles[: len(shown[0]) - 3]:
-        handle.set_sizes([40.0])
-        handle.set_linewidths([1.0])
+        handle.set(sizes=[40.0], linewidths=[1.0])
     save(figure, 'smoothing_network.png')
 
     figure, axes = plt.subplots(
@@ -149,7 +147,7 @@ def draw_network(axes: Axes, found: ClipTrajectories) -> None:
     joint = names.index(found_joint(found))
     motions, counts = found.origins[[*found.pair]], []
     for t, (one, seen) in enumerate(zip(found.modes, found.visited(), strict=True)):
-        depths = seen_from_shoulders(found.joints(one.mixture.means), names)[:, joint, 2]
+        depths = found.joints(one.mixture.means)[:, joint, 2]
         counts.append((len(seen), int(seen.sum())))
         smoothed = found.weights[t]
         own = np.where(seen[:, None], found.found.shares[t][:, motions] * smoothed[:, None], 0.0)
@@ -170,15 +168,14 @@ def draw_network(axes: Axes, found: ClipTrajectories) -> None:
                 np.full(len(seen), t), depths, s=sizes, color=face, edgecolors=edge,
                 linewidths=np.where(sizes > 0, 1.0, 0.0), label=label if t == 0 else None,
             )  # fmt: skip
-    joints = seen_from_shoulders(found.joints(found.optima.means), names)[:, :, joint, 2]
-    for which, (i, colour) in enumerate(zip(found.pair, PAIR, strict=True)):
-        axes.plot(joints[i], color=colour, lw=1.2, zorder=3, label=f'optimum {"AB"[which]}')
-    if names[joint] in found.recording.names:
-        at = found.recording.names.index(names[joint])
-        true = seen_from_shoulders(found.truth, found.recording.names)[:, at, 2]
-        axes.plot(true, color='black', ls=':', lw=1.4, zorder=4, label='truth')
+    i, j = found.pair
+    depths = found.joints(found.optima.means)[:, :, joint, 2]
+    axes.plot(depths[i], color=DARK, lw=1.2, zorder=3, label='optimum A')
+    axes.plot(depths[j], color=ACCENT, lw=1.2, zorder=3, label='optimum B')
+    axes.plot(found.truth[:, joint, 2], color='black', ls=':', lw=1.4, zorder=4, label='truth')
     modes, visited = np.mean(counts, axis=0)
-    title = f'{found.name}, {found.inputs}: {visited:.1f} of {modes:.1f} modes an image are visited'
+    seen = f'{visited:.1f} of {modes:.1f} modes an image are visited'
+    title = f'{found.clip.name}, {found.inputs}: {seen}'
     axes.set_title(title, loc='left')
     axes.set(ylabel=f'depth of\n{names[joint].replace("_", " ")}, m', xlim=(-1, TIMES))
     print(f'network {title}')  # noqa: T201
@@ -192,31 +189,23 @@ def found_joint(found: ClipTrajectories) -> str:
 
 def draw_arm(axes: np.ndarray, found: ClipTrajectories) -> None:
     """The arm that refinement moves most: its bending, and the depth of its end (VMS 3, 4)."""
-    names, best = found.body.joint_names, found.pair[0]
+    best, names = found.pair[0], found.body.joint_names
     modes, optimum = (found.joints(poses[best]) for poses in (found.paths, found.optima.means))
-    moved = np.abs(depth(modes, names, 'wrist') - depth(optimum, names, 'wrist')).max(1)
-    side = ('left', 'right')[int(moved.argmax())]
+    arms = [
+        [names.index(f'{side}_{name}') for name in ('shoulder', 'elbow', 'wrist')]
+        for side in ('left', 'right')
+    ]
+    arm = max(arms, key=lambda arm: np.abs(modes - optimum)[:, arm[2], 2].max())
     lines = (
-        (modes, names, {'color': LIGHT, 'marker': '.', 'ms': 4, 'lw': 0.9, 'label': 'modes'}),
-        (optimum, names, {'color': DARK, 'lw': 1.6, 'label': 'optimum'}),
-        (found.truth, found.recording.names,
-         {'color': ACCENT, 'ls': ':', 'lw': 1.8, 'label': 'truth'}),
-    )  # fmt: skip
-    for joints, own, style in lines:
-        arm = [own.index(f'{side}_{name}') for name in ('shoulder', 'elbow', 'wrist')]
+        (modes, {'color': LIGHT, 'marker': '.', 'ms': 4, 'lw': 0.9, 'label': 'modes'}),
+        (optimum, {'color': DARK, 'lw': 1.6, 'label': 'optimum'}),
+        (found.truth, {'color': ACCENT, 'ls': ':', 'lw': 1.8, 'label': 'truth'}),
+    )
+    for joints, style in lines:
         axes[0].plot(found.seconds, bending(joints[:, arm]), **style)
-        axes[1].plot(
-            found.seconds, depth(joints, own, 'wrist')[('left', 'right').index(side)], **style
-        )
-    axes[0].set_title(f'{found.name}: {side} elbow')
-    axes[1].set_title(f'{side} wrist')
-    axes[1].set_xlabel('s')
-
-
-def depth(joints: np.ndarray, names: Sequence[str], name: str) -> np.ndarray:
-    """How far the left and the right one (2, T) are beyond the middle of the shoulders, m."""
-    own = [names.index(f'{side}_{name}') for side in ('left', 'right')]
-    return seen_from_shoulders(joints, names)[:, own, 2].T
+        axes[1].plot(found.seconds, joints[:, arm[2], 2], **style)
+    axes[0].set_title(f'{found.clip.name}: {names[arm[1]].replace("_", " ")}')
+    axes[1].set(title=names[arm[2]].replace('_', ' '), xlabel='s')
 
 
 def bending(joints: np.ndarray) -> np.ndarray:
@@ -229,8 +218,8 @@ def bending(joints: np.ndarray) -> np.ndarray:
 
 def draw_numbers(axes: np.ndarray, found: ClipTrajectories) -> None:
     """Differences, likelihoods, eigenvalues and free energy of a clip (VMS 5 to 8)."""
-    colour, line = LINES[found.name]
-    style: dict[str, Any] = {'color': colour, 'ls': line, 'lw': 1.4, 'label': found.name}
+    colour, line = LINES[found.clip.name]
+    style: dict[str, Any] = {'color': colour, 'ls': line, 'lw': 1.4, 'label': found.clip.name}
     moved = np.degrees(np.abs(found.optima.means - found.paths).mean((1, 2)))
     gains = (found.observed(found.optima.means) - found.observed(found.paths)) / len(found.modes)
     rank = np.arange(1, len(moved) + 1)
@@ -241,14 +230,14 @@ def draw_numbers(axes: np.ndarray, found: ClipTrajectories) -> None:
     spectra = [found.spectrum(images) for images in SPECTRUM]
     ratios = ', '.join(f'{values[0] / values[-1] / 1e3:.0f}' for values in spectra)
     for values, width in zip(spectra, (0.8, 1.4, 2.2), strict=True):
-        label = f'{found.name}: {ratios}' if width > 2 else None
+        label = f'{found.clip.name}: {ratios}' if width > 2 else None
         share = np.linspace(0, 1, len(values))
         axes[1, 0].semilogy(share, values, **{**style, 'lw': width, 'label': label})
     descent = found.descent()
     fallen = descent.held_out - descent.held_out[0]
     axes[1, 1].plot(fallen, marker='.', **style)
     print(  # noqa: T201
-        f'{found.name}: {found.refined.sum()} refined of {len(moved)} motions, moved by '
+        f'{found.clip.name}: {found.refined.sum()} refined of {len(moved)} motions, moved by '
         f'{moved.round(1)} degrees, -log likelihood {gains.round(2)} nats an image; eigenvalues '
         f'{ratios}; free energy {fallen.round(1)}'
     )
@@ -270,7 +259,7 @@ def draw_pair(found: ClipTrajectories, file: str) -> None:
     }
     draw_strip(found, columns, strips, file)
     print(  # noqa: T201
-        f'{file}: {found.name} by {found.inputs} from {found.stamps[0] * 1e-9:.2f} s, optima of '
+        f'{file}: {found.clip.name} by {found.inputs}, optima of '
         f'{weights[[i, j]].round(2)}, log p(X, R) of B {logs[j] - logs[i]:+.1f} nats; '
         f'{found_joint(found)} apart by {away.max():.2f} m; '
         f'{len(between)} of {len(away)} images beyond {APART} m'
@@ -287,7 +276,8 @@ def draw_samples(found: ClipTrajectories) -> None:
     strips = {'one sample': drawn[i], 'another sample': drawn[j]}
     draw_strip(found, columns, strips, 'smoothing_samples.png')
     print(  # noqa: T201
-        f'samples of {found.name}: torso and arms {1e3 * np.median(between[between > 0]):.0f} mm '
+        f'samples of {found.clip.name}: torso and arms '
+        f'{1e3 * np.median(between[between > 0]):.0f} mm '
         f'apart in the median, {1e3 * between[i, j]:.0f} mm at most, a joint '
         f'{away[i, j].max():.2f} m'
     )
@@ -304,10 +294,11 @@ def draw_strip(
     found: ClipTrajectories, columns: Sequence[int], strips: dict[str, np.ndarray], file: str
 ) -> None:
     """Two trajectories over the images, and torso and arms of both and the truth from above."""
-    clip, names = found.recording.clip, found.body.joint_names
+    clip, names = found.clip, found.body.joint_names
+    lower = [i for i, name in enumerate(names) if name not in (*UPPER, 'pelvis')]
     poses = np.array([*strips.values()])
-    joints = found.joints(poses)
-    left, right, bottom, top = box_of(clip.camera.project(joints[:, columns].reshape(-1, 3)))
+    shown = np.concatenate([found.body.joint_positions(one[columns]) for one in poses])
+    left, right, bottom, top = box_of(clip.camera.project(shown.reshape(-1, 3)))
     more = max(0.0, LEAST_WIDTH * (bottom - top) - (right - left)) / 2
     box = left - more, right + more, bottom, top
     heights = [(box[2] - box[3]) / (box[1] - box[0])] * 3 + [1.0]
@@ -316,20 +307,17 @@ def draw_strip(
         gridspec_kw={'height_ratios': heights},
     )  # fmt: skip
     by_stamp = dict(zip(clip.stamps, clip.images, strict=True))
-    # Of both and of the truth: joints that are not drawn are unknown.
-    lines = [(joints[0], names, DARK, 3.4), (joints[1], names, ACCENT, 1.7)]
-    lines.append((found.truth, found.recording.names, 'black', 0.9))
+    # Of both and the truth; what is unknown is not drawn.
+    above = np.array([*found.joints(poses), found.truth])[..., [0, 2]]
+    above[:, :, lower] = np.nan
     for column, index in enumerate(columns):
         axes[0, column].set_title(f'{found.seconds[index]:.2f} s')
         for row, axis in enumerate(axes[:3, column]):
             if row:
                 add_body(axis, found.body, poses[row - 1, index], clip.camera, alpha=0.75)
-            frame_image(axis, by_stamp[found.stamps[index]], box)
-        for every, own, colour, width in lines:
-            places = seen_from_shoulders(every[index], own)[:, [0, 2]]
-            lower = [i for i, name in enumerate(own) if name not in (*UPPER, 'pelvis')]
-            places[lower] = np.nan
-            add_skeleton(axes[3, column], places, own, colour, width)
+            frame_image(axis, by_stamp[found.modes[index].stamp_ns], box)
+        for every, colour, width in zip(above, (*PAIR, 'black'), (3.4, 1.7, 0.9), strict=True):
+            add_skeleton(axes[3, column], every[index], names, colour, width)
         frame_above(axes[3, column])
         axes[3, column].set(xlim=(-REACH, REACH), ylim=(-REACH, REACH))
     labels = ('image', *strips, 'from above')
