@@ -10,11 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.clips import ROOT, Clip, development_folder, read_clip
 from benchmarks.runs import begun, stepped
@@ -23,6 +21,7 @@ from hmt_ros.body.mirror import free_limits, without_turns
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.image.image_sequence import ImageSequence, SeenImage
+from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.inference.mode_chain import backward_weights, drawn_paths
 from hmt_ros.sessions.camera_file import read_camera
@@ -34,12 +33,12 @@ from hmt_ros.smoothing.motion_smoother import ANEW, PATHS, SmoothedMotions
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.smoothing.variational_mixture import VariationalMixture, minimise_free_energy
 
-Array = NDArray[np.float64]
-
 # Images of a window, and the steps from window to window.
 TIMES, STEP = 47, 5
 # Distance of a joint from which on motions are apart, m, and the least weight of a likely one.
 APART, LIKELY = 0.2, 0.1
+# Images that likely motions which are not apart count.
+TIE = 1e-6
 # Joints that are looked at: those of torso and arms.
 UPPER = (
     'neck', 'head', *(f'{side}_{x}' for x in ('shoulder', 'elbow', 'wrist', 'hand')
@@ -79,8 +78,8 @@ class ClipTrajectories:
     found: SmoothedMotions
     images: ImageSequence
     optima: TrajectoryMixture
-    origins: NDArray[np.intp]
-    refined: NDArray[np.bool_]
+    origins: Index
+    refined: Mask
     pair: tuple[int, int]
 
     @property
@@ -103,11 +102,10 @@ class ClipTrajectories:
         """Of the modes (K_t,) given all images."""
         return backward_weights([one.link for one in self.modes])
 
-    def visited(self) -> list[NDArray[np.bool_]]:
-        """Which modes (K_t,) paths go through that are drawn from the chain."""
-        links = [one.link for one in self.modes]
-        nodes, _ = drawn_paths(links, PATHS, self.smoother.seed)
-        return [np.isin(np.arange(len(link.weights)), nodes[:, t]) for t, link in enumerate(links)]
+    @property
+    def paths_through(self) -> Index:
+        """Modes (N, T) that paths go through which are drawn from the chain."""
+        return drawn_paths([one.link for one in self.modes], PATHS, self.smoother.seed)[0]
 
     def observed(self, poses: Array) -> Array:
         """-log p (M,) of the images along poses (M, T, d), nats."""
@@ -116,13 +114,12 @@ class ClipTrajectories:
         value = self.images.energy(poses.reshape(-1, d), at).value
         return np.asarray(value.reshape(count, times).sum(1))
 
-    @cached_property
-    def prior(self) -> TrajectoryPrior:
-        """Of the states, as that of the refinement."""
+    def prior(self, count: int) -> TrajectoryPrior:
+        """Of the states of the first images, as that of the refinement."""
         of = self.origins[self.refined]
-        begins = self.found.begins[of, 1:].any(0)
+        begins = self.found.begins[of, 1:count].any(0)
         noise = np.where(begins, ANEW, self.found.liveliness[of].max())
-        return self.smoother.dynamics.prior(np.diff(self.seconds), noise=noise)
+        return self.smoother.dynamics.prior(np.diff(self.seconds[:count]), noise=noise)
 
     def spectrum(self, count: int) -> Array:
         """Eigenvalues, falling, of the Hessian at the optimum of the first images alone (VMS 7).
@@ -130,16 +127,16 @@ class ClipTrajectories:
         The optimum is the one next to the heaviest of all images; velocities are integrated out.
         Metres and radians stand beside each other, as in the paper.
         """
-        dynamics, d = self.smoother.dynamics, self.body.dimension
-        prior = dynamics.prior(np.diff(self.seconds[:count]), noise=self.found.liveliness.max())
-        start = self.optima.states[self.refined][:1, :count]
-        part = LikelihoodPart(self.images, 0, count)
-        factor = refine(start, prior, part, *free_limits(self.body)).factors[0]
-        n = start.shape[2]
+        start, part = (
+            self.optima.states[self.refined][:1, :count],
+            LikelihoodPart(self.images, 0, count),
+        )
+        found = refine(start, self.prior(count), part, *free_limits(self.body))
+        d, n = self.body.dimension, start.shape[2]
         units = np.zeros((count, d, count, n))
         for t in range(count):
             units[t, :, t, :d] = np.eye(d)
-        columns = factor.solve(units.reshape(count * d, count, n))
+        columns = found.factors[0].solve(units.reshape(count * d, count, n))
         return 1.0 / np.linalg.eigvalsh(columns[:, :, :d].reshape(count * d, count * d))
 
     def descent(self) -> VariationalMixture:
@@ -150,7 +147,7 @@ class ClipTrajectories:
             weights / weights.sum(),
             self.optima.states[self.refined],
             [self.optima.factors[i] for i in np.flatnonzero(self.refined)],
-            self.prior,
+            self.prior(TIMES),
             self.images,
             low=low,
             high=high,
@@ -251,7 +248,7 @@ def joints_of(body: Body, poses: Array) -> Array:
     return flat.reshape(*poses.shape[:-1], *flat.shape[1:])
 
 
-def traced(body: Body, optima: Array, motions: Array) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+def traced(body: Body, optima: Array, motions: Array) -> tuple[Mask, Index]:
     """Whether optima (M, T, d) are refined, and the motion of (N, T, d) that each comes from, (M,).
 
     It is the same motion or, if they are refined, the nearest of those that are not among the
@@ -281,20 +278,17 @@ def upper_distances(body: Body, poses: Array) -> Array:
 
 
 def apart(body: Body, weights: Array, poses: Array) -> tuple[tuple[int, int], float]:
-    """The two motions that stay apart longest, the heavier first, and the number of images.
+    """The two motions that stay apart longest, the heavier first, and their score.
 
-    Images are counted by the smaller weight, and only where both motions are likely; where there
-    are no such two, the heaviest two are told, with 0.
+    That is the number of images times the smaller weight, and of motions that are not both likely
+    next to nothing.
 
     Args:
-        weights: (M,).
+        weights: (M,) falling; 0: not to be chosen.
         poses: (M, T, d).
     """
     images = (upper_distances(body, poses).max(3) > APART).sum(2)
-    least = np.minimum(weights[:, None], weights)
-    score = np.triu(images * np.where(least >= LIKELY, least, 0.0), 1)
+    least = np.minimum.outer(weights, weights)
+    score = np.triu(least * (images * (least >= LIKELY) + TIE), 1)
     i, j = np.unravel_index(int(np.argmax(score)), score.shape)
-    if score[i, j] == 0:
-        i, j = np.argsort(-weights, kind='stable')[[0, min(1, len(weights) - 1)]]
-    i, j = sorted((int(i), int(j)), key=lambda x: -weights[x])
-    return (i, j), float(score.max())
+    return (int(i), int(j)), float(score.max())

@@ -144,9 +144,11 @@ def draw_clips(found: Sequence[ClipTrajectories]) -> None:
 def draw_network(axes: Axes, found: ClipTrajectories) -> None:
     """All modes of each image by the depth of a joint, those that motions visit filled (VMS 2)."""
     names = found.body.joint_names
-    joint = names.index(found_joint(found))
+    away = upper_distances(found.body, found.optima.means)[found.pair].max(0)
+    joint = names.index(UPPER[int(away.argmax())])
     motions, counts = found.origins[[*found.pair]], []
-    for t, (one, seen) in enumerate(zip(found.modes, found.visited(), strict=True)):
+    for t, (one, nodes) in enumerate(zip(found.modes, found.paths_through.T, strict=True)):
+        seen = np.isin(np.arange(len(one.mixture)), nodes)
         depths = found.joints(one.mixture.means)[:, joint, 2]
         counts.append((len(seen), int(seen.sum())))
         smoothed = found.weights[t]
@@ -179,12 +181,6 @@ def draw_network(axes: Axes, found: ClipTrajectories) -> None:
     axes.set_title(title, loc='left')
     axes.set(ylabel=f'depth of\n{names[joint].replace("_", " ")}, m', xlim=(-1, TIMES))
     print(f'network {title}')  # noqa: T201
-
-
-def found_joint(found: ClipTrajectories) -> str:
-    """The joint by which the two motions differ most."""
-    i, j = found.pair
-    return UPPER[int(upper_distances(found.body, found.optima.means)[i, j].max(0).argmax())]
 
 
 def draw_arm(axes: np.ndarray, found: ClipTrajectories) -> None:
@@ -248,39 +244,21 @@ def draw_numbers(axes: np.ndarray, found: ClipTrajectories) -> None:
 
 def draw_pair(found: ClipTrajectories, file: str) -> None:
     """Two likely optima that stay apart longest, over images and from above (VMS 9)."""
-    i, j = found.pair
-    away = upper_distances(found.body, found.optima.means)[i, j]
-    between = np.flatnonzero(away.max(1) > APART)
-    columns = spread(between, int(away.max(1).argmax()))
-    weights, logs = found.optima.weights, found.optima.log_joint
-    strips = {
-        f'optimum {name},\n{100 * weights[k]:.0f} %': found.optima.means[k]
-        for name, k in zip('AB', (i, j), strict=True)
-    }
-    draw_strip(found, columns, strips, file)
-    print(  # noqa: T201
-        f'{file}: {found.clip.name} by {found.inputs}, optima of '
-        f'{weights[[i, j]].round(2)}, log p(X, R) of B {logs[j] - logs[i]:+.1f} nats; '
-        f'{found_joint(found)} apart by {away.max():.2f} m; '
-        f'{len(between)} of {len(away)} images beyond {APART} m'
-    )
+    pair = [*found.pair]
+    weights, logs = found.optima.weights[pair], found.optima.log_joint[pair]
+    titles = [f'optimum {name},\n{100 * x:.0f} %' for name, x in zip('AB', weights, strict=True)]
+    draw_strip(found, found.optima.means[pair], titles, file)
+    print(f'weights {weights.round(2)}, log p(X, R) of B {logs[1] - logs[0]:+.1f}')  # noqa: T201
 
 
 def draw_samples(found: ClipTrajectories) -> None:
     """The two farthest apart of samples of the posterior (VMS 10)."""
     drawn = found.optima.sample(DRAWN, np.random.default_rng(SEED))
-    away = upper_distances(found.body, drawn)
-    between = away.mean((2, 3))
-    i, j = np.unravel_index(int(np.argmax(between)), between.shape)
-    columns = spread(np.arange(len(found.modes)), int(away[i, j].max(1).argmax()))
-    strips = {'one sample': drawn[i], 'another sample': drawn[j]}
-    draw_strip(found, columns, strips, 'smoothing_samples.png')
-    print(  # noqa: T201
-        f'samples of {found.clip.name}: torso and arms '
-        f'{1e3 * np.median(between[between > 0]):.0f} mm '
-        f'apart in the median, {1e3 * between[i, j]:.0f} mm at most, a joint '
-        f'{away[i, j].max():.2f} m'
-    )
+    away = upper_distances(found.body, drawn).mean((2, 3))
+    both = np.unravel_index(int(np.argmax(away)), away.shape)
+    titles = ['one sample', 'another sample']
+    draw_strip(found, drawn[[*both]], titles, 'smoothing_samples.png')
+    print(f'mean distances: median {np.median(away[away > 0]):.3f}, {away[both]:.3f} m')  # noqa: T201
 
 
 def spread(images: np.ndarray, shown: int) -> list[int]:
@@ -291,12 +269,18 @@ def spread(images: np.ndarray, shown: int) -> list[int]:
 
 
 def draw_strip(
-    found: ClipTrajectories, columns: Sequence[int], strips: dict[str, np.ndarray], file: str
+    found: ClipTrajectories, poses: np.ndarray, titles: Sequence[str], file: str
 ) -> None:
-    """Two trajectories over the images, and torso and arms of both and the truth from above."""
+    """Two trajectories (2, T, d) over images where they are apart; from above with the truth."""
+    away = upper_distances(found.body, poses)[0, 1]
+    between = np.flatnonzero(away.max(1) > APART)
+    columns = spread(between, int(away.max(1).argmax()))
+    print(  # noqa: T201
+        f'{file}: {UPPER[int(away.max(0).argmax())]} apart by {away.max():.2f} m, '
+        f'{len(between)} of {len(away)} images beyond {APART} m'
+    )
     clip, names = found.clip, found.body.joint_names
     lower = [i for i, name in enumerate(names) if name not in (*UPPER, 'pelvis')]
-    poses = np.array([*strips.values()])
     shown = np.concatenate([found.body.joint_positions(one[columns]) for one in poses])
     left, right, bottom, top = box_of(clip.camera.project(shown.reshape(-1, 3)))
     more = max(0.0, LEAST_WIDTH * (bottom - top) - (right - left)) / 2
@@ -320,7 +304,7 @@ def draw_strip(
             add_skeleton(axes[3, column], every[index], names, colour, width)
         frame_above(axes[3, column])
         axes[3, column].set(xlim=(-REACH, REACH), ylim=(-REACH, REACH))
-    labels = ('image', *strips, 'from above')
+    labels = ('image', *titles, 'from above')
     for axis, label, colour in zip(axes[:, 0], labels, ('black', *PAIR, 'black'), strict=True):
         axis.set_ylabel(label, color=colour)
     save(figure, file)
