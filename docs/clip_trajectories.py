@@ -1,197 +1,294 @@
-"""What VMS shows of its sequence, on a clip that the tracker follows: from its modes to its optima.
+"""What VMS shows of its sequence, on a window of a clip: from the modes of the filter to optima.
 
-The modes of the likelihoods of `TIMES` images make the network; `PATHS` paths through it are
-refined, and the free energy is minimised from their optima, as in the paper (VMS 4 to 7). Errors of
-images count as independent, as they do there; `smoother_node` counts what is new of an image alone.
+The evidence is that of the nodes: modes, posterior weights and ancestry of the likelihood mixtures.
+The motions of the window are found as `smoother_node` finds them, and refined on the images as
+`person_node` does on request (VMS 4 to 7). Of the windows of a clip that one is taken in which two
+motions that are both likely stay apart longest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import logsumexp
 
-from benchmarks.runs import Seen
+from benchmarks.clips import ROOT, Clip, development_folder, read_clip
+from benchmarks.runs import begun, stepped
 from hmt_ros.body import Body
 from hmt_ros.body.mirror import free_limits, without_turns
 from hmt_ros.body.motion_prior import motion_prior
-from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.energy import Derivatives
-from hmt_ros.sessions.image_evidence import Evidence
-from hmt_ros.sessions.smoother_session import MERGED
-from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, Paths
-from hmt_ros.smoothing.likelihood import counted
-from hmt_ros.smoothing.mode_sequence import ModeSequence
-from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories, limits_of_states, refine
+from hmt_ros.evaluation.track_scores import Truth
+from hmt_ros.image.image_sequence import ImageSequence, SeenImage
+from hmt_ros.inference.arrays import Array, Index, Mask
+from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
+from hmt_ros.inference.mode_chain import backward_weights, drawn_paths
+from hmt_ros.sessions.camera_file import read_camera
+from hmt_ros.sessions.smoother_session import LIVELINESS
+from hmt_ros.smoothing import ImageModes, Link, MotionSmoother, TrajectoryMixture
+from hmt_ros.smoothing.image_refinement import refined_on_images
+from hmt_ros.smoothing.likelihood import LikelihoodPart
+from hmt_ros.smoothing.motion_smoother import ANEW, PATHS, SmoothedMotions
+from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.smoothing.variational_mixture import VariationalMixture, minimise_free_energy
 
-Array = NDArray[np.float64]
-
-# Images, and how many images of the clip lie between two of them (VMS 7: every second or third).
-TIMES, EVERY = 47, 2
-PATHS = 64
+# Images of a window, and the steps from window to window.
+TIMES, STEP = 47, 5
+# Distance of a joint from which on motions are apart, m, and the least weight of a likely one.
+APART, LIKELY = 0.2, 0.1
+# Images that likely motions which are not apart count.
+TIE = 1e-6
+# Joints that are looked at: those of torso and arms.
+UPPER = (
+    'neck', 'head', *(f'{side}_{x}' for x in ('shoulder', 'elbow', 'wrist', 'hand')
+                      for side in ('left', 'right')),
+)  # fmt: skip
+SHOULDERS = ('left_shoulder', 'right_shoulder')
+DEMONSTRATION, DESK = 'reach', 'desk_1'
 # Of the descent of the free energy.
 SAMPLES, ITERATIONS = 16, 15
 
 
 @dataclass(frozen=True, eq=False)
 class ClipTrajectories:
-    """Images of a clip, smoothed step by step.
+    """A window of a clip, smoothed step by step.
 
     Attributes:
+        clip: images.
+        truth: (T, J, 3) true joints of the body, see `from_shoulders`; unknown ones are NaN.
+        inputs: what the tracker was given, see `benchmarks.runs`.
         body: of the person, as the tracker has it at last.
-        stamps: (T,) ns.
-        sequence: the modes of the likelihoods.
-        paths: `PATHS` of them, the best between each pair of ends and, where these are fewer, more.
-        starts: (P, T, n) states along them.
-        refined: the optimum that each of them leads to.
-        visiting: T arrays (K_1, K_t), how probably the paths from each first mode visit a mode.
-        start_energies: (P,) -log p of the observations along the paths.
-        lower, upper: (d,) limits of poses.
+        modes: T of the filter.
+        smoother: of the node, without resting feet.
+        found: N motions, as the node has them.
+        images: T of them, as observations.
+        optima: M motions, of which the distinct ones are refined on the images.
+        origins: (M,) motion that each comes from.
+        refined: (M,) whether they are refined.
+        pair: two of them that are likely and stay apart longest.
     """
 
+    clip: Clip
+    truth: Array
+    inputs: str
     body: Body
-    stamps: tuple[int, ...]
-    sequence: ModeSequence
-    paths: Paths
-    starts: Array
-    refined: RefinedTrajectories
-    visiting: tuple[Array, ...]
-    start_energies: Array
-    lower: Array
-    upper: Array
+    modes: Sequence[ImageModes]
+    smoother: MotionSmoother
+    found: SmoothedMotions
+    images: ImageSequence
+    optima: TrajectoryMixture
+    origins: Index
+    refined: Mask
+    pair: tuple[int, int]
 
     @property
     def seconds(self) -> Array:
         """Times (T,) from the first image on, s."""
-        return (np.array(self.stamps) - self.stamps[0]) * 1e-9
+        stamps = np.array([one.stamp_ns for one in self.modes])
+        return (stamps - stamps[0]) * 1e-9
 
-    @cached_property
-    def distinct(self) -> RefinedTrajectories:
-        """The optima without repetitions, the most probable first."""
-        return self.refined.without_duplicates()
+    @property
+    def paths(self) -> Array:
+        """Poses (M, T, d) of the modes that the optima come from."""
+        return self.found.evidence.means[self.origins]
 
-    def joints(self, states: Array) -> Array:
-        """Joints (..., J, 3) at states (..., n), camera frame, m."""
-        d = self.sequence.dynamics.dimension
-        flat = states[..., :d].reshape(-1, d)
-        return self.body.joint_positions(flat).reshape(*states.shape[:-1], -1, 3)
+    def joints(self, poses: Array) -> Array:
+        """Joints (..., J, 3) at poses (..., d), see `from_shoulders`."""
+        return from_shoulders(joints_of(self.body, poses), self.body.joint_names)
+
+    @property
+    def weights(self) -> list[Array]:
+        """Of the modes (K_t,) given all images."""
+        return backward_weights([one.link for one in self.modes])
+
+    @property
+    def paths_through(self) -> Index:
+        """Modes (N, T) that paths go through which are drawn from the chain."""
+        return drawn_paths([one.link for one in self.modes], PATHS, self.smoother.seed)[0]
+
+    def observed(self, poses: Array) -> Array:
+        """-log p (M,) of the images along poses (M, T, d), nats."""
+        count, times, d = poses.shape
+        at = np.tile(np.arange(times), count)
+        value = self.images.energy(poses.reshape(-1, d), at).value
+        return np.asarray(value.reshape(count, times).sum(1))
+
+    def prior(self, count: int) -> TrajectoryPrior:
+        """Of the states of the first images, as that of the refinement."""
+        of = self.origins[self.refined]
+        begins = self.found.begins[of, 1:count].any(0)
+        noise = np.where(begins, ANEW, self.found.liveliness[of].max())
+        return self.smoother.dynamics.prior(np.diff(self.seconds[:count]), noise=noise)
+
+    def spectrum(self, count: int) -> Array:
+        """Eigenvalues, falling, of the Hessian at the optimum of the first images alone (VMS 7).
+
+        The optimum is the one next to the heaviest of all images; velocities are integrated out.
+        Metres and radians stand beside each other, as in the paper.
+        """
+        start, part = (
+            self.optima.states[self.refined][:1, :count],
+            LikelihoodPart(self.images, 0, count),
+        )
+        found = refine(start, self.prior(count), part, *free_limits(self.body))
+        d, n = self.body.dimension, start.shape[2]
+        units = np.zeros((count, d, count, n))
+        for t in range(count):
+            units[t, :, t, :d] = np.eye(d)
+        columns = found.factors[0].solve(units.reshape(count * d, count, n))
+        return 1.0 / np.linalg.eigvalsh(columns[:, :, :d].reshape(count * d, count * d))
+
+    def descent(self) -> VariationalMixture:
+        """The descent of the free energy from the optima: weights, means, inflations (VMS 6)."""
+        low, high = self.smoother.limits()
+        weights = self.optima.weights[self.refined]
+        return minimise_free_energy(
+            weights / weights.sum(),
+            self.optima.states[self.refined],
+            [self.optima.factors[i] for i in np.flatnonzero(self.refined)],
+            self.prior(TIMES),
+            self.images,
+            low=low,
+            high=high,
+            samples=SAMPLES,
+            max_iterations=ITERATIONS,
+        )
 
 
-def clip_trajectories(
-    seen: Sequence[Seen], *, independent: bool = True, through_modes: bool = False
-) -> ClipTrajectories:
-    """Network, paths and optima of what the tracker says of some images.
-
-    Args:
-        seen: of T images.
-        independent: whether errors of images count as independent; else as `smoother_node` does.
-        through_modes: whether paths through every single mode are among the starts.
+def clip_trajectories(name: str, inputs: str) -> ClipTrajectories:
+    """Motions and optima of the window of a clip in which two likely motions stay apart longest.
 
     Raises:
-        ValueError: there are fewer than two images.
+        ValueError: the clip can not be read, the filter has lost the person.
     """
-    if len(seen) < 2:
-        raise ValueError(f'wanted at least 2 images with a likelihood, saw {len(seen)}')
-    body, dynamics = seen[-1].body, motion_prior(seen[-1].body)
-    stamps = [one.stamp for one in seen]
-    intervals = np.diff(stamps) * 1e-9
-    lower, upper = free_limits(body)
-    mixtures = _evidence(seen, body, independent)
-    sequence = ModeSequence(mixtures, dynamics, intervals)
-    paths = sequence.paths(PATHS, through_modes=through_modes)
-    starts = sequence.states(paths)
-    refined = refine(starts, sequence.prior, sequence.likelihood, lower, upper)
+    clip, true, names = read(name)
+    body, modes, shown = followed(clip, inputs)
+    prior = motion_prior(body)
+    smoother = MotionSmoother(
+        replace(prior, diffusion=LIVELINESS * prior.diffusion),
+        *free_limits(body),
+        points=body.relative_joints,
+    )
+    windows = [slice(a, a + TIMES) for a in range(0, len(modes) - TIMES + 1, STEP)]
+    motions = [smoother.motions(modes[window]) for window in windows]
+    scores = [apart(body, x.trajectories.weights, x.trajectories.means)[1] for x in motions]
+    best = int(np.argmax(scores))
+    window, found = windows[best], motions[best]
+    stamps = [one.stamp_ns for one in modes[window]]
+    images = ImageSequence.of(shown[window], stamps, of_changes=True)
+    optima = refined_on_images(smoother, found, images)
+    refined, origins = traced(body, optima.means, found.trajectories.means)
+    weights = np.where(refined, optima.weights, 0.0) if refined.sum() > 1 else optima.weights
+    pair = apart(body, weights, optima.means)[0]
+    truth = np.full((TIMES, len(body.joint_names), 3), np.nan)
+    known = [name for name in names if name in body.joint_names]
+    into, own = ([of.index(name) for name in known] for of in (body.joint_names, names))
+    truth[:, into] = np.array([true[stamp] for stamp in stamps])[:, own]
+    truth = from_shoulders(truth, body.joint_names)
     return ClipTrajectories(
-        body,
-        tuple(stamps),
-        sequence,
-        paths,
-        starts,
-        refined,
-        visiting_probabilities(sequence.network, paths),
-        _observed(sequence, starts),
-        lower,
-        upper,
-    )
-
-
-def _evidence(seen: Sequence[Seen], body: Body, independent: bool) -> tuple[GaussianMixture, ...]:
-    """Likelihoods, on angles that go on from image to image."""
-    whole: list[GaussianMixture] = []
-    for one in seen:
-        mixture = one.likelihood
-        before = whole[-1].means if whole else mixture.means[[int(mixture.weights.argmax())]]
-        whole.append(replace(mixture, means=without_turns(body, mixture.means, before)))
-    if independent:
-        return tuple(counted(mixture, 1.0) for mixture in whole)
-    distance, befores = MERGED, [None, *(x.stamp for x in seen)]
-    return tuple(
-        Evidence(x.stamp, mixture, x.errors, None).since(before, body.rates, distance)
-        for x, mixture, before in zip(seen, whole, befores)
-    )
-
-
-def _observed(sequence: ModeSequence, states: Array) -> Array:
-    """-log p (P,) of the observations along trajectories (P, T, n), nats."""
-    count, times, _ = states.shape
-    poses = states[:, :, : sequence.dynamics.dimension].reshape(count * times, -1)
-    at = np.tile(np.arange(times), count)
-    value = sequence.likelihood.energy(poses, at, derivatives=Derivatives.NONE).value
-    result: Array = value.reshape(count, times).sum(1)
-    return result
-
-
-def pose_covariance(found: ClipTrajectories, images: int) -> Array:
-    """Covariance (T d, T d) of the first T poses at the optimum of these images alone (VMS 7).
-
-    The optimum is the one next to the best one of all images; velocities are integrated out. Metres
-    and radians stand beside each other, as in the paper.
-    """
-    whole = found.sequence
-    part = ModeSequence(whole.mixtures[:images], whole.dynamics, whole.intervals[: images - 1])
-    start = found.distinct.states[:1, :images]
-    refined = refine(start, part.prior, part.likelihood, found.lower, found.upper)
-    d, n = whole.dynamics.dimension, start.shape[2]
-    units = np.zeros((images, d, images, n))
-    for t in range(images):
-        units[t, :, t, :d] = np.eye(d)
-    columns = refined.factors[0].solve(units.reshape(images * d, images, n))
-    return np.asarray(columns[:, :, :d].reshape(images * d, images * d))
-
-
-def descent(found: ClipTrajectories) -> VariationalMixture:
-    """The descent of the free energy from the distinct optima, weighed by their height (VMS 6)."""
-    prior, distinct = found.sequence.prior, found.distinct
-    low, high = limits_of_states(
-        found.lower, found.upper, prior.dimension, distinct.states.shape[2]
-    )
-    heights = np.exp(-distinct.energies - logsumexp(-distinct.energies))
-    return minimise_free_energy(
-        heights, distinct.states, distinct.factors, prior,
-        found.sequence.likelihood, low=low, high=high, samples=SAMPLES, max_iterations=ITERATIONS,
+        clip, truth, inputs, body, modes[window], smoother, found, images, optima, origins, refined,
+        pair,
     )  # fmt: skip
 
 
-def visiting_probabilities(network: EmbeddedNetwork, paths: Paths) -> tuple[Array, ...]:
-    """How probably the paths from each source visit each node (VMS fig. 2), T arrays (K_1, K_t).
+def read(name: str) -> tuple[Clip, Mapping[int, Array], Sequence[str]]:
+    """The demonstration, or a clip of the development data; with its true joints by stamp, m.
 
-    Of the paths that start from the same first node, the sum of the probabilities of those through
-    a node over that of all. Rows of sources without paths are zero.
+    Joints that are not known are NaN; the truth of the clip itself may lack them.
+
+    Raises:
+        ValueError: files that can not be read.
     """
-    sources = len(network.nodes[0])
-    weights = np.zeros(len(paths))
-    for source in range(sources):
-        at = paths.nodes[:, 0] == source
-        if at.any():
-            weights[at] = np.exp(paths.log_values[at] - logsumexp(paths.log_values[at]))
-    result = []
-    for t, nodes in enumerate(network.nodes):
-        table = np.zeros((sources, len(nodes)))
-        np.add.at(table, (paths.nodes[:, 0], paths.nodes[:, t]), weights)
-        result.append(table)
-    return tuple(result)
+    folder = ROOT / 'bags' / name if name == DEMONSTRATION else development_folder() / name
+    if name != DESK:
+        clip = read_clip(folder)
+        return clip, clip.truth.joints, clip.truth.joint_names
+    with np.load(folder / 'truth.npz') as content:
+        joints, names = content['joints'].astype(float), content['joint_names'].tolist()
+        true = dict(zip(content['stamps'].tolist(), joints, strict=True))
+    video = cv2.VideoCapture(str(folder / f'{name}.mp4'))
+    images = [np.asarray(video.read()[1], dtype=np.uint8) for _ in true]
+    camera = read_camera(folder / 'camera.yaml', images[0].shape[1::-1])
+    shoulders = {t: one[[names.index(x) for x in SHOULDERS]] for t, one in true.items()}
+    truth = Truth(name, SHOULDERS, shoulders)
+    return Clip(folder, camera, [*true], images, truth, {}, None), true, names
+
+
+def followed(clip: Clip, inputs: str) -> tuple[Body, list[ImageModes], list[SeenImage]]:
+    """Body, modes and evidence of the images in which the tracker sees the person.
+
+    Raises:
+        ValueError: the chain of modes breaks.
+    """
+    tracker, keypoints = begun(clip, inputs, with_subject=clip.subject.is_file())
+    chain: list[ImageModes] = []
+    shown: list[SeenImage] = []
+    identities = np.empty(0, dtype=np.int64)
+    for one in stepped(clip, tracker, keypoints):
+        estimate = tracker.estimate
+        told, body = estimate.likelihood, estimate.body
+        if one.likelihood is None or estimate.shown is None:
+            continue
+        if chain and not np.array_equal(told.ancestors, identities):
+            raise ValueError(f'{clip.name}: the chain of modes breaks at {one.stamp} ns')
+        means = told.mixture.means
+        before = chain[-1].mixture.means if chain else means[:1]
+        mixture = replace(told.mixture, means=without_turns(body, means, before))
+        link = Link(told.posterior_weights, told.origins)
+        chain.append(ImageModes(one.stamp, link, mixture, told.errors))
+        shown.append(estimate.shown)
+        identities = told.identities
+    return body, chain, shown
+
+
+def joints_of(body: Body, poses: Array) -> Array:
+    """Joints (..., J, 3) at poses (..., d), camera frame, m."""
+    flat = body.joint_positions(poses.reshape(-1, poses.shape[-1]))
+    return flat.reshape(*poses.shape[:-1], *flat.shape[1:])
+
+
+def traced(body: Body, optima: Array, motions: Array) -> tuple[Mask, Index]:
+    """Whether optima (M, T, d) are refined, and the motion of (N, T, d) that each comes from, (M,).
+
+    It is the same motion or, if they are refined, the nearest of those that are not among the
+    optima.
+    """
+    away = np.linalg.norm(joints_of(body, optima)[:, None] - joints_of(body, motions), axis=-1)
+    away = away.mean((2, 3))
+    refined = away.min(1) > 0.0
+    away[np.ix_(refined, away.min(0) == 0.0)] = np.inf
+    return refined, away.argmin(1)
+
+
+def from_shoulders(joints: Array, names: Sequence[str]) -> Array:
+    """Joints (..., J, 3), camera frame, relative to the middle of the shoulders, m.
+
+    All clips know where these are.
+    """
+    middle = joints[..., [names.index(name) for name in SHOULDERS], :].mean(-2, keepdims=True)
+    return joints - middle
+
+
+def upper_distances(body: Body, poses: Array) -> Array:
+    """Distances (M, M, T, J) of the joints `UPPER` of poses (M, T, d), seen from the pelvis, m."""
+    joints = joints_of(body, poses)
+    joints = joints[:, :, [body.joint_names.index(name) for name in UPPER]] - joints[:, :, :1]
+    return np.asarray(np.linalg.norm(joints[:, None] - joints, axis=-1))
+
+
+def apart(body: Body, weights: Array, poses: Array) -> tuple[tuple[int, int], float]:
+    """The two motions that stay apart longest, the heavier first, and their score.
+
+    That is the number of images times the smaller weight, and of motions that are not both likely
+    next to nothing.
+
+    Args:
+        weights: (M,) falling; 0: not to be chosen.
+        poses: (M, T, d).
+    """
+    images = (upper_distances(body, poses).max(3) > APART).sum(2)
+    least = np.minimum.outer(weights, weights)
+    score = np.triu(least * (images * (least >= LIKELY) + TIE), 1)
+    i, j = np.unravel_index(int(np.argmax(score)), score.shape)
+    return (int(i), int(j)), float(score.max())

@@ -1,8 +1,8 @@
 """Draws the figures of smoothing.md: what VMS shows of its sequence, on clips that are tracked.
 
-python docs/figures_smoothing.py     minutes
+python docs/figures_smoothing.py     two minutes
 
-Those of the clips with known truth need the development data; those of bags/reach do not.
+Those of the clips need the development data; that of bags/reach does not.
 """
 
 from __future__ import annotations
@@ -29,166 +29,179 @@ from body_pictures import (  # noqa: E402
     frame_image,
 )
 from clip_trajectories import (  # noqa: E402
-    EVERY,
+    APART,
+    DEMONSTRATION,
+    DESK,
     TIMES,
+    UPPER,
     ClipTrajectories,
     clip_trajectories,
-    descent,
-    pose_covariance,
+    upper_distances,
 )
 from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.ticker import MaxNLocator  # noqa: E402
-from scipy.special import logsumexp  # noqa: E402
 
-from benchmarks.clips import ROOT, Clip, read_clip, with_file  # noqa: E402
-from benchmarks.runs import IMAGES, UNKNOWN, Seen, tracked  # noqa: E402
+from benchmarks.clips import with_file  # noqa: E402
+from benchmarks.runs import BOTH, IMAGES, KEYPOINTS  # noqa: E402
 from hmt_ros.app.report.skeletons import save_picture  # noqa: E402
-from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories  # noqa: E402
-from hmt_ros.smoothing.variational_mixture import VariationalMixture, laplace_masses  # noqa: E402
 
-# A usual motion, one with the arms towards the camera, and one with many explanations.
-CLIPS = ('walk', 'signals', 'laugh')
-LINES = {'walk': ('#1f3a5f', '-'), 'signals': ('#c8553d', '--'), 'laugh': ('#6b8f71', ':')}
+# Clips of the development data, and what the tracker is given of each.
+CLIPS = {'exercise': BOTH, 'laugh': IMAGES, DESK: KEYPOINTS}
+LINES = {
+    'exercise': ('#1f3a5f', '-'),
+    'laugh': ('#c8553d', '--'),
+    DESK: ('#6b8f71', ':'),
+    DEMONSTRATION: ('#8a6fb0', '-.'),
+}
+# Of those whose images may be shown.
+STRIPS = {'exercise': 'smoothing_strip.png', 'laugh': 'smoothing_optima.png'}
 SPECTRUM = (1, 8, TIMES)
-# Joints whose depth, and the bending at whose middle one, is drawn.
-LIMBS = tuple(
-    tuple(f'{side}_{name}' for name in names)
-    for names in (('shoulder', 'elbow', 'wrist'), ('hip', 'knee', 'ankle'))
-    for side in ('left', 'right')
-)
 DARK, LIGHT, ACCENT = '#1f3a5f', '#9db4c8', '#c8553d'
-REACH, COLUMNS = ROOT / 'bags' / 'reach', 8
+PAIR = (DARK, ACCENT)
+COLUMNS = 6
+# Share of the paths of a motion that a mode which it visits has.
+WELL = 0.15
+# Half the width of torso and arms from above, m; width of a part of an image at least, of its
+# height.
+REACH, LEAST_WIDTH = 0.7, 0.75
 # Of the trajectories that are drawn from the posterior.
-SAMPLES, SEED = 64, 0
+DRAWN, SEED = 64, 0
 
 
 def main() -> int:
     """Draws all figures whose data are there."""
     plt.switch_backend('Agg')
-    try:
-        folders = with_file(CLIPS, None, 'truth.npz')
-    except FileNotFoundError as error:
-        print(f'figures of clips: skipped, {error}')  # noqa: T201
-        folders = []
+    demonstration = clip_trajectories(DEMONSTRATION, IMAGES)
     with plt.rc_context(PAGE_STYLE):
-        if folders:
-            draw_clips([read_clip(folder) for folder in folders])
-        draw_reach(read_clip(REACH))
+        draw_samples(demonstration)
+        try:
+            with_file([*CLIPS], None, 'truth.npz')
+        except FileNotFoundError as error:
+            print(f'figures of clips: skipped, {error}')  # noqa: T201
+            return 0
+        found = [clip_trajectories(name, inputs) for name, inputs in CLIPS.items()]
+        draw_clips([*found, demonstration])
+        for one in found:
+            if one.clip.name in STRIPS:
+                draw_pair(one, STRIPS[one.clip.name])
     return 0
 
 
 # Curves of the clips.
 
 
-def draw_clips(clips: Sequence[Clip]) -> None:
-    """Visiting probabilities, paths against optima, and what trajectories have in numbers."""
-    seen = {clip.name: tracked(clip, IMAGES, UNKNOWN)[::EVERY][:TIMES] for clip in clips}
-    found = {name: clip_trajectories(one) for name, one in seen.items()}
-    free = {name: descent(one) for name, one in found.items()}
-    for name, one in found.items():
-        print(f'{name}: {summary(one, seen[name], free[name])}')  # noqa: T201
-
-    figure, axes = plt.subplots(len(clips), 1, figsize=(8.4, 5.4), dpi=110, layout='constrained')
-    for ax, (name, one) in zip(axes, found.items(), strict=True):
-        draw_visiting(ax, name, one)
-    axes[-1].set_xlabel('image; its modes stand side by side')
-    axes[1].set_ylabel('probability of a visit (odd images downwards)')
+def draw_clips(found: Sequence[ClipTrajectories]) -> None:
+    """Modes that are visited, paths against optima, and what trajectories have in numbers."""
+    figure, axes = plt.subplots(len(found), 1, figsize=(8.4, 9.6), dpi=100, layout='constrained')
+    for ax, one in zip(axes, found, strict=True):
+        draw_network(ax, one)
+    axes[-1].set_xlabel('image')
+    shown = axes[0].get_legend_handles_labels()
+    legend = figure.legend(*shown, loc='outside upper center', ncols=3, frameon=False)
+    for handle in legend.legend_handles[: len(shown[0]) - 3]:
+        handle.set(sizes=[40.0], linewidths=[1.0])
     save(figure, 'smoothing_network.png')
 
     figure, axes = plt.subplots(
-        2, len(clips), figsize=(8.4, 4.9), dpi=110, layout='constrained', sharex='col'
+        2, len(found), figsize=(8.4, 4.9), dpi=110, layout='constrained', sharex='col'
     )
-    for column, clip in zip(axes.T, clips, strict=True):
-        draw_limb(column, clip, found[clip.name])
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
-                  frameon=False)  # fmt: skip
+    for column, one in zip(axes.T, found, strict=True):
+        draw_arm(column, one)
+    axes[0, 0].set_ylabel('bent by, degrees')
+    axes[1, 0].set_ylabel('depth from the shoulders, m')
+    shown = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*shown, loc='outside upper center', ncols=3, frameon=False)
     save(figure, 'smoothing_angles.png')
 
-    figure, axes = plt.subplots(2, 2, figsize=(8.4, 6.0), dpi=110, layout='constrained')
-    for name, one in found.items():
-        colour, line = LINES[name]
-        style: dict[str, Any] = {'color': colour, 'ls': line, 'lw': 1.4, 'label': name}
-        axes[0, 0].plot(distances(one), **style)
-        axes[0, 1].plot(np.sort(gains(one)), **style)
-        trace = free[name].held_out
-        axes[1, 1].plot(trace - trace[0], marker='.', **style)
-        spectra = [1.0 / np.linalg.eigvalsh(pose_covariance(one, images)) for images in SPECTRUM]
-        ratios = ', '.join(f'{values[0] / values[-1]:.0f}' for values in spectra)
-        for values, width in zip(spectra, (0.8, 1.4, 2.2), strict=True):
-            share = np.linspace(0, 1, len(values))
-            label = f'{name}: {ratios}' if width > 2 else None
-            axes[1, 0].semilogy(share, values, **{**style, 'lw': width, 'label': label})
-    for ax in axes.flat:
-        ax.legend(frameon=False)
-    axes[1, 0].legend(title=f'largest / smallest, {SPECTRUM} images', frameon=False)
-    axes[1, 1].legend(frameon=False, ncols=2, loc='upper right')
-    axes[1, 1].set_ylim(-1.0, 0.9)
+    figure, axes = plt.subplots(2, 2, figsize=(8.4, 6.4), dpi=110, layout='constrained')
+    for one in found:
+        draw_numbers(axes, one)
     axes[0, 0].set(
-        xlabel='trajectory', ylabel='degrees (m as rad)', ylim=(0, None),
-        title='Difference of a variable, path to optimum',
+        xlabel='motion (filled: refined on images)', ylabel='degrees (m as rad)', ylim=(0, None),
+        title='Difference of a variable, modes to optimum',
     )  # fmt: skip
+    axes[0, 1].axhline(0, color='black', lw=0.5)
     axes[0, 1].set(
-        xlabel='trajectory, sorted', ylabel='nats',
-        title='-log likelihood, optimum minus path',
-    )  # fmt: skip
+        xlabel='motion (filled: refined on images)',
+        ylabel='nats',
+        title='-log likelihood an image, optimum minus modes',
+    )
     axes[1, 0].set(
-        xlabel='rank / size', ylabel='1 / rad², 1 / m²', ylim=(None, 1e10),
+        xlabel='rank / size',
+        ylabel='1 / rad², 1 / m²',
+        ylim=(None, 1e11),
         title='Eigenvalues of the Hessian',
-    )  # fmt: skip
+    )
     axes[1, 1].set(xlabel='iteration', ylabel='nats', title='Free energy, from its start')
-    axes[1, 1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes[1, 0].legend(title=f'largest / smallest / 1000, {SPECTRUM} images', frameon=False)
+    shown = axes[1, 1].get_legend_handles_labels()
+    figure.legend(*shown, loc='outside upper center', ncols=4, frameon=False)
+    for ax in (*axes[0], axes[1, 1]):
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     save(figure, 'smoothing_trajectories.png')
 
 
-def draw_visiting(axes: Axes, name: str, found: ClipTrajectories) -> None:
-    """Modes of all images in a row, those of every second image downwards (VMS 2)."""
-    values, owners = [], []
-    for t, table in enumerate(found.visiting):
-        values.append(table * (1 if t % 2 == 0 else -1))
-        owners.append(np.full(table.shape[1], t))
-    value, owner = np.concatenate(values, axis=1), np.concatenate(owners)
-    at = np.arange(value.shape[1])
-    for row in value:
-        axes.vlines(at, 0, row, color=DARK, lw=0.9, alpha=0.35)
-    axes.axhline(0, color='black', lw=0.5)
-    times = range(0, len(found.stamps), 5)
-    axes.set_xticks([int(np.flatnonzero(owner == t)[0]) for t in times], [str(t) for t in times])
-    axes.set(ylim=(-1.05, 1.05), xlim=(-1, len(at)), yticks=(-1, 0, 1), yticklabels=('1', '0', '1'))
-    visited = np.mean([(table.max(0) > 0.01).sum() for table in found.visiting])
-    modes = np.mean([table.shape[1] for table in found.visiting])
-    title = f'{name}: {visited:.1f} of {modes:.1f} modes of an image have more than 1 %'
-    axes.set_title(title, loc='left')
-
-
-def draw_limb(axes: np.ndarray, clip: Clip, found: ClipTrajectories) -> None:
-    """The limb that the optimum moves most: its bending, and the depth of its end (VMS 3, 4)."""
-    best = int(np.argmin(found.refined.energies))
+def draw_network(axes: Axes, found: ClipTrajectories) -> None:
+    """All modes of each image by the depth of a joint, those that motions visit filled (VMS 2)."""
     names = found.body.joint_names
-    path, optimum = found.joints(found.starts[best]), found.joints(found.refined.states[best])
-    moved = np.abs(depth(path, names) - depth(optimum, names)).max(0)
-    limb = max(LIMBS, key=lambda limb: moved[names.index(limb[2])])
-    truth = np.array([clip.truth.joints[stamp] for stamp in found.stamps])
-    styles = (
-        (path, names, {'color': LIGHT, 'marker': '.', 'ms': 4, 'lw': 0.9, 'label': 'path'}),
-        (optimum, names, {'color': DARK, 'lw': 1.6, 'label': 'optimum'}),
-        (truth, clip.truth.joint_names, {'color': ACCENT, 'ls': ':', 'lw': 1.6, 'label': 'truth'}),
+    away = upper_distances(found.body, found.optima.means)[found.pair].max(0)
+    joint = names.index(UPPER[int(away.argmax())])
+    motions, counts = found.origins[[*found.pair]], []
+    for t, (one, nodes) in enumerate(zip(found.modes, found.paths_through.T, strict=True)):
+        seen = np.isin(np.arange(len(one.mixture)), nodes)
+        depths = found.joints(one.mixture.means)[:, joint, 2]
+        counts.append((len(seen), int(seen.sum())))
+        smoothed = found.weights[t]
+        own = np.where(seen[:, None], found.found.shares[t][:, motions] * smoothed[:, None], 0.0)
+        a, b = (own > WELL * own.sum(0)).T
+        kinds = (
+            ('mode that no path visits', 8.0 * ~seen, 'white', '#aaaaaa'),
+            (
+                'mode that paths visit, larger if heavier',
+                (10 + 250 * smoothed) * seen,
+                LIGHT,
+                LIGHT,
+            ),
+            ('visited by motion A', 14.0 * a, DARK, DARK),
+            ('visited by motion B', 50.0 * b, 'none', ACCENT),
+        )
+        for label, sizes, face, edge in kinds:
+            axes.scatter(
+                np.full(len(seen), t), depths, s=sizes, color=face, edgecolors=edge,
+                linewidths=np.where(sizes > 0, 1.0, 0.0), label=label if t == 0 else None,
+            )  # fmt: skip
+    i, j = found.pair
+    depths = found.joints(found.optima.means)[:, :, joint, 2]
+    axes.plot(depths[i], color=DARK, lw=1.2, zorder=3, label='optimum A')
+    axes.plot(depths[j], color=ACCENT, lw=1.2, zorder=3, label='optimum B')
+    axes.plot(found.truth[:, joint, 2], color='black', ls=':', lw=1.4, zorder=4, label='truth')
+    modes, visited = np.mean(counts, axis=0)
+    seen = f'{visited:.1f} of {modes:.1f} modes an image are visited'
+    title = f'{found.clip.name}, {found.inputs}: {seen}'
+    axes.set_title(title, loc='left')
+    axes.set(ylabel=f'depth of\n{names[joint].replace("_", " ")}, m', xlim=(-1, TIMES))
+    print(f'network {title}')  # noqa: T201
+
+
+def draw_arm(axes: np.ndarray, found: ClipTrajectories) -> None:
+    """The arm that refinement moves most: its bending, and the depth of its end (VMS 3, 4)."""
+    best, names = found.pair[0], found.body.joint_names
+    modes, optimum = (found.joints(poses[best]) for poses in (found.paths, found.optima.means))
+    arms = [
+        [names.index(f'{side}_{name}') for name in ('shoulder', 'elbow', 'wrist')]
+        for side in ('left', 'right')
+    ]
+    arm = max(arms, key=lambda arm: np.abs(modes - optimum)[:, arm[2], 2].max())
+    lines = (
+        (modes, {'color': LIGHT, 'marker': '.', 'ms': 4, 'lw': 0.9, 'label': 'modes'}),
+        (optimum, {'color': DARK, 'lw': 1.6, 'label': 'optimum'}),
+        (found.truth, {'color': ACCENT, 'ls': ':', 'lw': 1.8, 'label': 'truth'}),
     )
-    for joints, own, style in styles:
-        at = [own.index(name) for name in limb]
-        axes[0].plot(found.seconds, bending(joints[:, at]), **style)
-        axes[1].plot(found.seconds, depth(joints, own)[:, at[2]], **style)
-    axes[0].set_title(f'{clip.name}: {limb[1].replace("_", " ")}')
-    axes[1].set_title(limb[2].replace('_', ' '))
-    axes[1].set_xlabel('s')
-    if clip.name == CLIPS[0]:
-        axes[0].set_ylabel('bent by, degrees')
-        axes[1].set_ylabel('depth from the pelvis, m')
-
-
-def depth(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """How far joints (T, J) are beyond the middle of the hips, m."""
-    hips = joints[:, [names.index('left_hip'), names.index('right_hip')]].mean(1)
-    return joints[:, :, 2] - hips[:, 2:]
+    for joints, style in lines:
+        axes[0].plot(found.seconds, bending(joints[:, arm]), **style)
+        axes[1].plot(found.seconds, joints[:, arm[2], 2], **style)
+    axes[0].set_title(f'{found.clip.name}: {names[arm[1]].replace("_", " ")}')
+    axes[1].set(title=names[arm[2]].replace('_', ' '), xlabel='s')
 
 
 def bending(joints: np.ndarray) -> np.ndarray:
@@ -199,147 +212,101 @@ def bending(joints: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def distances(found: ClipTrajectories) -> np.ndarray:
-    """Mean differences (P,) of a variable between path and optimum, degrees (VMS 5)."""
-    d = found.sequence.dynamics.dimension
-    return np.degrees(np.abs(found.refined.states - found.starts)[..., :d].mean((1, 2)))
-
-
-def gains(found: ClipTrajectories) -> np.ndarray:
-    """-log likelihood (P,) of the images at optima minus that along paths, nats (VMS 6)."""
-    return np.asarray(found.refined.observation_energies - found.start_energies)
-
-
-def summary(found: ClipTrajectories, seen: Sequence[Seen], free: VariationalMixture) -> str:
-    """What the page tells of a clip."""
-    as_node = clip_trajectories(seen, independent=False)
-    d, energies = found.sequence.dynamics.dimension, found.distinct.energies
-    spread = []
-    for images in SPECTRUM:
-        covariance = pose_covariance(found, images)
-        middle = images // 2 * d
-        own = np.diagonal(covariance)[middle : middle + d][found.body.skeleton.dof_is_rotation]
-        spread.append(float(np.degrees(np.sqrt(np.median(own)))))
-    rough = [
-        np.square(np.diff(x[..., :d], n=2, axis=1)).mean()
-        for x in (found.refined.states, found.starts)
-    ]
-    count, trace = int((energies - energies[0] < 10).sum()), free.held_out
-    return (
-        f'{len(found.paths)} paths, {len(found.distinct)} optima, {count} of them within 10 nats; '
-        f'as the node counts {len(as_node.distinct)}; differ by {distances(found).mean():.1f} '
-        f'degrees, roughness {rough[0] / rough[1]:.3f} of that of paths; -log likelihood '
-        f'{gains(found).mean():+.1f} nats over {len(seen)} images; median deviation of an angle of '
-        f'{", ".join(f"{x:.1f}" for x in spread)} degrees by {SPECTRUM} images; free energy '
-        f'{trace[0] - trace.min():.1f} nats in {int(np.argmin(trace))} iterations'
-    )
-
-
-# Film strips of the bag of the repository.
-
-
-def draw_reach(clip: Clip) -> None:
-    """Images, modes of the filter, trajectories and samples (VMS 9, 10)."""
-    seen = tracked(clip, IMAGES, UNKNOWN)[::EVERY]
-    found = clip_trajectories(seen, through_modes=True)
-    d = found.sequence.dynamics.dimension
-    log_masses = laplace_masses(found.distinct.energies, found.distinct.factors)
-    masses = np.exp(log_masses - logsumexp(log_masses))
-    order = np.argsort(-masses, kind='stable')
-    distinct, weights = found.distinct[order], masses[order]
-    optima = found.joints(distinct.states)
-    optima = optima - optima[:, :, :1]
-    apart = np.linalg.norm(optima - optima[:1], axis=3)
-    other = int(np.argmax(apart.mean((1, 2))))
-    filtered = np.array([one.posterior.means[one.posterior.weights.argmax()] for one in seen])
-    first, second = (distinct.states[i, :, :d] for i in (0, other))
-    difference = apart[other].max(1)
-    columns = spread_columns(len(seen), int(np.argmax(difference)))
-    bodies = [one.body for one in seen]
+def draw_numbers(axes: np.ndarray, found: ClipTrajectories) -> None:
+    """Differences, likelihoods, eigenvalues and free energy of a clip (VMS 5 to 8)."""
+    colour, line = LINES[found.clip.name]
+    style: dict[str, Any] = {'color': colour, 'ls': line, 'lw': 1.4, 'label': found.clip.name}
+    moved = np.degrees(np.abs(found.optima.means - found.paths).mean((1, 2)))
+    gains = (found.observed(found.optima.means) - found.observed(found.paths)) / len(found.modes)
+    rank = np.arange(1, len(moved) + 1)
+    for ax, values in zip(axes[0], (moved, gains), strict=True):
+        ax.plot(rank, values, color=colour, ls=line, lw=0.8)
+        for own, face in ((found.refined, colour), (~found.refined, 'white')):
+            ax.scatter(rank[own], values[own], color=face, edgecolors=colour, s=26, zorder=3)
+    spectra = [found.spectrum(images) for images in SPECTRUM]
+    ratios = ', '.join(f'{values[0] / values[-1] / 1e3:.0f}' for values in spectra)
+    for values, width in zip(spectra, (0.8, 1.4, 2.2), strict=True):
+        label = f'{found.clip.name}: {ratios}' if width > 2 else None
+        share = np.linspace(0, 1, len(values))
+        axes[1, 0].semilogy(share, values, **{**style, 'lw': width, 'label': label})
+    descent = found.descent()
+    fallen = descent.held_out - descent.held_out[0]
+    axes[1, 1].plot(fallen, marker='.', **style)
     print(  # noqa: T201
-        f'reach: {len(distinct)} optima, the weights {np.round(weights, 3)}; number {other + 1} '
-        f'differs by {difference.max():.2f} m at {found.seconds[np.argmax(difference)]:.1f} s, '
-        f'{1e3 * apart[other].mean():.0f} mm in the mean; all by {apart.max((1, 2)).round(2)} m'
+        f'{found.clip.name}: {found.refined.sum()} refined of {len(moved)} motions, moved by '
+        f'{moved.round(1)} degrees, -log likelihood {gains.round(2)} nats an image; eigenvalues '
+        f'{ratios}; free energy {fallen.round(1)}'
     )
-    strips = {
-        'heaviest of\nthe filter': filtered,
-        f'optimum of\n{100 * weights[0]:.0f} %': first,
-        f'optimum of\n{100 * weights[other]:.1f} %': second,
-    }
-    draw_strip(clip, found, bodies, columns, strips, 'smoothing_strip.png', images=True)
-
-    drawn = samples(found, distinct, weights)
-    joints = found.joints(drawn)
-    joints = joints - joints[:, :, :1]
-    between = np.linalg.norm(joints[:, None] - joints[None], axis=4).mean((2, 3))
-    i, j = np.unravel_index(int(np.argmax(between)), between.shape)
-    farthest = np.linalg.norm(joints[i] - joints[j], axis=2).max(1)
-    median, most = (1e3 * float(x) for x in (np.median(between[between > 0]), between[i, j]))
-    print(  # noqa: T201
-        f'reach: of {len(drawn)} samples two differ by {median:.0f} mm in the median, '
-        f'{most:.0f} mm at most, one joint by {farthest.max():.2f} m'
-    )
-    strips = {'one sample': drawn[i], 'another sample': drawn[j]}
-    draw_strip(clip, found, bodies, columns, strips, 'smoothing_samples.png', images=False)
 
 
-def spread_columns(count: int, shown: int) -> list[int]:
-    """Images over the whole span, of which the nearest is replaced by one that is to be shown."""
-    chosen = np.rint(np.linspace(0, count - 1, COLUMNS)).astype(int)
+# Film strips.
+
+
+def draw_pair(found: ClipTrajectories, file: str) -> None:
+    """Two likely optima that stay apart longest, over images and from above (VMS 9)."""
+    pair = [*found.pair]
+    weights, logs = found.optima.weights[pair], found.optima.log_joint[pair]
+    titles = [f'optimum {name},\n{100 * x:.0f} %' for name, x in zip('AB', weights, strict=True)]
+    draw_strip(found, found.optima.means[pair], titles, file)
+    print(f'weights {weights.round(2)}, log p(X, R) of B {logs[1] - logs[0]:+.1f}')  # noqa: T201
+
+
+def draw_samples(found: ClipTrajectories) -> None:
+    """The two farthest apart of samples of the posterior (VMS 10)."""
+    drawn = found.optima.sample(DRAWN, np.random.default_rng(SEED))
+    away = upper_distances(found.body, drawn).mean((2, 3))
+    both = np.unravel_index(int(np.argmax(away)), away.shape)
+    titles = ['one sample', 'another sample']
+    draw_strip(found, drawn[[*both]], titles, 'smoothing_samples.png')
+    print(f'mean distances: median {np.median(away[away > 0]):.3f}, {away[both]:.3f} m')  # noqa: T201
+
+
+def spread(images: np.ndarray, shown: int) -> list[int]:
+    """Some of the images, of which the nearest is replaced by one that is to be shown."""
+    chosen = images[np.rint(np.linspace(0, len(images) - 1, COLUMNS)).astype(int)]
     chosen[np.abs(chosen - shown).argmin()] = shown
     return sorted(int(i) for i in chosen)
 
 
-def samples(
-    found: ClipTrajectories, optima: RefinedTrajectories, weights: np.ndarray
-) -> np.ndarray:
-    """Trajectories (S, T, d) of the mixture of Gaussians at the optima, weighed by their mass."""
-    rng = np.random.default_rng(SEED)
-    d = found.sequence.dynamics.dimension
-    owners = rng.choice(len(weights), size=SAMPLES, p=weights)
-    noise = rng.standard_normal((SAMPLES, *found.starts.shape[1:]))
-    drawn = [
-        optima.states[i] + optima.factors[i].solve_transposed(z)
-        for i, z in zip(owners, noise, strict=True)
-    ]
-    return np.clip(np.array(drawn)[:, :, :d], found.lower, found.upper)
-
-
 def draw_strip(
-    clip: Clip, found: ClipTrajectories, bodies: Sequence[Any], columns: Sequence[int],
-    strips: dict[str, np.ndarray], file: str, *, images: bool,
-) -> None:  # fmt: skip
-    """Poses over the images, and from above with the truth as a black skeleton."""
-    pixels = np.array([clip.pixels[found.stamps[i]] for i in columns])
-    box = box_of(pixels)
-    rows = 2 * len(strips) + images
-    kinds = ['image'] * images + ['image', 'above'] * len(strips)
-    heights = [1.4 if kind == 'image' else 0.95 for kind in kinds]
+    found: ClipTrajectories, poses: np.ndarray, titles: Sequence[str], file: str
+) -> None:
+    """Two trajectories (2, T, d) over images where they are apart; from above with the truth."""
+    away = upper_distances(found.body, poses)[0, 1]
+    between = np.flatnonzero(away.max(1) > APART)
+    columns = spread(between, int(away.max(1).argmax()))
+    print(  # noqa: T201
+        f'{file}: {UPPER[int(away.max(0).argmax())]} apart by {away.max():.2f} m, '
+        f'{len(between)} of {len(away)} images beyond {APART} m'
+    )
+    clip, names = found.clip, found.body.joint_names
+    lower = [i for i, name in enumerate(names) if name not in (*UPPER, 'pelvis')]
+    shown = np.concatenate([found.body.joint_positions(one[columns]) for one in poses])
+    left, right, bottom, top = box_of(clip.camera.project(shown.reshape(-1, 3)))
+    more = max(0.0, LEAST_WIDTH * (bottom - top) - (right - left)) / 2
+    box = left - more, right + more, bottom, top
+    heights = [(box[2] - box[3]) / (box[1] - box[0])] * 3 + [1.0]
     figure, axes = plt.subplots(
-        rows, len(columns), figsize=(8.4, sum(heights) + 0.4), dpi=90, layout='constrained',
+        4, len(columns), figsize=(8.4, 1.36 * sum(heights) + 0.3), dpi=90, layout='constrained',
         gridspec_kw={'height_ratios': heights},
     )  # fmt: skip
     by_stamp = dict(zip(clip.stamps, clip.images, strict=True))
-    names = clip.truth.joint_names
+    # Of both and the truth; what is unknown is not drawn.
+    above = np.array([*found.joints(poses), found.truth])[..., [0, 2]]
+    above[:, :, lower] = np.nan
     for column, index in enumerate(columns):
-        stamp = found.stamps[index]
-        truth = clip.truth.joints[stamp]
-        axes[0, column].set_title(f'{found.seconds[index]:.1f} s')
-        for row, (title, poses) in enumerate(strips.items()):
-            upper, lower = axes[2 * row + images, column], axes[2 * row + images + 1, column]
-            add_body(upper, bodies[-1], poses[index], clip.camera, alpha=0.75)
-            add_body(lower, bodies[-1], poses[index], None)
-            away = truth - truth[names.index('pelvis')]
-            add_skeleton(lower, away[:, [0, 2]], names, 'black', 0.9)
-            frame_above(lower)
-            if column == 0:
-                upper.set_ylabel(title)
-                lower.set_ylabel('from above')
-        for axis, kind in zip(axes[:, column], kinds, strict=True):
-            if kind == 'image':
-                frame_image(axis, by_stamp[stamp], box)
-    if images:
-        axes[0, 0].set_ylabel('image')
+        axes[0, column].set_title(f'{found.seconds[index]:.2f} s')
+        for row, axis in enumerate(axes[:3, column]):
+            if row:
+                add_body(axis, found.body, poses[row - 1, index], clip.camera, alpha=0.75)
+            frame_image(axis, by_stamp[found.modes[index].stamp_ns], box)
+        for every, colour, width in zip(above, (*PAIR, 'black'), (3.4, 1.7, 0.9), strict=True):
+            add_skeleton(axes[3, column], every[index], names, colour, width)
+        frame_above(axes[3, column])
+        axes[3, column].set(xlim=(-REACH, REACH), ylim=(-REACH, REACH))
+    labels = ('image', *titles, 'from above')
+    for axis, label, colour in zip(axes[:, 0], labels, ('black', *PAIR, 'black'), strict=True):
+        axis.set_ylabel(label, color=colour)
     save(figure, file)
 
 
