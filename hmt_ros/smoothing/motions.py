@@ -89,23 +89,27 @@ def grouped(weights: Array, distances: Array, means: Array, most: int, least: fl
     """Motion (N,) of each path, numbered by weight.
 
     Motions are found one by one: the path with the most weight within `SAME_MOTION` leads the
-    next. Every path then belongs to the leader that is nearest in the mean.
+    next. Every path belongs to the leader that is nearest in the mean.
 
     Args:
         weights: (N,) of paths, which sum to 1.
         distances, means: (N, N) of paths, m, see `path_distances`.
         most: number of motions at most.
-        least: weight within `SAME_MOTION` of a leader, besides the first.
+        least: weight of a motion; the paths of a lighter one belong to the others.
     """
-    near, left = distances <= SAME_MOTION, weights.copy()
-    around, leaders = near @ left, list[int]()
-    while len(leaders) < most and around.max() > (least if leaders else 0.0):
-        leaders.append(int(np.argmax(around)))
+    near, left, leaders = distances <= SAME_MOTION, weights.copy(), list[int]()
+    while len(leaders) < most and left.any():
+        leaders.append(int(np.argmax(near @ left)))
         left[near[leaders[-1]]] = 0.0
-        around = near @ left
     labels = np.argmin(means[leaders], axis=0)
-    order = np.argsort(-np.bincount(labels, weights), kind='stable')
-    return np.asarray(np.argsort(order)[labels])
+    masses = np.bincount(labels, weights, minlength=len(leaders))
+    if masses.min() < least:
+        leaders = [leaders[m] for m in np.flatnonzero(masses >= min(least, masses.max()))]
+        labels = np.argmin(means[leaders], axis=0)
+    order = np.argsort(-np.bincount(labels, weights, minlength=len(leaders)), kind='stable')
+    labels = np.argsort(order)[labels]
+    # A leader whose paths are nearer to others has none.
+    return np.asarray(np.unique(labels, return_inverse=True)[1].reshape(-1))
 
 
 def evidence_of_motions(
