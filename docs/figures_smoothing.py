@@ -290,7 +290,10 @@ def draw_strip(
         4, len(columns), figsize=(8.4, 1.36 * sum(heights) + 0.3), dpi=90, layout='constrained',
         gridspec_kw={'height_ratios': heights},
     )  # fmt: skip
-    by_stamp = dict(zip(clip.stamps, clip.images, strict=True))
+    # Images of the development data are not shown; the true joints are where they show the person.
+    by_stamp = (
+        dict(zip(clip.stamps, clip.images, strict=True)) if clip.name == DEMONSTRATION else {}
+    )
     # Of both and the truth; what is unknown is not drawn.
     above = np.array([*found.joints(poses), found.truth])[..., [0, 2]]
     above[:, :, lower] = np.nan
@@ -299,12 +302,15 @@ def draw_strip(
         for row, axis in enumerate(axes[:3, column]):
             if row:
                 add_body(axis, found.body, poses[row - 1, index], clip.camera, alpha=0.75)
-            frame_image(axis, by_stamp[found.modes[index].stamp_ns], box)
+            stamp = found.modes[index].stamp_ns
+            if stamp not in by_stamp:
+                add_skeleton(axis, clip.pixels[stamp], clip.truth.joint_names, 'black', 0.9)
+            frame_image(axis, by_stamp.get(stamp), box)
         for every, colour, width in zip(above, (*PAIR, 'black'), (3.4, 1.7, 0.9), strict=True):
             add_skeleton(axes[3, column], every[index], names, colour, width)
         frame_above(axes[3, column])
         axes[3, column].set(xlim=(-REACH, REACH), ylim=(-REACH, REACH))
-    labels = ('image', *titles, 'from above')
+    labels = ('image' if by_stamp else 'truth', *titles, 'from above')
     for axis, label, colour in zip(axes[:, 0], labels, ('black', *PAIR, 'black'), strict=True):
         axis.set_ylabel(label, color=colour)
     save(figure, file)
