@@ -12,6 +12,7 @@ from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.inference.mode_chain import reachable_origins
 from hmt_ros.sessions.smoothed_messages import SmoothedBody
 from hmt_ros.smoothing import ImageModes, Link
+from hmt_ros.smoothing.motions import mean_distances
 from msg_tools import MessageError
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
@@ -98,7 +99,7 @@ def continued(
         if set(columns) == set(before.identities):
             origins = ancestry[:, [columns[name] for name in before.identities]]
     if origins is None:
-        away = np.linalg.norm(points[:, None] - points_before, axis=3).mean(2)
+        away = mean_distances(points[:, None], points_before)
         reach = TREMBLE + FASTEST * (modes.stamp_ns - others.stamp_ns) / SECOND_NS
         origins = reachable_origins(away, others.link.weights, reach)
     return evidence._replace(modes=modes._replace(link=modes.link._replace(origins=origins)))

@@ -34,6 +34,7 @@ from hmt_ros.smoothing.motions import (
     MotionEvidence,
     evidence_of_motions,
     grouped,
+    mean_distances,
     path_distances,
 )
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
@@ -305,7 +306,7 @@ class MotionSmoother:
         every = self.points_of(found.means).swapaxes(0, 1)
         weights, strays = np.zeros((found.times, len(found))), []
         for t, (image, own, places) in enumerate(zip(images, smoothed, every, strict=True)):
-            away = _distances(image.points[:, None], places)
+            away = mean_distances(image.points[:, None], places)
             nearest = away.min(1, keepdims=True)
             parts = np.where(away <= nearest + SAME_MOTION / 2, shares[t] + 1e-6 * found.weights, 0)
             stray = nearest[:, 0] > STRAY
@@ -344,7 +345,7 @@ class MotionSmoother:
         at, known, least = dynamics.initial_mean, dynamics.initial_precision, LIVELIER[0]
         if first is not None:
             before = self.points_of(first.means[m, :d])
-            begins[0] = self.points is not None and _distances(before, places).min() > WRONG
+            begins[0] = self.points is not None and mean_distances(before, places).min() > WRONG
             if not begins[0]:
                 at, known = first.means[m], np.linalg.inv(first.covariances[m])
                 least = first.liveliness[m] / LIVELIER[1]
@@ -381,7 +382,7 @@ class MotionSmoother:
     def _away(self, states: Array, places: Array) -> Array:
         """Mean distances (T,) of the points of states (T, n) from others (T, P, 3), m."""
         poses = np.clip(states, *self.limits())[:, : self.dynamics.dimension]
-        return _distances(self.points_of(poses), places)
+        return mean_distances(self.points_of(poses), places)
 
     def advanced(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
         """What the first images of a window tell of the one after them.
@@ -433,11 +434,6 @@ def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Arr
     return np.asarray(result / result.sum(1, keepdims=True))
 
 
-def _distances(one: Array, other: Array) -> Array:
-    """Mean distances (...) of points (..., P, 3), m."""
-    return np.asarray(np.linalg.norm(one - other, axis=-1).mean(-1))
-
-
 def _begins(places: Array, intervals: Array) -> Mask:
     """Where, (T-1,), modes (T, P, 3) have gone over to another explanation since the image before.
 
@@ -451,7 +447,7 @@ def _begins(places: Array, intervals: Array) -> Mask:
         some = np.flatnonzero((i >= 0) & (k < len(places)))
         i, k = i[some], k[some]
         gap = seconds[k] - seconds[i]
-        near = _distances(places[i], places[k]) <= TREMBLE + FASTEST * gap
+        near = mean_distances(places[i], places[k]) <= TREMBLE + FASTEST * gap
         short = gap - intervals[some] <= FLICKER
         result[some[near & short]] = False
     return result

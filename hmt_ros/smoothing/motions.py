@@ -49,6 +49,11 @@ class MotionEvidence(NamedTuple):
     disagreements: Array
 
 
+def mean_distances(one: Array, other: Array) -> Array:
+    """Mean distances (...) of points (..., P, 3), m."""
+    return np.asarray(np.linalg.norm(one - other, axis=-1).mean(-1))
+
+
 def path_distances(
     nodes: Index, points: Sequence[Array], stamps: Sequence[int], before: Array | None = None
 ) -> tuple[Array, Array]:
@@ -134,9 +139,8 @@ def evidence_of_motions(
         shares = np.zeros((count, len(mixture)))
         np.add.at(shares, (labels, nodes[:, t]), weights)
         if points is not None:
-            heaviest = points[t][shares.argmax(1)]
-            away = np.linalg.norm(heaviest[:, None] - points[t], axis=3).mean(2)
-            shares[away > OPPOSITE] = 0.0
+            heaviest = points[t][shares.argmax(1), None]
+            shares[mean_distances(heaviest, points[t]) > OPPOSITE] = 0.0
         shares /= shares.sum(1, keepdims=True)
         means[:, t] = shares @ mixture.means
         offsets = mixture.means - means[:, t, None]

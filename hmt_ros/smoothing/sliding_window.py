@@ -25,7 +25,7 @@ from hmt_ros.smoothing.motion_smoother import (
     SmoothedMotions,
     WindowImage,
 )
-from hmt_ros.smoothing.motions import SAME_MOTION, SECOND_NS
+from hmt_ros.smoothing.motions import SAME_MOTION, SECOND_NS, mean_distances
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
 # Intervals between poses vary by this share of their length.
@@ -243,7 +243,7 @@ class SlidingWindow:
             self.smoother.points_of(means)
             for means in (found.means[:, :common], last.means[:, -common:])
         )
-        away = np.linalg.norm(now[:, None] - before, axis=-1).mean((2, 3))
+        away = mean_distances(now[:, None], before).mean(2)
         return np.where(away <= SAME_MOTION, away / last.weights, np.inf), last.identities
 
 
