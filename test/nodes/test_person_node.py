@@ -71,23 +71,30 @@ def subscribed(node):
     return {one.topic_name for one in node.subscriptions}
 
 
-def test_what_one_publishes_the_next_gets_without_dds(together, small_camera):
-    from hmt_msgs.msg import PoseMixture
+def camera_of(other, executor):
+    """Publishers of a camera, once the image comes in, whatever number of nodes wants it."""
     from sensor_msgs.msg import CameraInfo, Image
 
-    nodes, other, executor = together()
-    came = []
-    other.create_subscription(PoseMixture, 'pose_mixture', came.append, 100)
     publishers = {
         'camera_info': other.create_publisher(CameraInfo, 'camera_info', 100),
         'image': other.create_publisher(Image, 'image', 100),
     }
-    # The image comes in once, whatever number of nodes wants it, and predictions not at all.
     spin_until(
         executor,
         lambda: all(p.get_subscription_count() == 1 for p in publishers.values()),
         'a subscription',
     )
+    return publishers
+
+
+def test_what_one_publishes_the_next_gets_without_dds(together, small_camera):
+    from hmt_msgs.msg import PoseMixture
+
+    nodes, other, executor = together()
+    came = []
+    other.create_subscription(PoseMixture, 'pose_mixture', came.append, 100)
+    publishers = camera_of(other, executor)
+    # Predictions do not come in at all.
     assert other.count_subscribers(PREDICTION) == 0
     assert other.count_subscribers('likelihood_mixture') == 0
     spin_until(executor, lambda: other.count_publishers('pose_mixture') == 1, 'a publisher')
@@ -114,23 +121,17 @@ def in_lock_step(together, small_camera, kinds, count=6):
     """Bytes by topic of images in one process, and of the sessions by themselves, bytes between."""
     from importlib import import_module
 
-    from sensor_msgs.msg import CameraInfo, Image
-
     nodes, other, executor = together()
     came = {topic: [] for topic in kinds}
     for topic, name in kinds.items():
         kind = getattr(import_module('hmt_msgs.msg'), name)
         other.create_subscription(kind, topic, came[topic].append, 100, raw=True)
-    publishers = {
-        'camera_info': other.create_publisher(CameraInfo, 'camera_info', 100),
-        'image': other.create_publisher(Image, 'image', 100),
-    }
+    publishers = camera_of(other, executor)
     filter_node, bme_node = nodes['filter_node'], nodes['bme_node']
     spin_until(
         executor,
         lambda: (
-            all(p.get_subscription_count() == 1 for p in publishers.values())
-            and all(other.count_publishers(topic) == 1 for topic in kinds)
+            all(other.count_publishers(topic) == 1 for topic in kinds)
             and filter_node._outputs['pose_mixture'].get_subscription_count() == 1
         ),
         'subscriptions',

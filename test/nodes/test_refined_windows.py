@@ -6,7 +6,12 @@ from hmt_ros.image.image_sequence import SeenImage
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from msg_tools.messages.cdr import serialise
-from test.nodes.test_person_node import spin_until, state_of, together  # noqa: F401
+from test.nodes.test_person_node import (  # noqa: F401
+    camera_of,
+    spin_until,
+    state_of,
+    together,
+)
 from test.sessions.conftest import StubTracker
 
 pytestmark = pytest.mark.ros
@@ -25,21 +30,12 @@ def test_a_window_is_refined_in_the_process_of_the_filter(
     monkeypatch,
 ):
     from hmt_msgs.srv import SmoothWindow
-    from sensor_msgs.msg import CameraInfo, Image
 
     monkeypatch.setattr(StubTracker, 'shown', property(seen))
     nodes, other, executor = together(refine_on_images=refine)
     smoother, told = nodes['smoother_node'], []
     monkeypatch.setattr(smoother.get_logger(), 'info', told.append)
-    publishers = {
-        'camera_info': other.create_publisher(CameraInfo, 'camera_info', 100),
-        'image': other.create_publisher(Image, 'image', 100),
-    }
-    spin_until(
-        executor,
-        lambda: all(p.get_subscription_count() == 1 for p in publishers.values()),
-        'a subscription',
-    )
+    publishers = camera_of(other, executor)
     publishers['camera_info'].publish(serialise(small_camera.info()))
     for index in range(3):
         publishers['image'].publish(serialise(small_camera.image(index)))

@@ -76,6 +76,19 @@ def in_order(one, weights):
     return [of_modes[x] for x in pose_mixture_of(one.message).identities.tolist()]
 
 
+def test_the_chain_passes_through_messages(filtered):
+    """Weights given later images, from messages alone, are those of the filter, by identities."""
+    contents = [pose_mixture_of(one.message) for one in filtered]
+    weights, wanted = contents[-1].posterior_weights, filtered[-1].modes.mixture.weights
+    for i, (content, one) in reversed([*enumerate(zip(contents, filtered, strict=True))]):
+        assert weights == pytest.approx(in_order(one, wanted), abs=1e-12)
+        if i:
+            assert content.ancestry_ids.tolist() == contents[i - 1].identities.tolist()
+            assert content.ancestry_stamp_ns == contents[i - 1].stamp_ns
+            weights, wanted = weights @ content.ancestry, wanted @ one.modes.origins
+    assert (contents[0].ancestry.shape[1], contents[0].ancestry_stamp_ns) == (0, 0)
+
+
 @pytest.mark.parametrize('lag', [0.0, 0.3, 10.0])
 def test_backward_weights_are_those_of_the_filter(filtered, lag):
     """The newest image has the filter's weights, those before have its lagged weights."""

@@ -9,18 +9,16 @@ from scipy.spatial.transform import Rotation
 
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.image.likelihood import LikelihoodSettings
-from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.track_messages import TOPICS, TrackedImage, track_messages
 from hmt_ros.sessions.tracking_parameters import FilterParameters
-from hmt_ros.tracking import Status, Tracker, TrackerSettings
+from hmt_ros.tracking import Status
 from hmt_ros.tracking.ground import Ground
 from msg_tools import MessageError
-from msg_tools.messages.cdr import deserialise, serialise
+from msg_tools.messages.cdr import serialise
 from msg_tools.messages.ground import ground_of
 from msg_tools.messages.images import decode_image
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
@@ -148,46 +146,6 @@ def test_mixtures(track, body):
         [0.25, 1.0],
     )
     assert (likelihood.cue_names, len(likelihood.cue_probabilities)) == ([], 0)
-
-
-def test_the_chain_of_the_modes_passes_through_messages(track, body):
-    """Weights given later images, from messages alone, are those of the filter, by identities."""
-    settings = TrackerSettings(
-        candidates=8,
-        likelihood=LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints),
-        flow_weight=0.0,
-        estimate_shape=False,
-        lifter='',
-    )
-    tracker, pose = Tracker(body, CAMERA, settings), poses_of(body, 3)[1]
-    tracker.reset(GaussianMixture(np.ones(1), pose[None], 0.01 * np.eye(len(pose))[None]))
-    black, rng, count = np.zeros((240, 320, 3), np.uint8), np.random.default_rng(0), 6
-    contents, modes = [], []
-    for i in range(count):
-        pose[body.dof_names.index('left_elbow')] += 0.1
-        pixels = CAMERA.project(body.joint_positions(pose[None]))[0]
-        pixels += rng.normal(size=pixels.shape)
-        covariances = np.tile(np.eye(2), (len(pixels), 1, 1))
-        seen = Keypoints(body.joint_names, pixels, covariances, np.ones(len(pixels)))
-        waiting = WaitingImage(black, STAMP + i * 100_000_000, 'lens')
-        posterior, likelihood = tracker.step(black, waiting.stamp_ns, seen)
-        image = TrackedImage(
-            waiting, tracker, posterior, likelihood, FilterParameters(), '', False, False
-        )
-        ((_, message),) = track_messages(image, lambda topic: topic == 'likelihood_mixture')
-        contents.append(pose_mixture_of(deserialise(serialise(message), message.__msgtype__)))
-        modes.append(tracker.estimate.modes)
-    weights, wanted = contents[-1].posterior_weights, modes[-1].mixture.weights
-    assert len(weights) > 1
-    for i in reversed(range(count)):
-        of_modes = dict(zip(modes[i].identities.tolist(), wanted, strict=True))
-        in_order = [of_modes[x] for x in contents[i].identities.tolist()]
-        assert weights == pytest.approx(in_order, abs=1e-12)
-        if i:
-            assert contents[i].ancestry_ids.tolist() == contents[i - 1].identities.tolist()
-            assert contents[i].ancestry_stamp_ns == contents[i - 1].stamp_ns
-            weights, wanted = weights @ contents[i].ancestry, wanted @ modes[i].origins
-    assert (contents[0].ancestry.shape[1], contents[0].ancestry_stamp_ns) == (0, 0)
 
 
 def test_joint_states_are_those_of_the_point_estimate(track, body):
