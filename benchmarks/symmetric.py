@@ -125,7 +125,7 @@ def _motions(limb: str, distance: float, seed: int) -> tuple[Array, float]:
     """The pair of motions of a case with the least difference of priors.
 
     Raises:
-        ValueError: there is none, or their images differ.
+        ValueError: the limb has no such pair, or the images of the pair differ.
     """
     body, camera, rng = BODY, camera_at(distance), np.random.default_rng(seed)
     likelihood = ImageLikelihood(body, camera)

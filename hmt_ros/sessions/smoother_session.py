@@ -121,7 +121,7 @@ class SmootherState(SessionState):
 
 
 def untold(text: str) -> None:
-    """Nobody is told."""
+    """Drops what a caller does not want to be told."""
 
 
 class SmootherSession(Session[SmootherParameters, SmootherState]):
@@ -386,7 +386,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
         Args:
             from_ns, to_ns: first and last stamp, inclusive; 0: the oldest, the newest.
-            tell: is told whether images have refined the motions, and why not.
+            tell: called with whether images have refined the motions, and if not, why.
 
         Returns:
             hmt_msgs/TrajectoryMixture with covariances.
