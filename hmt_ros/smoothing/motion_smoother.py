@@ -47,9 +47,9 @@ LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
 # Distance from which on the modes of an image are taken for wrong, m, and looks at that.
 WRONG, WRONG_PASSES = 0.15, 3
 # Speed of a body, seen from the pelvis, m/s, and what modes tremble by, m: beyond, states begin
-# anew, unless modes less than so many images and seconds away deny it. Factor on the noise there.
-FASTEST, TREMBLE = 3.0, 0.05
-NEIGHBOURS, FLICKER = 3, 0.1
+# anew, unless modes so many seconds further away deny it (three images at 30 Hz). Factor on the
+# noise there.
+FASTEST, TREMBLE, FLICKER = 3.0, 0.05, 0.11
 ANEW = 1e6
 # Distance from all motions from which on a mode is a stray, m.
 STRAY = 0.05
@@ -440,16 +440,16 @@ def _begins(places: Array, intervals: Array) -> Mask:
     Those shortly before are out of reach of those shortly after.
     """
     seconds = np.concatenate([[0.0], np.cumsum(intervals)])
-    last = np.arange(len(intervals))
     result = np.ones(len(intervals), dtype=np.bool_)
-    for a, b in np.ndindex(NEIGHBOURS, NEIGHBOURS):
-        i, k = last - a, last + 1 + b
-        some = np.flatnonzero((i >= 0) & (k < len(places)))
-        i, k = i[some], k[some]
-        gap = seconds[k] - seconds[i]
-        near = mean_distances(places[i], places[k]) <= TREMBLE + FASTEST * gap
-        short = gap - intervals[some] <= FLICKER
-        result[some[near & short]] = False
+    for apart in range(1, len(places)):
+        gaps = seconds[apart:] - seconds[:-apart]
+        near = mean_distances(places[apart:], places[:-apart]) <= TREMBLE + FASTEST * gaps
+        spans = [slice(a, a + len(gaps)) for a in range(apart)]
+        short = [gaps - intervals[span] <= FLICKER for span in spans]
+        if not np.any(short):
+            break
+        for span, some in zip(spans, short, strict=True):
+            result[span][near & some] = False
     return result
 
 

@@ -258,6 +258,16 @@ def test_states_begin_anew_where_the_chain_goes_over_to_another_pose(chained):
     assert np.abs(alone.means[0, :, 0]).max() < 0.1
 
 
+@pytest.mark.parametrize('rate', [15, 30, 90])
+@pytest.mark.parametrize(('seconds', 'wanted'), [(1 / 15, 0), (1 / 3, 2)])
+def test_seconds_count_not_images(rate, seconds, wanted):
+    """Another pose for a fifteenth of a second is passed over, for a third it is not."""
+    places = np.zeros((rate, 1, 3))
+    places[rate // 3 : rate // 3 + round(seconds * rate), 0, 0] = 0.8
+    begins = motion_smoother._begins(places, np.full(rate - 1, 1.0 / rate))
+    assert begins.sum() == wanted
+
+
 def test_modes_that_are_opposite_are_no_one_gaussian(chained):
     """A motion keeps its pose in an image where a third of its paths pass another, far away."""
     mixtures, stamps = [], [round(1e9 * t / 30) for t in range(16)]
