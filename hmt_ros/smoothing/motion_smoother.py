@@ -92,25 +92,8 @@ class WindowImage(NamedTuple):
     alone: float
 
 
-class Past(NamedTuple):
-    """What is known of the first image of a window from the images before.
-
-    Attributes:
-        shares: (K, M) probability that each mode of the image continues each of M motions.
-        means, covariances: (M, n) and (M, n, n) of the states that these motions predict.
-        liveliness: (M,) their l.
-        places: (M, P, 3) where they were in the last image, m.
-    """
-
-    shares: Array
-    means: Array
-    covariances: Array
-    liveliness: Array
-    places: Array
-
-
 class FirstStates(NamedTuple):
-    """What the past tells of the first states of M motions.
+    """What the past tells of the first states of M motions of a window.
 
     Attributes:
         means, covariances: (M, n) and (M, n, n).
@@ -120,6 +103,20 @@ class FirstStates(NamedTuple):
     means: Array
     covariances: Array
     liveliness: Array
+
+
+class Past(NamedTuple):
+    """What is known of the first image of a window from the images before.
+
+    Attributes:
+        shares: (K, M) probability that each mode of the image continues each of M motions.
+        first: states that these motions predict.
+        places: (M, P, 3) where they were in the last image, m.
+    """
+
+    shares: Array
+    first: FirstStates
+    places: Array
 
 
 class MotionStates(NamedTuple):
@@ -321,11 +318,11 @@ class MotionSmoother:
         shares = np.zeros((int(labels.max()) + 1, past.shares.shape[1]))
         np.add.at(shares, labels, weights[:, None] * past.shares[nodes])
         shares /= shares.sum(1, keepdims=True)
-        means = shares @ past.means
-        offsets = past.means - means[:, None]
-        covariances = np.einsum('mk,kij->mij', shares, past.covariances)
+        means = shares @ past.first.means
+        offsets = past.first.means - means[:, None]
+        covariances = np.einsum('mk,kij->mij', shares, past.first.covariances)
         covariances += (offsets * shares[:, :, None]).swapaxes(1, 2) @ offsets
-        return FirstStates(means, covariances, past.liveliness[shares.argmax(1)])
+        return FirstStates(means, covariances, past.first.liveliness[shares.argmax(1)])
 
     def _states(
         self,
@@ -423,7 +420,7 @@ class MotionSmoother:
             found.shares[count] if count < len(stamps) else after.link.origins @ found.shares[-1]
         )
         places = self.points_of(found.trajectories.means[:, count - 1])
-        return Past(shares, means, covariances, found.liveliness, places)
+        return Past(shares, FirstStates(means, covariances, found.liveliness), places)
 
 
 def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Array) -> Array:

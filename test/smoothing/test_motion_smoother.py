@@ -13,7 +13,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.inference.mode_chain import backward_weights
 from hmt_ros.smoothing import LinearGaussianDynamics, MotionSmoother, SlidingWindow, motion_smoother
-from hmt_ros.smoothing.motion_smoother import Past
+from hmt_ros.smoothing.motion_smoother import FirstStates, Past
 from hmt_ros.smoothing.trajectory_mixture import led_by_first
 
 FAST = LinearGaussianDynamics.constant_velocity([2.0, 1.0], 0.8)
@@ -143,13 +143,8 @@ def test_joint_densities_are_those_of_prior_and_images(modes, chained, known):
     past = None
     if known:
         rng = np.random.default_rng(1)
-        past = Past(
-            np.eye(3),
-            rng.normal(size=(3, 4)),
-            np.array([np.eye(4)] * 3),
-            np.ones(3),
-            np.zeros((3, 2, 1)),
-        )
+        first = FirstStates(rng.normal(size=(3, 4)), np.array([np.eye(4)] * 3), np.ones(3))
+        past = Past(np.eye(3), first, np.zeros((3, 2, 1)))
     found = smoother.smoothed(window, past)
     differ = []
     for m in range(len(found.trajectories)):
