@@ -43,24 +43,19 @@ saying_how_long() {
   local what=$1 start=$SECONDS
   shift
   say "$what"
-  (
-    trap 'kill "$pause"; exit' TERM
-    while true; do
-      sleep 3 &
-      pause=$!
-      wait "$pause"
-      say "$what, $((SECONDS - start)) s so far"
-    done
-  ) 9<&- &
+  # Its last sleep holds nothing open.
+  (while sleep 3 <&- >&- 2>&-; do say "$what, $((SECONDS - start)) s so far"; done) 9<&- &
   ticker=$!
+  disown
   local code=0
   "$@" || code=$?
   stop_ticker
   return $code
 }
 
+# KILL: at TERM a process that has just begun would run the trap of this shell.
 stop_ticker() {
-  [ -z "$ticker" ] || kill "$ticker" 2>/dev/null || true
+  [ -z "$ticker" ] || kill -KILL "$ticker" 2>/dev/null || true
   ticker=''
 }
 
