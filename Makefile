@@ -1,7 +1,8 @@
-# make demo   tracks the person of a bag in bags/      make lint   ruff and mypy
+# make demo   tracks the person of a bag in bags/      make lint   ruff, mypy and clang-format
 # make test   all tests                                make bench  the benchmarks
 # make setup  the workspace, with MediaPipe Pose       make soak   nodes under load and faults
 # make clean  restores the state of a clone            make detector  MediaPipe Pose alone
+# make core   compiles the core of the sources         make sanitize  its tests, with sanitizers
 # make learn  learns everything again from DATA=...
 #
 # Each works as the first command after a clone: it installs its requirements into .venv and builds
@@ -10,7 +11,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -e -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup detector demo test lint bench soak learn clean lock
+.PHONY: help setup core detector demo test lint sanitize bench soak learn clean lock
 
 # Small matrices: a second BLAS thread costs more than it saves.
 export OMP_NUM_THREADS := 1
@@ -23,6 +24,7 @@ PYTHON_IN_VENV := .venv/bin/python
 SOURCED := source tools/environment.bash &&
 TEST_PROCESSES ?= 2
 SOAK_MINUTES ?= 10
+CORE := hmt_ros/core
 DATA ?= $(or $(HMT_SHARED),../shared)
 DEMO_BAG ?= $(patsubst %/metadata.yaml,%,$(firstword $(wildcard bags/*/metadata.yaml)))
 
@@ -30,21 +32,24 @@ help:
 	@sed -n 's/^# \{0,1\}//p; /^$$/q' Makefile
 
 setup:
-	@$(WORKSPACE) ros test lint kernels
+	@$(WORKSPACE) ros test lint core build
 	@$(WITH_DETECTOR)
 
+core:
+	@$(WORKSPACE) ros core
+
 detector:
-	@$(WORKSPACE) ros detector
+	@$(WORKSPACE) ros core detector
 
 demo:
-	@$(WORKSPACE) ros kernels
+	@$(WORKSPACE) ros core build
 	@$(WITH_DETECTOR)
 	@rm -rf build/demo && mkdir -p build/demo
 	@echo 'starting the demonstration'
 	@$(SOURCED) python tools/demonstration/demo.py $(DEMO_BAG) -o build/demo --live
 
 test:
-	@$(WORKSPACE) ros test kernels
+	@$(WORKSPACE) ros test core build
 	@$(WORKSPACE) detector || echo 'hmt_ros: the tests of MediaPipe Pose are skipped' >&2
 	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder $(ARGS)
 
@@ -53,21 +58,29 @@ lint:
 	@$(PYTHON_IN_VENV) -m ruff check .
 	@$(PYTHON_IN_VENV) -m ruff format --check .
 	@$(PYTHON_IN_VENV) -m mypy
+	@find $(CORE) -name '*.h' -o -name '*.cpp' | xargs .venv/bin/clang-format --dry-run -Werror
+
+# AddressSanitizer and UndefinedBehaviorSanitizer of g++. What Python itself leaks is not told.
+sanitize:
+	@$(WORKSPACE) ros test sanitize
+	@ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONMALLOC=malloc \
+	  LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libstdc++.so)" \
+	  $(PYTHON_IN_VENV) -m pytest -o pythonpath='build/sanitize/lib .' $(or $(ARGS),test/core)
 
 bench:
-	@$(WORKSPACE) ros test build
+	@$(WORKSPACE) ros test core build
 	@$(SOURCED) python -m benchmarks $(ARGS)
 
 soak:
-	@$(WORKSPACE) ros test build
+	@$(WORKSPACE) ros test core build
 	@$(SOURCED) python -m benchmarks soak --minutes $(SOAK_MINUTES) $(ARGS)
 
 learn:
-	@$(WORKSPACE) ros test build
+	@$(WORKSPACE) ros test core build
 	@$(SOURCED) tools/learn.sh $(DATA) build/learned
 
 clean:
-	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info $(CORE)/*.so
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The newest versions that fit together on every supported Python. Only this target changes them.

@@ -1,11 +1,16 @@
 import ast
 import os
+import re
 import shlex
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
 from setuptools.command.develop import develop
 from setuptools.command.install import install
 
@@ -54,6 +59,96 @@ def opencv() -> list[str]:
     return ['opencv-python-headless'] if done.returncode else []
 
 
+# No fused products: every processor rounds alike. Without errno and traps loops become vectors.
+CORE_OPTIONS = ['-std=c++20', '-O3', '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math']
+CORE_OPTIONS += ['-fvisibility=hidden']
+# What the core is compiled with: condition of the preprocessor, what is missing, package of apt.
+CORE_NEEDS = [
+    ('__cplusplus >= 202002L', 'compiler for C++20 (g++ 11, clang++ 14 or later)', 'g++'),
+    ('__has_include(<Python.h>)', 'Python.h', 'python3-dev'),
+    ('__has_include(<pybind11/pybind11.h>)', 'pybind11', 'pybind11-dev'),
+]
+
+
+def core() -> Extension:
+    """The compiled core: the sources of hmt_ros/core, which include its headers."""
+    folder = f'{PACKAGE}/core'
+    return Extension(
+        f'{PACKAGE}.core._compiled',
+        files(folder, '**/*.cpp'),
+        depends=[*files(folder, '**/*.h'), 'setup.py'],
+        extra_compile_args=CORE_OPTIONS,
+        language='c++',
+    )
+
+
+class BuildCore(build_ext):
+    """``build_ext`` that compiles files at the same time, and only those that have changed.
+
+    The headers of pybind11 are those of Python or of the system. ``--debug`` is for debuggers.
+    """
+
+    def build_extension(self, ext: Extension) -> None:
+        """Compile and link the core."""
+        with suppress(ImportError):
+            from pybind11 import get_include
+
+            self.compiler.add_include_dir(get_include())
+        self.expect_compiler()
+        ext.extra_compile_args += ['-Og', '-g'] if self.debug else ['-DNDEBUG', '-g0']
+        compile_all, compile_one = self.compiler.compile, self.compiler._compile
+
+        def compile_together(*arguments: Any, **options: Any) -> list[str]:
+            begun = []
+
+            def begin(target: str, source: str, *rest: Any) -> None:
+                if self.force or is_older(target, [source, *ext.depends]):
+                    begun.append(pool.submit(compile_one, target, source, *rest))
+
+            self.compiler._compile = begin
+            with ThreadPoolExecutor(processes()) as pool:
+                objects = compile_all(*arguments, **options)
+            for one in begun:
+                one.result()
+            return objects
+
+        self.compiler.compile = compile_together
+        super().build_extension(ext)
+
+    def expect_compiler(self) -> None:
+        """Stop with one line where something is missing that the core is compiled with."""
+        # Older setuptools compiles C++ by the name of the compiler of C.
+        compiler = getattr(self.compiler, 'compiler_so_cxx', self.compiler.compiler_so)
+        folders = [f'-I{folder}' for folder in self.compiler.include_dirs]
+        command = [*compiler, *folders, CORE_OPTIONS[0], '-E', '-P', '-x', 'c++', '-']
+        asked = [f'#if {x[0]}\nfound {i}\n#endif\n' for i, x in enumerate(CORE_NEEDS)]
+        try:
+            done = subprocess.run(
+                command, input=''.join(asked), capture_output=True, text=True, check=False
+            )
+            found = done.stdout
+        except OSError:
+            found = ''
+        for i, (_, name, package) in enumerate(CORE_NEEDS):
+            if f'found {i}' not in found:
+                raise SystemExit(
+                    f'{PACKAGE}: no {name} to compile its core with {compiler[0]}. '
+                    f'Try: sudo apt install {package}'
+                )
+
+
+def is_older(target: str, sources: list[str]) -> bool:
+    """Whether a file is missing, or older than one of those that it is made of."""
+    made = Path(target).stat().st_mtime if Path(target).is_file() else -1.0
+    return any(Path(source).stat().st_mtime > made for source in sources)
+
+
+def processes() -> int:
+    """How many processes compile at the same time: as MAKEFLAGS says, or one on each processor."""
+    found = re.search(r'-j ?(\d+)', os.environ.get('MAKEFLAGS', ''))
+    return int(found[1]) if found else os.cpu_count() or 1
+
+
 class Install(install):
     """``install``, and the messages with it; into the prefix that colcon or bloom gives."""
 
@@ -63,29 +158,25 @@ class Install(install):
         super().finalize_options()
 
     def run(self) -> None:
-        """Install hmt_msgs, then hmt_ros, and compile its kernels."""
+        """Install hmt_msgs, then hmt_ros."""
         prefix = Path(self.install_base)
         given = self.prefix_is_given and 'AMENT_PREFIX_PATH' in os.environ and not WHEEL
         if given or in_colcon(prefix):
             build_base = Path(self.get_finalized_command('build').build_base)
             install_messages(build_base / MESSAGES, prefix, str(self.root or ''))
         super().run()
-        if in_colcon(prefix):
-            compile_kernels(Path(self.install_lib))
 
 
 class Develop(develop):
     """``develop``, and the messages with it, for ``colcon build --symlink-install``."""
 
     def run(self) -> None:
-        """Install hmt_msgs, then hmt_ros, and compile its kernels."""
+        """Install hmt_msgs, then hmt_ros."""
         prefix = Path(self.prefix or sys.prefix)
         if in_colcon(prefix):
             build_base = Path(self.get_finalized_command('build').build_base)
             install_messages(build_base / MESSAGES, prefix, '')
         super().run()
-        if in_colcon(prefix):
-            compile_kernels(ROOT)
 
 
 def in_colcon(prefix: Path) -> bool:
@@ -93,24 +184,6 @@ def in_colcon(prefix: Path) -> bool:
     return not WHEEL and any(
         (x / '.colcon_install_layout').is_file() for x in (prefix, prefix.parent)
     )
-
-
-def compile_kernels(folder: Path) -> None:
-    """Compile the kernels of the package in a folder, for this processor.
-
-    With HMT_ROS_KERNELS=later it does nothing. If it fails the build goes on: nodes compile what is
-    missing before they are active.
-    """
-    if os.environ.get('HMT_ROS_KERNELS') == 'later':
-        return
-    path = os.pathsep.join(filter(None, [str(folder), os.environ.get('PYTHONPATH', '')]))
-    command = [sys.executable, '-m', PACKAGE, 'compile', '--quiet']
-    done = subprocess.run(command, env=dict(os.environ, PYTHONPATH=path), cwd='/', check=False)
-    if done.returncode != 0:
-        sys.stderr.write(
-            f'{PACKAGE}: its kernels could not be compiled, see above; "ros2 run {PACKAGE} '
-            'compile" compiles them later, or each node when it starts\n'
-        )
 
 
 def install_messages(build: Path, prefix: Path, root: str) -> None:
@@ -218,7 +291,6 @@ setup(
         'setuptools',
         'numpy',
         'scipy',
-        'numba',
         'PyYAML',
         'matplotlib',
         'pillow',
@@ -239,7 +311,8 @@ setup(
         'video': ['av'],
     },
     zip_safe=False,
-    cmdclass={'install': Install, 'develop': Develop},
+    ext_modules=[core()],
+    cmdclass={'build_ext': BuildCore, 'install': Install, 'develop': Develop},
     entry_points={
         # "ros2 run" finds each program by its name; pip would put all these names into PATH.
         'console_scripts': [f'{PACKAGE} = {PACKAGE}.app:main']

@@ -18,7 +18,7 @@ BENCHMARKS = {
     'joint_errors': 'what joints err by in every pose, and what all images leave of a covariance',
     'keep_out': 'how often a true joint is outside the space that a robot keeps out of',
     'keypoint_noise': 'where landmarks of a detector lie on the body, and how they err',
-    'kernels': 'what an evaluation of a pose computes, and what compiled code takes',
+    'kernels': 'what compiled code takes, and an evaluation of a pose, term by term',
     'kjs': 'kinematic jumps against random sampling at finding minima',
     'lifting': 'poses from keypoints alone, on clips with truth',
     'live': 'the nodes at the images of a camera that does not wait for them',

@@ -26,16 +26,11 @@ from benchmarks.truth_fits import QUICK, SUBTRACTED, TRUE, best_poses, fitted, s
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import GROWTH_SIGMAS, ShapeSpace
+from hmt_ros.core import mark_visibility, trace_contour
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, ObservedImage
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.pose_energy import PoseEnergy
-from hmt_ros.image.surface import (
-    empty_contour,
-    flesh_table_of,
-    lens_of,
-    mark_visibility,
-    trace_contour,
-)
+from hmt_ros.image.surface import empty_contour, flesh_table_of, lens_of
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.tracking.shape_estimation import ShapeEstimate

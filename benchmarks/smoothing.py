@@ -246,7 +246,6 @@ def smoothed(
     messages = RosbagsMessages()
     parameters = with_values(SmootherParameters(), {'window_length': KEPT})
     session = SmootherSession(parameters, outputs.append, SMOOTHED.__eq__)
-    session.prepare()
     shapes = {x.stamp: x.likelihood.shape_covariance for x in seen}
     for one in seen:
         likelihood, told = one.likelihood.mixture, one.likelihood

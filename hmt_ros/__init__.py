@@ -1,13 +1,8 @@
 """Monocular 3D human motion tracking with mixtures, as a library and as ROS 2 nodes."""
 
 import os
-from pathlib import Path
-
-from hmt_ros.compiled_code import keep_compiled_code_apart
 
 __version__ = '1.0.0'
-
-keep_compiled_code_apart(Path(__file__).parent)
 
 # OpenCV reads these when it is loaded: pixels of an image, whatever its format, and no lines of its
 # own about files from outside, of which our errors tell.

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import socket
 import zlib
 from collections.abc import Callable
@@ -19,6 +20,8 @@ from hmt_ros.detectors.blazepose_models import has_networks, has_runtime
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools import BagReader
 from msg_tools.messages.images import decode_image
+
+ROOT = Path(__file__).resolve().parents[1]
 
 # Speed is no property of a result: a busy machine must not fail a test.
 settings.register_profile('hmt_ros', deadline=None, derandomize=True)
@@ -93,6 +96,15 @@ def pytest_collection_modifyitems(items):
     folder = Path(__file__).resolve().parent
     places = {folder / name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path, len(places)))
+
+
+def copy_objects_of_core(build: Path) -> None:
+    """What "make core" has compiled, for the build of a copy of the sources.
+
+    A build keeps the objects of files that have not changed.
+    """
+    for folder in (ROOT / 'build' / 'hmt_ros' / 'build').glob('temp.*'):
+        shutil.copytree(folder, build / folder.name)
 
 
 @pytest.fixture(scope='session')

@@ -100,23 +100,34 @@ def test_a_background_is_a_file_and_a_line(monkeypatch):
 
 TERM = """
 from typing import NamedTuple
-from numba import njit
 from hmt_ros.image.terms.image_term import ImageTerm, TermSettings, Weighting
 
 class Inputs(NamedTuple):
     term: Weighting
     brightness: float
 
-@njit
-def kernel(view, inputs, wrenches, stiffnesses):
-    return inputs.term.weight * inputs.brightness
-
 BRIGHTNESS = ImageTerm(
     'brightness', 'Brightness of the image', TermSettings(2.0, 1.0, 1.0),
     lambda window: float(window.image.mean()),
     lambda term, evidence, request: Inputs(term, float(evidence or 0.0)),
-    kernel,
 )
+"""
+HEADER = """
+#pragma once
+#include "../pose_view.h"
+
+namespace hmt {
+
+struct BrightnessInputs {
+  Weighting term;
+  double brightness;
+};
+
+inline double add_term(const PoseView&, const BrightnessInputs& inputs, const Sums&) {
+  return inputs.term.weight * inputs.brightness;
+}
+
+}  // namespace hmt
 """
 TRY_TERM = """
 import numpy as np
@@ -137,27 +148,47 @@ print(energy.by_cue(poses, derivatives=False).values[:, 0].tolist())
 """
 
 
-def test_a_likelihood_term_is_a_file_and_a_line(tmp_path):
-    """In a copy of the package, interpreted: to compile the terms takes a minute."""
+def put(path, changes):
+    """Puts text in place of other text, which a file has once."""
+    text = path.read_text('utf-8')
+    for old, new in changes.items():
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path.write_text(text, 'utf-8')
+
+
+def test_a_likelihood_term_is_two_files_and_two_lines(tmp_path):
+    """In a copy of the package, whose core is compiled without optimisation: that is fastest."""
     for name in ('hmt_ros', 'msg_tools'):
-        ignored = shutil.ignore_patterns('__pycache__')
+        ignored = shutil.ignore_patterns('__pycache__', '*.so')
         shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
-    terms = tmp_path / 'hmt_ros' / 'image' / 'terms'
+    shutil.copy(ROOT / 'setup.py', tmp_path)
+    package = tmp_path / 'hmt_ros'
+    terms = package / 'image' / 'terms'
     (terms / 'brightness.py').write_text(TERM, 'utf-8')
-    registry = (terms / 'registry.py').read_text('utf-8')
-    registry = registry.replace('EDGES, DEPTH)', 'EDGES, DEPTH, BRIGHTNESS)')
     first = 'from hmt_ros.image.terms.depth import DEPTH\n'
     more = 'from hmt_ros.image.terms.brightness import BRIGHTNESS\n'
-    (terms / 'registry.py').write_text(registry.replace(first, more + first), 'utf-8')
-    done = subprocess.run(
-        [sys.executable, '-c', TRY_TERM],
-        cwd=tmp_path,
-        env={**os.environ, 'PYTHONPATH': str(tmp_path), 'NUMBA_DISABLE_JIT': '1'},
-        capture_output=True,
-        text=True,
-        check=False,
+    put(terms / 'registry.py', {first: more + first, 'DEPTH)': 'DEPTH, BRIGHTNESS)'})
+    (package / 'core' / 'terms' / 'brightness.h').write_text(HEADER, 'utf-8')
+    include = '#include "terms/coverage.h"\n'
+    more = '#include "terms/brightness.h"\n'
+    put(
+        package / 'core' / 'terms.h',
+        {include: more + include, 'DepthInputs>': 'DepthInputs, BrightnessInputs>'},
     )
-    assert (done.stderr, done.stdout) == ('', '[180.0, 180.0]\n')
+    put(tmp_path / 'setup.py', {"'-O3'": "'-O0', '-g0'"})
+    environment = {**os.environ, 'PYTHONPATH': str(tmp_path)}
+    for command in (['setup.py', '-q', 'build_ext', '--inplace'], ['-c', TRY_TERM]):
+        done = subprocess.run(
+            [sys.executable, *command],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+    assert done.stdout == '[180.0, 180.0]\n'
 
 
 def test_a_command_is_a_file_and_a_line(monkeypatch, capsys):

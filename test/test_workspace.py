@@ -15,11 +15,14 @@ import pytest
 import setuptools
 import yaml
 
+from test.conftest import copy_objects_of_core
+
 ROOT = Path(__file__).resolve().parents[1]
 HMT_MSGS = ROOT / 'msg_tools' / 'hmt_msgs'
 EXAMPLES = ROOT / 'examples'
 PARTS = ['colcon.pkg', 'package.xml', 'setup.py', 'setup.cfg', 'resource', 'hmt_ros', 'msg_tools']
 PARTS += ['launch', 'rviz', 'foxglove', 'security', 'examples']
+IGNORED = shutil.ignore_patterns('__pycache__', '*.so')
 
 PAGE = (ROOT / 'docs' / 'consumers.md').read_text('utf-8')
 RCLCPP = ROOT / 'test' / 'rclcpp_stand_in'
@@ -83,7 +86,6 @@ def ros_without_this_package():
     # Where wheels keep libraries that their own do not find from a program in C++.
     libraries = map(str, Path(sysconfig.get_path('purelib')).glob('ros_*.libs'))
     environment['LD_LIBRARY_PATH'] += ''.join(f':{folder}' for folder in sorted(libraries))
-    environment['HMT_ROS_KERNELS'] = 'later'
     environment.pop('COLCON_PREFIX_PATH', None)
     environment.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None)
     # Where tools/workspace.sh has unpacked the headers of Python.
@@ -111,11 +113,12 @@ def workspace(tmp_path_factory):
     for part in PARTS:
         target = folder / 'src' / 'hmt_ros' / part
         if (ROOT / part).is_dir():
-            shutil.copytree(ROOT / part, target, ignore=shutil.ignore_patterns('__pycache__'))
+            shutil.copytree(ROOT / part, target, ignore=IGNORED)
         else:
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / part, target)
+            shutil.copy2(ROOT / part, target)
     write_packages(folder / 'src')
+    copy_objects_of_core(folder / 'build' / 'hmt_ros' / 'build')
     environment = ros_without_this_package()
     # It comes before an rclcpp that is installed, and answers without a publisher.
     environment['CMAKE_PREFIX_PATH'] = f'{RCLCPP}:{environment["CMAKE_PREFIX_PATH"]}'
@@ -151,11 +154,11 @@ def sourced(workspace, command):
 @pytest.mark.ros
 def test_colcon_build_in_a_workspace_builds_the_messages(workspace):
     program = (
-        'import hmt_ros, json, sys; from hmt_msgs.msg import PoseComponent, PoseMixture; '
+        'import hmt_ros.core, json, sys; from hmt_msgs.msg import PoseComponent, PoseMixture; '
         'from rclpy.serialization import deserialize_message, serialize_message; '
         'sent = PoseMixture(components=[PoseComponent(weight=0.25)]); '
         'got = deserialize_message(serialize_message(sent), PoseMixture); '
-        'json.dump([hmt_ros.__file__, got.components[0].weight], sys.stdout)'
+        'json.dump([hmt_ros.core._compiled.__file__, got.components[0].weight], sys.stdout)'
     )
     done = sourced(workspace, f"python3 -c '{program}'")
     assert done.returncode == 0, done.stderr
@@ -195,10 +198,9 @@ def test_a_node_of_a_workspace_starts(workspace):
     )
     assert node.stderr is not None
     first = node.stderr.readline()
-    # It was built without kernels, which it compiles first; a signal ends it at once.
     node.terminate()
     rest = node.communicate(timeout=60)[1]
-    assert 'compiling kernels, once after an update' in first, first + rest
+    assert 'images from /image' in first, first + rest
     assert node.returncode == 0
 
 
@@ -247,24 +249,6 @@ def test_a_failed_build_of_messages_says_what_to_do(install_messages, tmp_path):
         install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
     assert len(str(raised.value).splitlines()) == 1
     assert len(install_messages.calls) == 1
-
-
-@pytest.mark.parametrize(('variable', 'code'), [('', 0), ('', 1), ('later', 0)])
-def test_kernels_are_compiled_where_the_package_is_installed(
-    install_messages, tmp_path, monkeypatch, capsys, variable, code
-):
-    runs: list[tuple[list[str], str]] = []
-
-    def run(command, *, env, cwd, check):
-        runs.append((command[1:], env['PYTHONPATH'].split(os.pathsep)[0]))
-        return SimpleNamespace(returncode=code)
-
-    monkeypatch.setattr(install_messages.subprocess, 'run', run)
-    monkeypatch.setenv('HMT_ROS_KERNELS', variable)
-    install_messages.compile_kernels(tmp_path)
-    wanted = [(['-m', 'hmt_ros', 'compile', '--quiet'], str(tmp_path))]
-    assert runs == ([] if variable else wanted)
-    assert ('ros2 run hmt_ros compile' in capsys.readouterr().err) == bool(code)
 
 
 # ---- What tools/workspace.sh does about the detector, with a stand-in for Python ----
@@ -386,15 +370,15 @@ def test_messages_alone_are_linked_into_a_workspace(tmp_path):
     assert order(folder) == ['hmt_msgs', 'consumer', 'listener']
 
 
-# ---- A file that is not run here: its one command is ----
+# ---- A file that is not run here: its commands are ----
 
 
 def test_workflow_runs_what_the_project_is_tested_with():
     workflow = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text('utf-8'))
-    (job,) = workflow['jobs'].values()
+    job, nightly = workflow['jobs'].values()
     assert job['strategy']['matrix']['python'] == ['3.10', '3.11', '3.12', '3.13']
     assert 'CPython 3.10 to 3.13' in (ROOT / 'README.md').read_text('utf-8')
-    assert [step['run'] for step in job['steps'] if 'run' in step] == [
-        'PYTHON=$(command -v python) .ci/run'
-    ]
+    runs = [[x['run'] for x in one['steps'] if 'run' in x] for one in (job, nightly)]
+    assert runs == [['PYTHON=$(command -v python) .ci/run'], ['make sanitize']]
     assert os.access(ROOT / '.ci' / 'run', os.X_OK)
+    assert re.search(r'^sanitize:', (ROOT / 'Makefile').read_text('utf-8'), re.M)

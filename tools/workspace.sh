@@ -6,10 +6,11 @@
 #
 #     ros      .venv with ROS 2, the build tools and what hmt_ros imports
 #     test     what the tests import in addition
-#     lint     ruff, mypy, pre-commit
+#     lint     ruff, mypy, clang-format, pre-commit
 #     detector MediaPipe Pose
+#     core     the compiled core of the sources, in hmt_ros/core
 #     build    both packages, in build/ and install/
-#     kernels  both packages and, at the same time, the kernels that numba compiles
+#     sanitize a copy of hmt_ros, in build/sanitize/lib, whose core checks its memory and arithmetic
 #
 # A checksum of its inputs identifies a completed stage, which is skipped. A stage that was
 # interrupted or whose inputs have changed runs again.
@@ -156,7 +157,7 @@ stage_ros() {
   done_already ros "$key" && venv_is_usable && return
   check_prerequisites
   # From scratch: no package remains that was half installed or is no longer required.
-  rm -rf "$venv" build install log
+  rm -rf "$venv" build install log hmt_ros/core/*.so
   say "creating .venv with $("$python" --version) and ROS 2 Jazzy, once (minutes, 1 GB)"
   saying_how_long 'creating .venv' "$python" -m venv "$venv"
   touch "$unfinished"
@@ -224,31 +225,44 @@ stage_requirements() {
 stage_build() {
   local key
   key=$(find package.xml colcon.pkg setup.py setup.cfg resource hmt_ros msg_tools launch rviz foxglove security \
-    -type f -not -name '*.pyc' | LC_ALL=C sort | checksum "$(cat "$stamps/ros")")
+    -type f -not -name '*.pyc' -not -name '*.so' | LC_ALL=C sort | checksum "$(cat "$stamps/ros")")
   done_already build "$key" && [ -f install/setup.bash ] && return
   saying_how_long 'building hmt_msgs and hmt_ros' colcon_build build --base-paths . msg_tools/hmt_msgs
   echo "$key" >"$stamps/build"
 }
 
-# Builds, and compiles the kernels of the sources, which tools/environment.bash uses, at the same time.
-stage_kernels() {
-  local key log compiling
-  key=$("$venv/bin/python" -c 'from pathlib import Path
-import hmt_ros.compiled_code as code; print(code.folder_of(Path("hmt_ros").resolve()))')
-  if done_already kernels "$key"; then
-    stage_build
-    return
-  fi
-  say 'compiling kernels, once after an update (a minute or two)'
-  log=$(mktemp)
-  "$venv/bin/python" -m hmt_ros compile --quiet >"$log" 2>&1 9<&- &
-  compiling=$!
-  # The kernels take longer.
-  niceness=10 stage_build
-  saying_how_long 'compiling kernels' wait "$compiling" ||
-    fail "the kernels could not be compiled:"$'\n'"$(cat "$log")"
-  rm "$log"
-  echo "$key" >"$stamps/kernels"
+# What colcon installs is linked from the same objects: this comes first.
+stage_core() {
+  local key
+  key=$(sources_of_core | checksum "$(cat "$stamps/ros")" "${CXX:-}")
+  done_already core "$key" && compgen -G 'hmt_ros/core/*.so' >/dev/null && return
+  saying_how_long 'compiling the core' compile_core '' build_ext --inplace \
+    --build-temp "build/hmt_ros/build/temp.linux-x86_64-$(cache_tag)"
+  echo "$key" >"$stamps/core"
+}
+
+stage_sanitize() {
+  # Python may have been compiled so that sums of integers wrap, which hides those that overflow.
+  local checks='-fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -fno-wrapv'
+  saying_how_long 'compiling the core with checks' compile_core "$checks" build \
+    --build-base build/sanitize --build-lib build/sanitize/lib build_ext --debug
+}
+
+sources_of_core() { find setup.py hmt_ros/core -name '*.py' -o -name '*.cpp' -o -name '*.h' | LC_ALL=C sort; }
+
+cache_tag() { "$venv/bin/python" -c 'import sys; print(sys.implementation.cache_tag)'; }
+
+# Runs commands of setup.py quietly, with more options of the compiler. Warnings are errors here, not
+# where users build.
+compile_core() {
+  local options="-Wall -Wextra -Werror $1" output
+  shift
+  output=$(
+    [ ! -d "$headers" ] || export CPATH=$headers/usr/include:$headers$(python_include "$venv/bin/python")
+    CPPFLAGS=$options "$venv/bin/python" setup.py -q "$@" 2>&1
+  ) && return
+  [[ $output != *$'\n'* ]] || output="the core could not be compiled:"$'\n'"$output"
+  fail "${output#hmt_ros: }"
 }
 
 # Runs "colcon build" quietly with .venv as the ROS installation; shows its output if it fails.
@@ -262,10 +276,8 @@ colcon_build() {
     export CPATH=$headers/usr/include
   fi
   output=$(
-    export HMT_ROS_KERNELS=later # Commands here run the sources.
     export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv
-    nice -n "${niceness:-0}" \
-      colcon --log-base "$(dirname "$build_base")/log" build --build-base "$build_base" "$@" \
+    colcon --log-base "$(dirname "$build_base")/log" build --build-base "$build_base" "$@" \
       --event-handlers console_cohesion+ console_start_end- console_stderr- status- \
       desktop_notification- --cmake-args "${cmake_args[@]}" 2>&1
   ) || fail "colcon build failed:"$'\n'"$output"
@@ -277,7 +289,7 @@ flock 9
 
 for stage in "$@"; do
   case $stage in
-    ros | test | lint | detector | build | kernels) "stage_$stage" ;;
-    *) fail "no stage '$stage': ros, test, lint, detector, build or kernels" ;;
+    ros | test | lint | detector | core | build | sanitize) "stage_$stage" ;;
+    *) fail "no stage '$stage': ros, test, lint, detector, core, build or sanitize" ;;
   esac
 done

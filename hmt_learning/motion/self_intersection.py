@@ -6,7 +6,8 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.self_intersection import add_overlaps, overlaps_of
+from hmt_ros.body.self_intersection import overlaps_of
+from hmt_ros.core import add_overlaps
 from hmt_ros.inference.arrays import Array
 
 

@@ -16,10 +16,6 @@ COMMANDS = {
         'hmt_ros.app.replay.command',
         'track the person in a bag and write the poses into a new bag',
     ),
-    'compile': (
-        'hmt_ros.app.compile_kernels',
-        'compile all kernels, so that no first image waits for it',
-    ),
     'install-detector': (
         'hmt_ros.app.install_detector',
         'install a detector of keypoints, MediaPipe Pose',

@@ -20,7 +20,6 @@ from typing import Any, TypeAlias, TypeVar
 
 from tqdm import tqdm
 
-from hmt_ros.compiled_code import compiling
 from msg_tools.files.error_line import LONGEST_LINE, one_line, printable
 
 Item = TypeVar('Item')
@@ -43,19 +42,18 @@ class LineFile:
 
 
 class _Bar(tqdm):
-    """A bar that shows the time, and that kernels are compiled, also while nothing is counted."""
+    """A bar that shows the time also while nothing is counted."""
 
     def __init__(self, interval: float, **options: Any) -> None:
         self._interval, self._ended = interval, Event()
         super().__init__(**options)
         if not self.disable:
-            compiling()
             Thread(target=self._show_time, name='progress', daemon=True).start()
 
     def _show_time(self) -> None:
         while not self._ended.wait(self._interval):
             self.delay = 0  # what has been shown is shown at the end, too
-            self.set_postfix_str('compiling kernels, once' if compiling() else '')
+            self.refresh()
 
     def close(self) -> None:
         """Removes the bar, or leaves it."""
@@ -88,7 +86,7 @@ def with_progress(
     options: dict[str, Any] = {'iterable': items, 'unit': f' {unit}', 'total': total}
     options['desc'] = one_line(what)
     if not unit:
-        options['bar_format'] = '{desc}: {elapsed} so far{postfix}'
+        options['bar_format'] = '{desc}: {elapsed} so far'
     if quiet or _is_wide_terminal():
         # One bar below another is removed at its end.
         return _Bar(1.0, **options, disable=quiet, leave=None)

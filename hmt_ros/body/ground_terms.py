@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.ground_kernel import Constants
 from hmt_ros.body.kinematics import Frames, forward, point_jacobians
 from hmt_ros.body.skeleton import other_side
 from hmt_ros.inference.arrays import Array, Index
@@ -92,6 +91,39 @@ class FloorPlane:
     height: float | None
     height_sigma: float
     measured: bool = True
+
+
+class Constants(NamedTuple):
+    """Inputs that do not depend on the pose, as compiled code reads them.
+
+    Attributes:
+        dof_is_rotation: (d,).
+        moves: (S, d) whether a degree of freedom moves a segment.
+        weights: (2,) of the terms: upright, floor; 0: off.
+        up: (3,) against gravity.
+        height: of the camera over the floor, m.
+        upright: (U,) segments that are upright.
+        axes: (U, 3, 3) their axes: to the side, ahead, up.
+        lean: (U, 3) deviations of gravity along these, rad.
+        soles: (P,) segments of the points of the soles.
+        local: (P, 3) their places there, m.
+        per_floor: 1 / deviation of the height of the floor, 1/m.
+        lean_tails, floor_tails: degrees of freedom of the robust costs.
+    """
+
+    dof_is_rotation: NDArray[np.bool_]
+    moves: NDArray[np.bool_]
+    weights: Array
+    up: Array
+    height: float
+    upright: NDArray[np.int64]
+    axes: Array
+    lean: Array
+    soles: NDArray[np.int64]
+    local: Array
+    per_floor: float
+    lean_tails: float
+    floor_tails: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,12 +21,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward, point_jacobians
+from hmt_ros.core import find_not_held
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.mixture import GaussianMixture
 
@@ -81,7 +81,9 @@ class Capsules:
         """The capsules without those inside of larger ones together, by a few surface points."""
         order = np.argsort(-self._sizes, kind='stable')
         some = self[order]
-        kept = _not_held(some.starts, some.ends, some.radii, some._surfaces())
+        axes = (np.ascontiguousarray(x) for x in (some.starts, some.ends))
+        kept = np.empty(len(some), dtype=np.bool_)
+        find_not_held(*axes, some.radii, some._surfaces(), kept)
         return self[np.sort(order[kept])]
 
     def grown(self, reach: float) -> Capsules:
@@ -187,46 +189,3 @@ def _parts(body: Body) -> tuple[Index, Array, Array]:
             ends += [skeleton.joint_offsets[joint] for joint in joints]
             radii.append(BARE)
     return np.array(segments, dtype=np.intp), np.array(ends), np.array(radii)
-
-
-@njit(cache=True, nogil=True)
-def _not_held(starts, ends, radii, points):  # type: ignore[no-untyped-def]
-    """Whether each of N capsules, largest first, has points (N, P, 3) outside of those before."""
-    n, count = points.shape[0], points.shape[1]
-    outside = np.ones((n, count), np.bool_)
-    left = np.full(n, count)
-    kept = np.zeros(n, np.bool_)
-    # A ball around each: most pairs are far apart.
-    balls = np.empty((n, 4))
-    for j in range(n):
-        half = 0.0
-        for k in range(3):
-            balls[j, k] = 0.5 * (starts[j, k] + ends[j, k])
-            half += (0.5 * (ends[j, k] - starts[j, k])) ** 2
-        balls[j, 3] = np.sqrt(half) + radii[j]
-    for i in range(n):
-        if left[i] == 0:
-            continue
-        kept[i] = True
-        ax, ay, az = starts[i, 0], starts[i, 1], starts[i, 2]
-        dx, dy, dz = ends[i, 0] - ax, ends[i, 1] - ay, ends[i, 2] - az
-        square = max(dx * dx + dy * dy + dz * dz, 1e-18)
-        limit = radii[i] * radii[i]
-        for j in range(i + 1, n):
-            if left[j] == 0:
-                continue
-            x, y, z = balls[j, 0] - ax, balls[j, 1] - ay, balls[j, 2] - az
-            along = min(max((x * dx + y * dy + z * dz) / square, 0.0), 1.0)
-            x, y, z = x - along * dx, y - along * dy, z - along * dz
-            far = radii[i] + balls[j, 3]
-            if x * x + y * y + z * z > far * far:
-                continue
-            for p in range(count):
-                if outside[j, p]:
-                    x, y, z = points[j, p, 0] - ax, points[j, p, 1] - ay, points[j, p, 2] - az
-                    along = min(max((x * dx + y * dy + z * dz) / square, 0.0), 1.0)
-                    x, y, z = x - along * dx, y - along * dy, z - along * dz
-                    if x * x + y * y + z * z <= limit:
-                        outside[j, p] = False
-                        left[j] -= 1
-    return kept

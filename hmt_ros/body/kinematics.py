@@ -21,10 +21,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.core import derive_along, lift_origins, place_joints, place_poses
 from hmt_ros.inference.arrays import Array, Index
 
 
@@ -120,7 +120,7 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     q = _checked(skeleton, poses)
     n, s, d = len(q), len(skeleton.parents), skeleton.dimension
     placed = np.empty((n, s, 3, 3)), np.empty((n, s, 3)), np.empty((n, d, 3)), np.zeros((n, d, 3))
-    _place_poses(placing_of(skeleton), q, *placed)
+    place_poses(placing_of(skeleton), q, *placed)
     return Frames(skeleton, q, *(np.ascontiguousarray(np.moveaxis(x, 0, -1)) for x in placed))
 
 
@@ -132,7 +132,7 @@ def joint_positions(skeleton: Skeleton, poses: ArrayLike) -> Array:
     """
     q = _checked(skeleton, poses)
     result = np.empty((len(q), len(skeleton.joint_segments), 3))
-    _place_joints(placing_of(skeleton), q, skeleton.joint_segments, skeleton.joint_offsets, result)
+    place_joints(placing_of(skeleton), q, skeleton.joint_segments, skeleton.joint_offsets, result)
     return result
 
 
@@ -142,8 +142,7 @@ def _checked(skeleton: Skeleton, poses: ArrayLike) -> Array:
     Raises:
         ValueError: they do not have d columns or are not finite.
     """
-    # Writable: kernels are compiled again for read-only arrays.
-    q = np.require(poses, np.float64, ('C', 'W'))
+    q = np.require(poses, np.float64, 'C')
     if q.ndim != 2 or q.shape[1] != skeleton.dimension:
         raise ValueError(
             f'poses of {skeleton.name} must have shape (N, {skeleton.dimension}), saw {q.shape}'
@@ -181,8 +180,8 @@ def directed_derivatives(
     skeleton = frames.skeleton
     axes, origins = (x[0] for x in frames.dofs_by_pose())
     points, directions = (np.ascontiguousarray(x) for x in (points, directions))
-    result = np.zeros((len(points), skeleton.dimension))
-    _directed(
+    result = np.empty((len(points), skeleton.dimension))
+    derive_along(
         skeleton.moves,
         skeleton.dof_is_rotation,
         axes,
@@ -195,46 +194,11 @@ def directed_derivatives(
     return result
 
 
-@njit(cache=True, nogil=True)
-def _directed(moves, is_rotation, axes, origins, segments, points, directions, result):  # type: ignore[no-untyped-def]
-    for m in range(len(points)):
-        s = segments[m]
-        p0, p1, p2 = points[m, 0], points[m, 1], points[m, 2]
-        a0, a1, a2 = directions[m, 0], directions[m, 1], directions[m, 2]
-        for j in range(len(axes)):
-            if not moves[s, j]:
-                continue
-            if is_rotation[j]:
-                # a . (axis x arm) = axis . (arm x a)
-                r0, r1, r2 = p0 - origins[j, 0], p1 - origins[j, 1], p2 - origins[j, 2]
-                turned = axes[j, 0] * (r1 * a2 - r2 * a1) + axes[j, 1] * (r2 * a0 - r0 * a2)
-                result[m, j] = turned + axes[j, 2] * (r0 * a1 - r1 * a0)
-            else:
-                result[m, j] = axes[j, 0] * a0 + axes[j, 1] * a1 + axes[j, 2] * a2
-
-
 def origin_length_jacobians(skeleton: Skeleton, frames: Frames) -> Array:
     """Derivatives (S, 3, L, N) of the origins of the segments with respect to the lengths."""
-    result = np.zeros((len(skeleton.parents), 3, len(skeleton.length_names), frames.count))
-    _lift_origins(placing_of(skeleton).parents, skeleton.offset_basis, frames.columns, result)
+    result = np.empty((len(skeleton.parents), 3, len(skeleton.length_names), frames.count))
+    lift_origins(placing_of(skeleton).parents, skeleton.offset_basis, frames.columns, result)
     return result
-
-
-@njit(cache=True, nogil=True)
-def _lift_origins(parents, basis, columns, result):  # type: ignore[no-untyped-def]
-    """Fills the result of `origin_length_jacobians`, segment by segment."""
-    segments, _, lengths, poses = result.shape
-    for s in range(segments):
-        parent = parents[s]
-        for x in range(3):
-            for k in range(lengths):
-                for n in range(poses):
-                    total = 0.0 if parent >= 0 else basis[s, x, k]
-                    if parent >= 0:
-                        total = result[parent, x, k, n]
-                        for i in range(3):
-                            total += columns[parent, i, x, n] * basis[s, i, k]
-                    result[s, x, k, n] = total
 
 
 def joint_length_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
@@ -374,88 +338,6 @@ def placing_of(skeleton: Skeleton) -> Placing:
         np.ascontiguousarray(skeleton.mounts, dtype=np.float64),
         np.ascontiguousarray(skeleton.offsets, dtype=np.float64),
     )
-
-
-@njit(cache=True, nogil=True)
-def place_pose(tree, pose, columns, origins, axes, dof_origins):  # type: ignore[no-untyped-def]
-    """Fills the frames of one pose (d,).
-
-    Args:
-        tree: of the skeleton.
-        pose: (d,).
-        columns, origins: (S, 3, 3), (S, 3) frames of the segments; columns[s, i] is axis i.
-        axes, dof_origins: (d, 3) unit vector of each degree of freedom, and a point on the axis of
-            each rotation; those of translations are left as they are.
-    """
-    for s in range(len(tree.parents)):
-        place_segment(tree, s, pose, columns, origins, axes, dof_origins)
-
-
-@njit(cache=True, nogil=True, inline='always')
-def place_segment(tree, s, pose, columns, origins, axes, dof_origins):  # type: ignore[no-untyped-def]
-    """Fills the frame of segment s of a pose (d,) whose parent is placed; see `place_pose`."""
-    mounts, offsets = tree.mounts, tree.offsets
-    parent = tree.parents[s]
-    for k in range(3):
-        origins[s, k] = offsets[s, k]
-    if parent >= 0:
-        for k in range(3):
-            origins[s, k] = origins[parent, k]
-            for i in range(3):
-                origins[s, k] += offsets[s, i] * columns[parent, i, k]
-    for i in range(3):
-        for k in range(3):
-            if parent >= 0:
-                total = 0.0
-                for j in range(3):
-                    total += mounts[s, j, i] * columns[parent, j, k]
-                columns[s, i, k] = total
-            else:
-                columns[s, i, k] = mounts[s, k, i]
-    for d in range(tree.first_dofs[s], tree.first_dofs[s + 1]):
-        axis, value = tree.dof_axes[d], pose[d]
-        if tree.dof_is_rotation[d]:
-            cos, sin = np.cos(value), np.sin(value)
-            i, j = (axis + 1) % 3, (axis + 2) % 3
-            for k in range(3):
-                axes[d, k] = columns[s, axis, k]
-                dof_origins[d, k] = origins[s, k]
-                a, b = columns[s, i, k], columns[s, j, k]
-                columns[s, i, k] = cos * a + sin * b
-                columns[s, j, k] = cos * b - sin * a
-        else:
-            for k in range(3):
-                along = 1.0 if k == axis else 0.0
-                if parent >= 0:
-                    along = columns[parent, axis, k]
-                axes[d, k] = along
-                origins[s, k] += along * value
-
-
-@njit(cache=True, nogil=True)
-def _place_poses(tree, poses, columns, origins, axes, dof_origins):  # type: ignore[no-untyped-def]
-    """Fills the frames of N poses (N, d), pose by pose; see `place_pose`."""
-    for n in range(len(poses)):
-        place_pose(tree, poses[n], columns[n], origins[n], axes[n], dof_origins[n])
-
-
-@njit(cache=True, nogil=True)
-def _place_joints(tree, poses, joint_segments, joint_offsets, joints):  # type: ignore[no-untyped-def]
-    """Fills the joints (N, J, 3) of poses (N, d)."""
-    segments, d = len(tree.parents), poses.shape[1]
-    columns, origins = np.empty((segments, 3, 3)), np.empty((segments, 3))
-    axes, on_axes = np.empty((d, 3)), np.empty((d, 3))
-    for n in range(len(poses)):
-        place_pose(tree, poses[n], columns, origins, axes, on_axes)
-        for j in range(len(joint_segments)):
-            s = joint_segments[j]
-            for x in range(3):
-                joints[n, j, x] = (
-                    columns[s, 0, x] * joint_offsets[j, 0]
-                    + columns[s, 1, x] * joint_offsets[j, 1]
-                    + columns[s, 2, x] * joint_offsets[j, 2]
-                    + origins[s, x]
-                )
 
 
 @lru_cache(maxsize=16)

@@ -18,19 +18,15 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_ros.body.angle_mixture import AngleMixture, shipped_prior
 from hmt_ros.body.body import Body
+from hmt_ros.core import evaluate_prior_at
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Energy
 
 LEARNED, ANGLES = 'learned', 'angles'
 KINDS = (LEARNED, ANGLES)
-
-# Components whose density is this much below the largest are left out, nats: below rounding.
-NEGLIGIBLE = 40.0
-FAINT = 1e-12  # responsibility below which a component adds nothing to the derivatives
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +122,8 @@ def prior_energies(prior: AnglePrior | MixturePrior, poses: Array) -> Energy:
     """Energies of poses (N, d), with derivatives; the Hessians are positive definite."""
     n, d = poses.shape
     value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
-    for i, pose in enumerate(np.ascontiguousarray(poses)):
-        value[i] = evaluate_prior(prior.compiled, pose, False, True, gradient[i], hessian[i])
+    poses = np.ascontiguousarray(poses, dtype=np.float64)
+    evaluate_prior_at(prior.compiled, poses, value, gradient, hessian)
     return Energy(value, gradient, hessian)
 
 
@@ -152,76 +148,3 @@ class PriorModel(NamedTuple):
     means: Array
     rest: Array
     weight: float
-
-
-@njit(cache=True, nogil=True)
-def evaluate_prior(model, pose, exact, wanted, gradient, hessian):  # type: ignore[no-untyped-def]
-    """The energy of a pose.
-
-    Args:
-        model: the prior.
-        pose: (d,).
-        exact: whether the Hessian is the exact one.
-        wanted: whether derivatives are wanted.
-        gradient, hessian: (d,), (d, d) become the derivatives.
-    """
-    count, n = model.centres.shape
-    d, places, weight = len(pose), model.places, model.weight
-    z, log = np.empty((count, n)), np.empty(count)
-    angles = np.empty(n)
-    for i in range(n):
-        angles[i] = pose[places[i]]
-    best = -np.inf
-    for c in range(count):
-        # The distance only grows: a component that is far away is given up early.
-        most = 2.0 * (model.constants[c] - best + NEGLIGIBLE)
-        distance = 0.0
-        for i in range(n):
-            s = 0.0
-            for j in range(i + 1):
-                s += model.whitening[c, i, j] * angles[j]
-            s -= model.centres[c, i]
-            z[c, i] = s
-            distance += s * s
-            if distance > most:
-                break
-        log[c] = -np.inf if distance > most else model.constants[c] - 0.5 * distance
-        best = max(best, log[c])
-    total = 0.0
-    for c in range(count):
-        log[c] = np.exp(log[c] - best)
-        total += log[c]
-    energy = -best - np.log(total)
-    for i in range(d):
-        offset = pose[i] - model.means[i]
-        energy += 0.5 * model.rest[i] * offset * offset
-    if not wanted:
-        return weight * energy
-    pull, pulls, curvature = np.empty(n), np.zeros(n), np.zeros((n, n))
-    for c in range(count):
-        share = log[c] / total
-        if share < FAINT:
-            continue
-        pull[:] = 0.0
-        for i in range(n):
-            for j in range(i + 1):
-                pull[j] += model.whitening[c, i, j] * z[c, i]
-        for i in range(n):
-            pulls[i] += share * pull[i]
-            for j in range(n):
-                curvature[i, j] += share * model.precisions[c, i, j]
-        if exact:
-            for i in range(n):
-                for j in range(n):
-                    curvature[i, j] -= share * pull[i] * pull[j]
-    hessian[:] = 0.0
-    for i in range(d):
-        gradient[i] = weight * model.rest[i] * (pose[i] - model.means[i])
-        hessian[i, i] = weight * model.rest[i]
-    for i in range(n):
-        gradient[places[i]] += weight * pulls[i]
-        for j in range(n):
-            hessian[places[i], places[j]] = weight * curvature[i, j]
-            if exact:
-                hessian[places[i], places[j]] += weight * pulls[i] * pulls[j]
-    return weight * energy

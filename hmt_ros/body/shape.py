@@ -18,11 +18,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import GROWTH, Body
 from hmt_ros.body.kinematics import Frames, origin_length_jacobians, placing_of
+from hmt_ros.core import sum_shape_residuals
 from hmt_ros.inference.arrays import Array, Mask
 
 # Standard deviations over people and clothes, by kind of growth: logarithms, m.
@@ -104,7 +104,7 @@ class ShapeSpace:
         d = skeleton.dimension
         result = np.zeros((n, size)), np.zeros((n, size, size)), np.zeros((n, size, d))
         lifts = origin_length_jacobians(skeleton, frames).transpose(3, 0, 1, 2)
-        _sum_residuals(
+        sum_shape_residuals(
             self._table,
             np.ascontiguousarray(lifts),
             placing_of(skeleton).parents,
@@ -197,130 +197,3 @@ class _ShapeTable(NamedTuple):
     joint_basis: Array
     variables: NDArray[np.int64]
     counts: NDArray[np.int64]
-
-
-@njit(cache=True, nogil=True)
-def _sum_residuals(  # type: ignore[no-untyped-def]
-    table,
-    lifts,
-    parents,
-    dof_segments,
-    is_rotation,
-    joint_segments,
-    columns,
-    origins,
-    axes,
-    dof_origins,
-    of_flesh,
-    of_joints,
-    gradient,
-    curvature,
-    mixed,
-):
-    """Adds up the sums of `ShapeSpace.second_order`.
-
-    A residual on the flesh has r = B' f, with f = (R' a, u R' a, a) (9,) and B (9, P) the
-    derivatives of centre, radii and origin, which are the same for all points of a segment; and
-    q = T' b, with b = (a, p x a) and twists T (6, d). So sums of f f' and f b' over the residuals
-    of a segment suffice.
-    """
-    segments, lengths = len(parents), lifts.shape[3]
-    d, size = axes.shape[1], gradient.shape[1]
-    pulls, squares, products = (
-        np.empty((segments, 9)),
-        np.empty((segments, 9, 9)),
-        np.empty((segments, 9, 6)),
-    )
-    carried = np.empty((segments, size, 6))
-    most = table.variables.shape[1]
-    f, b, row = np.empty(9), np.empty(6), np.empty(lengths)
-    rates, pushed, twist = np.empty((9, most)), np.empty((9, most)), np.empty(6)
-    for n in range(len(columns)):
-        lift = lifts[n]
-        pulls[:], squares[:], products[:], carried[:] = 0.0, 0.0, 0.0, 0.0
-        for m in range(1, 1 + int(of_flesh[n, 0, 0])):
-            s = int(of_flesh[n, m, 0])
-            point, a = of_flesh[n, m, 1:4], of_flesh[n, m, 4:7]
-            pull, c = of_flesh[n, m, 7], of_flesh[n, m, 8]
-            part = table.part_of[s]
-            for i in range(3):
-                turned, local = 0.0, 0.0
-                for k in range(3):
-                    turned += columns[n, s, i, k] * a[k]
-                    local += columns[n, s, i, k] * (point[k] - origins[n, s, k])
-                f[i] = turned
-                f[3 + i] = turned * (local - table.centres[part, i]) / table.radii[part, i]
-                f[6 + i] = a[i]
-            _wrench(point, a, b)
-            for i in range(9):
-                pulls[s, i] += pull * f[i]
-                for k in range(9):
-                    squares[s, i, k] += c * f[i] * f[k]
-                for k in range(6):
-                    products[s, i, k] += c * f[i] * b[k]
-        for s in range(segments):
-            part, count = table.part_of[s], table.counts[s]
-            if part < 0:
-                continue
-            for v in range(count):
-                p = table.variables[s, v]
-                for i in range(3):
-                    rates[i, v] = table.by_centre[part, i, p]
-                    rates[3 + i, v] = table.by_radius[part, i, p]
-                    rates[6 + i, v] = lift[s, i, p] if p < lengths else 0.0
-                for i in range(9):
-                    total = 0.0
-                    for k in range(9):
-                        total += squares[s, i, k] * rates[k, v]
-                    pushed[i, v] = total
-                    gradient[n, p] += pulls[s, i] * rates[i, v]
-                    for k in range(6):
-                        carried[s, p, k] += rates[i, v] * products[s, i, k]
-                for u in range(v + 1):
-                    q, total = table.variables[s, u], 0.0
-                    for i in range(9):
-                        total += rates[i, u] * pushed[i, v]
-                    curvature[n, q, p] += total
-                    if u != v:
-                        curvature[n, p, q] += total
-        for m in range(1, 1 + int(of_joints[n, 0, 0])):
-            joint = int(of_joints[n, m, 0])
-            point, a = of_joints[n, m, 1:4], of_joints[n, m, 4:7]
-            pull, c = of_joints[n, m, 7], of_joints[n, m, 8]
-            s = joint_segments[joint]
-            for p in range(lengths):
-                row[p] = 0.0
-                for k in range(3):
-                    rate = lift[s, k, p]
-                    for i in range(3):
-                        rate += columns[n, s, i, k] * table.joint_basis[joint, i, p]
-                    row[p] += a[k] * rate
-            _wrench(point, a, b)
-            for p in range(lengths):
-                gradient[n, p] += pull * row[p]
-                for q in range(lengths):
-                    curvature[n, p, q] += c * row[p] * row[q]
-                for k in range(6):
-                    carried[s, p, k] += c * row[p] * b[k]
-        for s in range(segments - 1, 0, -1):
-            if parents[s] >= 0:
-                carried[parents[s]] += carried[s]
-        for j in range(d):
-            twist[:3], twist[3:] = axes[n, j], 0.0
-            if is_rotation[j]:  # (o x w, w)
-                _wrench(dof_origins[n, j], axes[n, j], twist)
-                for k in range(3):
-                    twist[k], twist[3 + k] = twist[3 + k], twist[k]
-            for p in range(size):
-                total = 0.0
-                for k in range(6):
-                    total += carried[dof_segments[j], p, k] * twist[k]
-                mixed[n, p, j] = total
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _wrench(point, a, result):  # type: ignore[no-untyped-def]
-    """Fills (6,) with (a, point x a)."""
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        result[k], result[3 + k] = a[k], point[i] * a[j] - point[j] * a[i]

@@ -20,12 +20,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.flips.tree_growth import ChainLinks, chain_links, grow_leaves
+from hmt_ros.core import grow_leaves, keep_distinct
+from hmt_ros.flips.chain_links import ChainLinks, chain_links
 from hmt_ros.inference.arrays import Array, Index
 
 
@@ -74,6 +74,7 @@ def _leaves(frames: Frames, poses: Array, chain: ChainLinks) -> tuple[Array, NDA
     count = 2 ** len(chain.lengths)
     angles = np.empty((len(poses), count, len(chain.dofs)))
     valid = np.zeros((len(poses), count), dtype=np.bool_)
+    ends = np.ascontiguousarray(ends)
     grow_leaves(chain, frames.columns, frames.origins, poses, ends, 0.0, True, angles, valid)
     valid[:, 0] = True
     angles[:, 0] = poses[:, chain.dofs]
@@ -112,30 +113,7 @@ def distinct_poses(joints: ArrayLike, apart: float, most: int | None = None) -> 
     if points.ndim != 3 or points.shape[2] != 3:
         raise ValueError(f'joints must have shape (N, J, 3), saw {points.shape}')
     flat = points.reshape(len(points), 3 * points.shape[1])
-    return Distinct(*keep_distinct(flat, float(apart), len(flat) if most is None else int(most)))
-
-
-@njit(cache=True, nogil=True)
-def keep_distinct(points, apart, most):  # type: ignore[no-untyped-def]
-    """Indices of the poses (N, 3 J) that are kept, and which stands for each."""
-    n = len(points)
-    kept, owner = np.empty(n, np.int64), np.full(n, -1)
-    count = 0
-    for i in range(n):
-        least = apart * apart
-        for place in range(count):
-            k = kept[place]
-            gap = 0.0
-            for j in range(0, points.shape[1], 3):
-                x = points[k, j] - points[i, j]
-                y = points[k, j + 1] - points[i, j + 1]
-                z = points[k, j + 2] - points[i, j + 2]
-                gap = max(gap, x * x + y * y + z * z)
-                if gap >= least:
-                    break
-            if gap < least:
-                owner[i], least = place, gap
-        if owner[i] < 0 and count < most:
-            kept[count], owner[i] = i, count
-            count += 1
-    return kept[:count], owner
+    kept, owner = (np.empty(len(flat), dtype=np.intp) for _ in range(2))
+    most = len(flat) if most is None else int(most)
+    count = keep_distinct(flat, float(apart), most, kept, owner)
+    return Distinct(kept[:count], owner)

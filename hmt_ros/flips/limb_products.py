@@ -14,20 +14,113 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import placing_of
-from hmt_ros.flips.limb_products_kernel import (
-    Configurations,
-    combine,
-    fill_configurations,
-    limbs_of,
-    place_alone,
-)
+from hmt_ros.body.skeleton import Skeleton, sided_pairs
+from hmt_ros.core import combine, fill_configurations, place_alone
+from hmt_ros.flips.chain_links import chain_links
 from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.inference.arrays import Array, Index
+
+
+class Limbs(NamedTuple):
+    """The C limbs of a body as the core reads them, of at most K links and D variables.
+
+    Attributes:
+        links, dofs, joints: (C,) number of links, of degrees of freedom and of joints that move.
+        segments, parents, mounts, mounted, lengths, first_dofs, own, lower, upper, sides: those of
+            `ChainLinks`, filled up to the largest limb.
+        joint_segments, joint_offsets: (C, J), (C, J, 3) of the joints that a limb moves.
+        siblings: (C,) the limb of the other side; -1: there is none.
+    """
+
+    links: NDArray[np.int64]
+    dofs: NDArray[np.int64]
+    joints: NDArray[np.int64]
+    segments: NDArray[np.int64]
+    parents: NDArray[np.int64]
+    mounts: Array
+    mounted: NDArray[np.bool_]
+    lengths: Array
+    first_dofs: NDArray[np.int64]
+    own: NDArray[np.int64]
+    lower: Array
+    upper: Array
+    sides: NDArray[np.bool_]
+    joint_segments: NDArray[np.int64]
+    joint_offsets: Array
+    siblings: NDArray[np.int64]
+
+
+@lru_cache(maxsize=16)
+def limbs_of(skeleton: Skeleton) -> Limbs:
+    """The limbs of a skeleton, in the order of its chains.
+
+    Raises:
+        ValueError: a chain has no closed form; see `chain_links`.
+    """
+    names = list(skeleton.chains)
+    chains = [chain_links(skeleton, name) for name in names]
+    moved = [skeleton.chain_joints[name] for name in names]
+    siblings = np.full(len(names), -1)
+    for pair in sided_pairs(skeleton.chains):
+        left, right = (names.index(name) for name in pair)
+        siblings[left], siblings[right] = right, left
+    own: dict[str, Any] = {
+        name: _filled([np.asarray(getattr(chain, name)) for chain in chains])
+        for name in (
+            'segments',
+            'mounts',
+            'mounted',
+            'lengths',
+            'first_dofs',
+            'lower',
+            'upper',
+            'sides',
+        )
+    }
+    return Limbs(
+        links=np.array([len(chain.lengths) for chain in chains], dtype=np.int64),
+        dofs=np.array([len(chain.dofs) for chain in chains], dtype=np.int64),
+        joints=np.array([len(joints) for joints in moved], dtype=np.int64),
+        parents=np.array([chain.parent for chain in chains], dtype=np.int64),
+        own=_filled([chain.dofs.astype(np.int64) for chain in chains]),
+        joint_segments=_filled([skeleton.joint_segments[x].astype(np.int64) for x in moved]),
+        joint_offsets=_filled([skeleton.joint_offsets[x] for x in moved]),
+        siblings=siblings.astype(np.int64),
+        **own,
+    )
+
+
+def _filled(arrays: list[NDArray[Any]]) -> NDArray[Any]:
+    """Arrays of different lengths in one, filled up with zeros."""
+    most = max(len(x) for x in arrays)
+    result = np.zeros((len(arrays), most, *arrays[0].shape[1:]), dtype=arrays[0].dtype)
+    for row, x in zip(result, arrays, strict=True):
+        row[: len(x)] = x
+    return result
+
+
+class Configurations(NamedTuple):
+    """Configurations of limbs on T trunks; the first trunk is that of G modes.
+
+    Attributes:
+        trunks: (T, d) a pose of each trunk.
+        angles: (T, C, A, D) angles of each configuration of each limb.
+        counts: (T, C) number of configurations; 0: those on the first trunk.
+        penalties: (G, C, A) minus the log probability that a mode takes each on the first trunk.
+    """
+
+    trunks: Array
+    angles: Array
+    counts: NDArray[np.int64]
+    penalties: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +263,8 @@ class LimbProducts:
             limbs_of(self.body.skeleton),
             self.modes,
             found,
-            energies,
-            np.asarray(log_weights, dtype=np.float64),
+            np.ascontiguousarray(energies, dtype=np.float64),
+            np.ascontiguousarray(log_weights, dtype=np.float64),
             np.logaddexp.reduce(log_weights) - prices,
             float(share),
             int(count),

@@ -27,12 +27,13 @@ from hmt_ros.body.pose_prior import (
     pose_prior,
 )
 from hmt_ros.body.self_intersection import SelfIntersection
+from hmt_ros.core import record_residuals
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of, lens_of
 from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
-from hmt_ros.image.terms.registry import TERMS, Model, record_residuals
+from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
 from hmt_ros.inference.arrays import Array
 
@@ -168,8 +169,8 @@ class ImageLikelihood:
         """The residuals of the terms of contours and depths at the frames of N poses.
 
         Returns:
-            (N, 1 + M, RECORDED): rows 1 to m of a pose are their points and derivatives, see
-            `residuals.add_residual`; m is the first number of row 0.
+            (N, 1 + M, RECORDED): rows 1 to m of a pose are their points and derivatives; m is the
+            first number of row 0.
         """
         n = frames.count
         inputs = self.inputs(observation, n, None)
@@ -184,7 +185,7 @@ class ImageLikelihood:
     def inputs(
         self, observation: Observation, poses: int, explained: Array | None
     ) -> tuple[Any, ...]:
-        """The inputs of the kernels of all terms, for so many poses."""
+        """The inputs of all terms, for so many poses."""
         beliefs = observation.beliefs
         request = Request(poses, explained)
         result = []
@@ -206,7 +207,7 @@ class ImageLikelihood:
 
     @cached_property
     def model(self) -> Model:
-        """Body and camera as the kernels read them."""
+        """Body and camera as the core reads them."""
         body = self.body
         flesh = flesh_table_of(body)
         count = len(flesh.part_segments)

@@ -1,11 +1,11 @@
-"""Energies of poses and their minima, compiled as a whole: all terms of one image in one pass.
+"""Energies of poses and their minima: all terms of one image in one pass of the compiled core.
 
     E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_ground(x) + E_flow(x)
            + E_motion(x)
 
-A pose is placed once, and the kernels of all terms that it is compared by read its frames. The
+A pose is placed once, and all terms in `core/terms` that it is compared by read its frames. The
 minima are those of `inference.bounded_newton`, problem by problem instead of step by step. A term
-without a kernel here is added by its own `energy`; then the minima are found step by step, too.
+that is not in the core is added by its own `energy`; then the minima are found step by step, too.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
-from hmt_ros.body.kinematics import forward, placing_of
-from hmt_ros.body.pose_prior import AnglePrior, MixturePrior
+from hmt_ros.body.ground_terms import Constants, FloorPlane, GroundSettings, GroundTerm
+from hmt_ros.body.kinematics import Placing, forward, placing_of
+from hmt_ros.body.pose_prior import AnglePrior, MixturePrior, PriorModel
 from hmt_ros.body.pose_terms import FrameTerm
-from hmt_ros.body.self_intersection import SelfIntersection
+from hmt_ros.body.self_intersection import Overlaps, SelfIntersection
+from hmt_ros.core import solve
 from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.optical_flow import FlowTerm
-from hmt_ros.image.pose_energy_kernel import NO_DESCENT, Compiled, Descent, solve
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import NO_MAP
-from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
-from hmt_ros.image.terms.registry import TERMS
+from hmt_ros.image.terms.keypoints import KeypointInputs, Keypoints, KeypointTerm
+from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, add_energies
@@ -60,6 +60,52 @@ MAX_ITERATIONS = 40
 def scale_of(body: Body) -> Array:
     """Length (d,) of a moderate step of each variable, rad or m."""
     return np.where(body.skeleton.dof_is_rotation, ROTATION_STEP, PLACE_STEP)
+
+
+class Compiled(NamedTuple):
+    """The terms as compiled code reads them; a term that is not there counts 0.
+
+    Attributes:
+        placing: of the skeleton.
+        model, inputs: of the terms of the image.
+        image, contour: whether one of these is on, and whether one that is on needs the contour.
+        keypoints, prior, overlaps, ground, flow: of the other terms.
+        centres, precisions: (R, f), (R, f, f) of the motion, a row a problem or one for all; no
+            rows: there is none.
+        tails: its degrees of freedom; 0: it is Gaussian.
+    """
+
+    placing: Placing
+    model: Model
+    inputs: Any
+    image: bool
+    contour: bool
+    keypoints: KeypointInputs
+    prior: PriorModel
+    overlaps: Overlaps
+    ground: Constants
+    flow: FlowTerm
+    centres: Array
+    precisions: Array
+    tails: float
+
+
+class Descent(NamedTuple):
+    """Settings of the minimiser; see `bounded_newton.minimise`.
+
+    Attributes:
+        most: evaluations per problem after the first one.
+        damping, tolerance: first lambda, and gain of a step that ends a descent.
+        metric: (f,) diagonal of W.
+    """
+
+    most: int
+    damping: float
+    tolerance: float
+    metric: Array
+
+
+NO_DESCENT = Descent(0, 1.0, 0.0, np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,8 +310,7 @@ class PoseEnergy:
         if self.point is None:
             return np.arange(self.likelihood.body.dimension)
         assert self.free is not None
-        # A copy, which can be written: compiled code is the same for all.
-        return np.array(self.free, dtype=np.intp)
+        return np.asarray(self.free, dtype=np.intp)
 
     def _checked(self, x: ArrayLike) -> Array:
         result = np.array(x, dtype=np.float64, ndmin=2)

@@ -18,12 +18,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.lib.stride_tricks import as_strided
 from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri
 
+from hmt_ros.core import add_diagonal, fill_lower
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.exact_sums import dot
 
 
 class NotPositiveDefiniteError(ValueError):
@@ -209,40 +208,3 @@ def factorise_band(band: Array, times: int, size: int) -> BlockCholesky:
             f'{times * size}'
         )
     return BlockCholesky(factor, times, size)
-
-
-@njit(cache=True, nogil=True)
-def add_diagonal(columns: Array, blocks: Array, n: int) -> None:
-    """Adds blocks (T, d, d) to the leading parts of diagonal blocks in a band (T n, width + 1).
-
-    Of each block the upper triangle is read.
-    """
-    times, d, _ = blocks.shape
-    for t in range(times):
-        for b in range(d):
-            for a in range(b, d):
-                columns[t * n + b, a - b] += blocks[t, b, a]
-
-
-@njit(cache=True, nogil=True)
-def fill_lower(columns: Array, lower: Array) -> None:
-    """Writes the blocks E_t (T-1, n, n) into the columns (T n, width + 1) of a band."""
-    count, n, _ = lower.shape
-    width = columns.shape[1] - 1
-    for t in range(count):
-        for b in range(n):
-            for a in range(min(n, width - n + b + 1)):
-                columns[t * n + b, n + a - b] = lower[t, a, b]
-
-
-@njit(cache=True, nogil=True)
-def add_band_product(columns: Array, x: Array, result: Array) -> None:
-    """Adds P x, (S, T n), of vectors x (S, T n) and P in the columns (T n, width + 1) of a band."""
-    total, width = columns.shape
-    for s in range(len(x)):
-        for c in range(total):
-            last = min(width, total - c)
-            own = x[s, c]
-            result[s, c] += dot(columns[c], x[s], c, last)
-            for b in range(1, last):
-                result[s, c + b] += columns[c, b] * own

@@ -65,16 +65,7 @@ def run_together(
     sys.setswitchinterval(_SWITCH_INTERVAL)
     # The handlers of rclpy end the context in the middle of the work; ours let the work finish.
     stopped = threading.Event()
-    nodes: Sequence[SessionNode[Any, Any]] = ()
-
-    def stop(*_: object) -> None:
-        stopped.set()
-        if any(node.preparing for node in nodes):
-            # Nothing is lost: compiled code is kept, function by function.
-            sys.stderr.flush()
-            os._exit(0)
-
-    on_signals(stop)
+    on_signals(lambda *_: stopped.set())
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         nodes = make()

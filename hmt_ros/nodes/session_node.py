@@ -32,7 +32,6 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 
-from hmt_ros.compiled_code import prepare
 from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, trouble_of_period
 from hmt_ros.nodes.estimating_thread import (
     EstimatingThreads,
@@ -95,7 +94,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         SESSION: class of the session.
         DEFAULTS: parameters with their default values.
         CAN_WAIT: whether its results can wait for those of other nodes of the process.
-        preparing: whether kernels are being compiled or loaded, which may take a minute.
     """
 
     NAME: ClassVar[str]
@@ -126,7 +124,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         for service in self.services:
             service.callback = partial(self._serve, service.callback)
-        self.preparing = False
         self._session: AnySession | None = None
         self._estimator: Estimator | None = None
         self._outputs: dict[str, Any] = {}
@@ -247,7 +244,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     # Lifecycle.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Reads files, compiles or loads kernels, opens topics."""
+        """Reads files, opens topics."""
         try:
             session = self._new_session(self._settings, self._publish, self._is_wanted)
         except ValueError as error:
@@ -256,12 +253,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self._diagnose()
             return TransitionCallbackReturn.FAILURE
         self._failure = ''
-        if self.SESSION.prepare is not Session.prepare:
-            self.preparing = True
-            try:
-                prepare(session.prepare, self.get_logger().info)
-            finally:
-                self.preparing = False
         self._session = session
         for topic, published in self.SESSION.TOPICS.items():
             self._outputs[topic] = self._new_publisher(topic, *published_with(published))

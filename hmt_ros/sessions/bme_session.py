@@ -74,7 +74,6 @@ from hmt_ros.sessions.session import (
     NeededInput,
     PublishedTopic,
 )
-from hmt_ros.sessions.warm_up import film
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import image_message
@@ -162,18 +161,6 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._cue = p.predict_from
         self._keypoints = KeypointReader(p.source, self._log)
         self.restart()
-
-    def prepare(self) -> None:
-        """See `Session`."""
-        shown, previous = film(), None
-        if self._lifter is not None:
-            self._inputs[KEYPOINTS].put(0, shown.keypoints(0))
-            self._lifted(0, shown.camera)
-            self.restart()
-        if self._cue == FROM_KEYPOINTS:
-            return
-        for mask in shown.masks[:2]:
-            previous = self._seen(mask, shown.camera, previous).mixture
 
     def restart(self) -> None:
         """See `Session`."""

@@ -187,13 +187,6 @@ class Session(ABC, Generic[Parameters, State]):
     def share(self, images: SeenImages) -> None:
         """Takes the store of images of its process, before the first message."""
 
-    def prepare(self) -> None:
-        """Compiles, or loads, the code for messages; nothing is estimated or published.
-
-        It takes a second or, the first time after an update, a minute. To be called before the
-        first message.
-        """
-
     @property
     def most_waiting(self) -> int:
         """Maximum number of messages to be estimated from that wait for an estimate."""

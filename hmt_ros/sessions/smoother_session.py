@@ -57,10 +57,8 @@ from hmt_ros.sessions.smoothed_messages import (
 )
 from hmt_ros.sessions.smoother_parameters import AT_END, NEVER, SmootherParameters
 from hmt_ros.sessions.track import resembles
-from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MotionSmoother, SlidingWindow, TrajectoryMixture
 from hmt_ros.smoothing.image_refinement import refined_on_images
-from hmt_ros.smoothing.likelihood import MixtureLikelihood
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
@@ -149,20 +147,6 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._first_identity = 1
         self._images = SeenImages()
         self.restart()
-
-    def prepare(self) -> None:
-        """See `Session`."""
-        other = SmootherSession(self.parameters, lambda output: None)
-        for message in likelihoods(load_body(self.parameters.body_model or 'human37')):
-            other.take(MIXTURE, message)
-        other.smooth_span()
-        of, items = other.kept
-        assert of is not None
-        # The kernels of refinement; those of images are the filter's.
-        smoother, modes = other._smoother(of.body), [one.modes for one in items]
-        mixtures = MixtureLikelihood.of([one.mixture for one in modes])
-        refined_on_images(smoother, smoother.motions(modes), mixtures)
-        other.finish()
 
     def share(self, images: SeenImages) -> None:
         """See `Session`."""

@@ -42,7 +42,6 @@ from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
 from hmt_ros.sessions.track_reports import TrackCondition
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.tracking_parameters import FilterParameters
-from hmt_ros.sessions.warm_up import warm_up_tracking
 from hmt_ros.tracking import PosePrediction, Status
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_message, pose_mixture_of
@@ -134,10 +133,6 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         self._keypoints = KeypointReader(p.source, self._log)
         self._begin()
         self.state = self._present_state()
-
-    def prepare(self) -> None:
-        """See `Session`."""
-        warm_up_tracking()
 
     def share(self, images: SeenImages) -> None:
         """See `Session`."""

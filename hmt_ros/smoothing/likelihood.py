@@ -11,18 +11,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 from scipy.special import logsumexp
 
+from hmt_ros.core import add_mixture_energy
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
-from hmt_ros.inference.exact_sums import dot
-
-# Modes whose density is below exp(-60) of the greatest are left out: less than rounding.
-NEGLIGIBLE = 60.0
 
 
 class SequenceLikelihood(EnergyTerm, Protocol):
@@ -76,7 +72,7 @@ class MixtureLikelihood:
         return cls(
             first.astype(np.int64),
             np.log(weights) + log_norms - 0.5 * d * np.log(2 * np.pi),
-            np.concatenate([mixture.means for mixture in kept]),
+            np.ascontiguousarray(np.concatenate([mixture.means for mixture in kept])),
             np.tril(whiteners),
             whiteners.swapaxes(1, 2) @ whiteners,
         )
@@ -184,106 +180,3 @@ def check_mixtures(mixtures: Sequence[GaussianMixture]) -> None:
             mixture.cholesky()
         except ValueError as error:
             raise ValueError(f'mixture {t} of {len(mixtures)}: {error}') from None
-
-
-@njit(cache=True, nogil=True)
-def add_mixture_energy(
-    poses: Array,
-    times: NDArray[np.int64],
-    first: NDArray[np.int64],
-    log_scales: Array,
-    means: Array,
-    whiteners: Array,
-    precisions: Array,
-    second: bool,
-    exact: bool,
-    value: Array,
-    gradient: Array,
-    hessian: Array,
-) -> None:
-    """Writes value (N,), gradient (N, d) and, if wanted, Hessian (N, d, d) at poses (N, d)."""
-    d = poses.shape[1]
-    most = 0
-    for t in range(len(first) - 1):
-        most = max(most, first[t + 1] - first[t])
-    white = np.empty((most, d))
-    pull = np.empty((most, d))
-    logs = np.empty(most)
-    near = np.empty(most)
-    delta = np.empty(d)
-    for i in range(len(poses)):
-        start, count = first[times[i]], first[times[i] + 1] - first[times[i]]
-        # The mode that explains the pose, roughly: the others are given up early against it.
-        leading = 0
-        for k in range(count):
-            mode = start + k
-            total = 0.0
-            for a in range(d):
-                offset = poses[i, a] - means[mode, a]
-                total += offset * offset * precisions[mode, a, a]
-            near[k] = log_scales[mode] - 0.5 * total / d
-            if near[k] > near[leading]:
-                leading = k
-        best = -np.inf
-        for order in range(count):
-            k = leading if order == 0 else (order - 1 if order <= leading else order)
-            mode = start + k
-            for a in range(d):
-                delta[a] = poses[i, a] - means[mode, a]
-            log = log_scales[mode]
-            floor = best - NEGLIGIBLE
-            for a in range(d):
-                total = dot(whiteners[mode, a], delta, 0, a + 1)
-                white[k, a] = total
-                log -= 0.5 * total * total
-                if log < floor:
-                    log = -np.inf
-                    break
-            logs[k] = log
-            best = max(best, log)
-        total = 0.0
-        for k in range(count):
-            if logs[k] > best - NEGLIGIBLE:
-                logs[k] = np.exp(logs[k] - best)
-                total += logs[k]
-            else:
-                logs[k] = 0.0
-        value[i] = -(best + np.log(total))
-        gradient[i] = 0.0
-        for k in range(count):
-            logs[k] /= total
-            if logs[k] == 0.0:
-                continue
-            mode = start + k
-            pull[k] = 0.0
-            for a in range(d):
-                factor = white[k, a]
-                for b in range(a + 1):
-                    pull[k, b] += factor * whiteners[mode, a, b]
-            for a in range(d):
-                gradient[i, a] += logs[k] * pull[k, a]
-        if not second:
-            continue
-        opened = False
-        for k in range(count):
-            if logs[k] == 0.0:
-                continue
-            mode = start + k
-            share = logs[k]
-            if opened:
-                for a in range(d):
-                    for b in range(d):
-                        hessian[i, a, b] += share * precisions[mode, a, b]
-            else:
-                for a in range(d):
-                    for b in range(d):
-                        hessian[i, a, b] = share * precisions[mode, a, b]
-                opened = True
-        if exact:
-            for k in range(count):
-                if logs[k] == 0.0 or logs[k] == 1.0:
-                    continue
-                for a in range(d):
-                    one = logs[k] * (pull[k, a] - gradient[i, a])
-                    for b in range(d):
-                        hessian[i, a, b] -= one * (pull[k, b] - gradient[i, b])

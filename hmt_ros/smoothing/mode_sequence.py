@@ -23,11 +23,11 @@ from functools import cached_property
 import numpy as np
 from scipy.special import logsumexp
 
+from hmt_ros.core import add_diagonal
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
-    add_diagonal,
     factorise_band,
 )
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior

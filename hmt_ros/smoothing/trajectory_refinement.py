@@ -18,16 +18,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.blas import dsbmv
 from scipy.linalg.lapack import dpbtrs
 
+from hmt_ros.core import add_diagonal, hold
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     NotPositiveDefiniteError,
-    add_diagonal,
     factorise_band,
 )
 from hmt_ros.inference.bounded_newton import Status, TrustRegion, resting
@@ -306,7 +305,7 @@ class _Problem:
     ) -> BlockCholesky | None:
         """Factor of the prior's precision + Hessians (T, d, d) + a diagonal (T, n), or None."""
         columns = self.band.copy()
-        add_diagonal(columns, hessian, self.size)
+        add_diagonal(columns, np.ascontiguousarray(hessian), self.size)
         columns[:, 0] += extra.reshape(-1)
         if held is not None:
             hold(columns, np.flatnonzero(held))
@@ -343,14 +342,3 @@ def limits_of_states(
         i = int(np.argmin(low <= high))
         raise ValueError(f'limits of variable {i}: lower {low[i]} is above upper {high[i]}')
     return low, high
-
-
-@njit(cache=True, nogil=True)
-def hold(columns: Array, held: NDArray[np.int64]) -> None:
-    """Takes variables out of a system in band storage: their rows and columns become those of I."""
-    width = columns.shape[1] - 1
-    for j in held:
-        columns[j] = 0.0
-        for b in range(1, min(width, j) + 1):
-            columns[j - b, b] = 0.0
-        columns[j, 0] = 1.0

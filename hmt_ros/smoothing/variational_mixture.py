@@ -15,6 +15,14 @@ with the same antithetic noise z throughout, so that the sampled F is a smooth f
 gradients and its descent is repeatable; the F that is reported comes from fresh samples, with a
 standard error. Variables are scaled by the curvature that F would have if the posterior were q:
 means by L_i sqrt(a_i), log s_i by sqrt(2 D a_i).
+
+Most components are far from each other, and two that are need not be compared: of the samples of i,
+those that j is responsible for have at most the probability
+
+    E_i[a_j q_j / (a_i q_i + a_j q_j)] <= (a_j / a_i)^(1/2) / 2 int (q_i q_j)^(1/2)
+
+and the overlap of two trajectories is at most that of their poses at any one time, for Gaussians at
+most exp(-1/4 D'(C_i + C_j)^-1 D). Pairs below exp(-30) are left out.
 """
 
 from __future__ import annotations
@@ -28,13 +36,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
+from hmt_ros.core import add_band_product, add_component_overlaps
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_band_product
+from hmt_ros.inference.block_tridiagonal import BlockCholesky
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.gaussian_pairs import pair_distances
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.inference.threads import together
-from hmt_ros.smoothing.component_overlaps import NEGLIGIBLE, add_overlaps
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 ADAPTABLE = ('weights', 'means', 'inflation')
@@ -44,6 +52,8 @@ PARTS = 4
 PATIENCE = 3
 # Least proportion that scales the variables of a component.
 LEAST_WEIGHT = 1e-4
+# Logarithm of an overlap that makes no difference.
+NEGLIGIBLE = 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +237,7 @@ class FreeEnergy:
         self.total = self.times * self.size
         self.prior, self.likelihood, self.noise = prior, likelihood, noise
         self.band = prior.precision.band()
-        self.start = states.reshape(self.count, -1)
+        self.start = np.ascontiguousarray(states.reshape(self.count, -1))
         self.log_weights = np.log(np.maximum(weights, 1e-300))
         self.factors = list(factors)
         self.low = np.tile(np.broadcast_to(low, (self.size,)), self.times)
@@ -314,7 +324,7 @@ class FreeEnergy:
         def work(part: int) -> None:
             for i in range(edges[part], edges[part + 1]):
                 points = means[i] + inflation[i] * roots[i]
-                add_overlaps(
+                add_component_overlaps(
                     i,
                     points,
                     noise[i],

@@ -125,8 +125,8 @@ def test_interrupt_key_is_one_line(run_with, capsys):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    assert run_with('compile', interrupted) == 130
-    assert capsys.readouterr().err == 'compile: interrupted\n'
+    assert run_with('evaluate', interrupted) == 130
+    assert capsys.readouterr().err == 'evaluate: interrupted\n'
     assert run_with('replay', interrupted) == 130
     assert capsys.readouterr().err == 'replay: interrupted, nothing is written\n'
 
@@ -335,7 +335,6 @@ NAMES = [
         ('lift', '{}', '--fov', '60', '--fps', '30', '--size', '64x64'),
         ('track-video', '{}', '--keypoints', '{}'),
         ('install-detector', '{}'),
-        ('compile', '{}'),
         ('train', '-o', '{}', '--mocap', '{}'),
         ('learn', 'prior', '{}', '-o', '{}'),
         ('learn', '{}'),

@@ -10,8 +10,7 @@ import pytest
 from hmt_ros.body import load_body
 from hmt_ros.body.skeleton import other_side
 from hmt_ros.flips.interpretation_tree import enumerate_flips
-from hmt_ros.flips.limb_products import LimbProducts
-from hmt_ros.flips.limb_products_kernel import Configurations, limbs_of
+from hmt_ros.flips.limb_products import Configurations, LimbProducts, limbs_of
 from hmt_ros.flips.torso_flips import flip_torso
 from test.oracles.rehung import rehang_chain
 

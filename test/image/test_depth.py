@@ -11,17 +11,11 @@ from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
 from hmt_ros.body.flesh import signed_power
 from hmt_ros.body.kinematics import forward
+from hmt_ros.core import ASIDE, BEHIND, COVER, DEPTH_JUMP, FEWEST, LEAST_COSINE
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import observe
-from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
-from hmt_ros.image.terms.depth import (
-    ASIDE,
-    DEPTH,
-    JUMP,
-    LEAST_COSINE,
-    usable_depths,
-)
-from hmt_ros.image.terms.residuals import FEWEST
+from hmt_ros.image.surface import flesh_table_of
+from hmt_ros.image.terms.depth import DEPTH, usable_depths
 from test.oracles.single_terms import image_energy
 
 ALONE = LikelihoodSettings.of_terms(depth=DEPTH.settings)
@@ -84,7 +78,7 @@ def is_hidden(body, frames, part, point):
         shape = axes.T / (COVER * np.array(other.radii))[:, None]
         m, k = shape @ point, shape @ centre
         root = (m @ k) ** 2 - m @ m * (k @ k - 1.0)
-        if root > 0 and m @ k - np.sqrt(root) < (1.0 - HIDDEN) * (m @ m):
+        if root > 0 and m @ k - np.sqrt(root) < (1.0 - BEHIND) * (m @ m):
             return True
     return False
 
@@ -96,7 +90,7 @@ def measured_at(depth, u, v):
         return 0.0
     i, j = min(int(v), height - 2), min(int(u), width - 2)
     cell, dv, du = depth[i : i + 2, j : j + 2].astype(float), v - i, u - j
-    if cell.min() <= 0 or np.ptp(cell) > JUMP * cell.min():
+    if cell.min() <= 0 or np.ptp(cell) > DEPTH_JUMP * cell.min():
         return cell[int(dv >= 0.5), int(du >= 0.5)]
     return np.array([1 - dv, dv]) @ cell @ np.array([1 - du, du])
 

@@ -8,10 +8,10 @@ import pytest
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import directed_derivatives, forward
 from hmt_ros.body.pose_prior import AnglePrior
+from hmt_ros.core import BEHIND, COVER
 from hmt_ros.image.likelihood import OFF, ImageLikelihood, ObservedImage
 from hmt_ros.image.observation import observe
 from hmt_ros.image.pose_energy import PoseEnergy
-from hmt_ros.image.surface import COVER, HIDDEN
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
 from hmt_ros.inference.energy import Derivatives
@@ -257,7 +257,7 @@ def test_visibility_agrees_with_marching_along_the_rays(shot):
                 place = frames.origins[part.segment, :, n] + rotations[part.segment] @ part.centre
                 local = (steps[:, None] * ray - place) @ rotations[part.segment]
                 inside |= ((local / (COVER * np.array(part.radii))) ** 2).sum(1) < 1
-            seen = (inside.any(), inside[steps < 1 - HIDDEN].any())
+            seen = (inside.any(), inside[steps < 1 - BEHIND].any())
             agree.append(seen == (covered[p, n], hidden[p, n]))
     # Rays that graze a part by less than a step are missed.
     assert np.mean(agree) > 0.985

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_ros.core import add_band_product
 from hmt_ros.inference.block_tridiagonal import (
     BlockTridiagonal,
     NotPositiveDefiniteError,
-    add_band_product,
 )
 
 CASES = [(3, 5, 'full'), (3, 5, 'diagonal'), (3, 5, 'lower'), (3, 5, 'upper'), (1, 4, 'full'),

@@ -437,25 +437,6 @@ def test_ends_cleanly(number, subject_file, executable):
     node = executable('filter_node', '-p', file, '--params-file', str(CONFIG))
     lines = node.stop_at('images from /image', number)
     assert 'images from /image' in lines[-1]
-    # Before it listened, it has loaded or compiled what it runs.
-    assert 'kernels loaded in' in lines[0] or 'compiling kernels' in lines[0]
-
-
-def test_kernels_are_ready_before_the_node_listens(world, monkeypatch):
-    prepared = []
-
-    def topics():
-        return {publisher.topic_name for publisher in one.node.publishers} & {'/pose_mixture'}
-
-    def prepare(session):
-        prepared.append((one.node.preparing, topics()))
-
-    monkeypatch.setattr('hmt_ros.sessions.tracking_session.TrackingSession.prepare', prepare)
-    one = world()
-    one.node.trigger_configure()
-    assert prepared == [(True, set())]
-    assert not one.node.preparing
-    assert topics() == {'/pose_mixture'}
 
 
 @pytest.mark.parametrize(

@@ -15,15 +15,24 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import Frames, assemble, forward, segment_sums
+from hmt_ros.core import (
+    BEHIND,
+    COVER,
+    FEWEST,
+    FLOW_SCALE,
+    FLOW_SHARE,
+    FLOW_SIGMA,
+    LEAST_FACING,
+    OUTLINE_SPACING,
+    OUTLINE_TURN,
+)
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.optical_flow import SCALE, SHARE, SIGMA
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
-from hmt_ros.image.surface_points import FACING, SurfacePoints, coarse_mesh
+from hmt_ros.image.surface import flesh_table_of
+from hmt_ros.image.surface_points import SurfacePoints, coarse_mesh
 from hmt_ros.image.terms.image_term import TermSettings
-from hmt_ros.image.terms.residuals import FEWEST
-from hmt_ros.image.terms.silhouette import SPACING, TURN, Outline
+from hmt_ros.image.terms.silhouette import Outline
 from test.oracles.numpy_contour import occluding_contour
 
 Array = NDArray[np.float64]
@@ -229,7 +238,7 @@ def visibility(body: Body, frames: Frames, points: Array, parts: Index) -> tuple
     mk = np.einsum('nbip,nbi->nbp', m, k)
     discriminant = mk * mk - mm * ((k * k).sum(2) - 1.0)[:, :, None]
     through = (discriminant > 0) & (np.arange(count)[:, None] != parts)
-    before = through & (mk - np.sqrt(np.maximum(discriminant, 0.0)) < (1.0 - HIDDEN) * mm)
+    before = through & (mk - np.sqrt(np.maximum(discriminant, 0.0)) < (1.0 - BEHIND) * mm)
     return through.any(1).T, before.any(1).T
 
 
@@ -242,7 +251,7 @@ def coverage(surface: Surface, outline: Outline, term: TermSettings, sigma: Arra
     sigma = sigma[match, batch]
     across = (nx * offset[0] + ny * offset[1]) / sigma
     along = nx * offset[1] - ny * offset[0]
-    beyond = np.sign(along) * np.maximum(np.abs(along) - SPACING, 0.0) / sigma
+    beyond = np.sign(along) * np.maximum(np.abs(along) - OUTLINE_SPACING, 0.0) / sigma
     # One kernel on the length of the two residuals together.
     each = term.weight / max(len(match), 1)
     rho, _, curvature = geman_mcclure(np.hypot(across, beyond), term.scale, each)
@@ -275,7 +284,7 @@ def nearest_contour_points(surface: Surface, outline: Outline) -> Index:
         [
             -2.0 * (outline.pixels - centre),
             np.ones((len(outline.pixels), 1)),
-            -2.0 * TURN**2 * outline.normals,
+            -2.0 * OUTLINE_TURN**2 * outline.normals,
         ],
         axis=1,
     )
@@ -322,9 +331,9 @@ def flow_energy(
     start = points.pixels.transpose(2, 0, 1)  # (2, K, Q)
     at = np.broadcast_to(start[:, None], (2, 2, *start.shape[1:]))
     moved, _ = sample(flow, at, np.arange(2)[:, None, None])  # (2, K, Q)
-    inverse = 1.0 / (SIGMA + SHARE * np.hypot(moved[0], moved[1]))[which].T
+    inverse = 1.0 / (FLOW_SIGMA + FLOW_SHARE * np.hypot(moved[0], moved[1]))[which].T
     error = (pixels - (start + moved)[:, which].transpose(0, 2, 1)) * inverse
-    rho, _, curvature = geman_mcclure(np.hypot(error[0], error[1]), SCALE, each)
+    rho, _, curvature = geman_mcclure(np.hypot(error[0], error[1]), FLOW_SCALE, each)
     residuals = _pairs(
         rho, segments, places, projection[0] * inverse, projection[1] * inverse, error[0],
         error[1], curvature,
@@ -359,7 +368,7 @@ def seen_points(body: Body, camera: Camera, frames: Frames, points: int = 120) -
     places = frames.points(mesh.segments, mesh.vertices)
     normals = frames.directions(mesh.segments, mesh.normals)
     distance = np.sqrt((places * places).sum(1))
-    facing = -(places * normals).sum(1) > FACING * distance
+    facing = -(places * normals).sum(1) > LEAST_FACING * distance
     _, hidden = visibility(body, frames, places, mesh.parts)
     pixels = camera.project(places.transpose(0, 2, 1)).transpose(2, 0, 1)  # (2, V, K)
     inside = (pixels[0] >= 0) & (pixels[0] < camera.width)

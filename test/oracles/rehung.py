@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body.kinematics import forward
-from hmt_ros.flips.tree_growth import chain_links, grow_leaves
+from hmt_ros.core import grow_leaves
+from hmt_ros.flips.chain_links import chain_links
 
 
 def rehang_chain(body, poses, new_poses, chain, *, image_of=None, slack=0.1):

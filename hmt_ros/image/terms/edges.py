@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hmt_ros.image.sampling import ImageMap, sample_distance
+from hmt_ros import core
+from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.image_term import (
     NO_MAP,
     ImageTerm,
@@ -23,15 +23,8 @@ from hmt_ros.image.terms.image_term import (
     TermSettings,
     Weighting,
 )
-from hmt_ros.image.terms.residuals import (
-    add_contour_residual,
-    contour_sigma,
-    geman_mcclure,
-    weight_of_each,
-)
 
-ORIENTATIONS = 4
-HALF_BIN = np.tan(np.pi / 8.0)
+ORIENTATIONS: int = core.ORIENTATIONS
 # Canny's thresholds.
 EDGE_LOW, EDGE_HIGH = 40.0, 100.0
 # Edges further outside the silhouette than this belong to the background, px.
@@ -48,7 +41,7 @@ HIDDEN = 2.0
 
 
 class EdgeInputs(NamedTuple):
-    """Weighting, and the distance to the nearest edge of each orientation, px."""
+    """Inputs of `core/terms/edges.h`: distances to the nearest edge of each orientation, px."""
 
     term: Weighting
     distances: ImageMap
@@ -93,60 +86,11 @@ def _inputs(term: Weighting, evidence: Any, _request: Request) -> EdgeInputs:
     return EdgeInputs(term, evidence or NO_MAP)
 
 
-@njit(cache=True, nogil=True, inline='always')
-def _orientation(x, y):  # type: ignore[no-untyped-def]
-    """The orientation, of `ORIENTATIONS`, that a normal is nearest to: of angle k pi / 4."""
-    if abs(y) <= HALF_BIN * abs(x):
-        return 0
-    if abs(x) <= HALF_BIN * abs(y):
-        return 2
-    return 1 if x * y > 0.0 else 3
-
-
-@njit(cache=True, nogil=True)
-def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
-    """Distances from visible contour points to the nearest edge; see `ImageTerm.kernel`."""
-    edges, term, contour = inputs.distances, inputs.term, view.contour
-    values, left, top = edges.values, edges.left, edges.top
-    parts, points, pixels, projections = (
-        contour.parts,
-        contour.points,
-        contour.pixels,
-        contour.projections,
-    )
-    normals, valid, hidden, noise = contour.normals, contour.valid, contour.hidden, contour.noise
-    owners = view.owners
-    each = weight_of_each(term.weight, view.contour_points * 6 // 10, valid, hidden)
-    energy = 0.0
-    for i in range(len(parts)):
-        if not valid[i] or hidden[i]:
-            continue
-        channel = _orientation(normals[i, 0], normals[i, 1])
-        value, gu, gv = sample_distance(values, left, top, channel, pixels[i, 0], pixels[i, 1])
-        sigma = contour_sigma(term, noise[i])
-        rho, pull, curvature = geman_mcclure(value / sigma, term.scale, each)
-        energy += rho
-        add_contour_residual(
-            wrenches,
-            stiffnesses,
-            owners[parts[i]],
-            points,
-            projections,
-            i,
-            gu / sigma,
-            gv / sigma,
-            pull,
-            curvature,
-        )
-    return energy
-
-
 EDGES = ImageTerm(
     'edges',
     'Distance of the visible contours from image edges.',
     TermSettings(20.0, 1.5, 3.0),
     edge_distances,
     _inputs,
-    add_edges,
     needs_contour=True,
 )

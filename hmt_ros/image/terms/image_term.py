@@ -1,7 +1,8 @@
 """The parts of a term of the image likelihood.
 
-A term is one file: its default settings, its evidence from an image, its compiled kernel, and one
-`ImageTerm` that names them. `registry` lists the terms; nothing else knows them.
+A term is one file here: its default settings, its evidence from an image, and one `ImageTerm` that
+names them; `registry` lists the terms. Its energy is one header in `core/terms`, and `core/terms.h`
+lists those. Nothing else knows the terms.
 """
 
 from __future__ import annotations
@@ -14,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import Contour, FleshTable, Lens
-from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.arrays import Array, Image
 
 NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
 
@@ -97,32 +97,6 @@ class Weighting(NamedTuple):
     growth: float = 0.0
 
 
-class PoseView(NamedTuple):
-    """One pose as the kernels of the terms see it.
-
-    Attributes:
-        number: (1,) n, of the poses of this call.
-        contour: occluding contour, traced if some term asks for it.
-        contour_points: number of contour points that a weight is shared among; 0: those there are.
-        owners: (B,) segment of each part of the flesh.
-        lens: the camera.
-        columns, origins: (S, 3, 3), (S, 3) frames of the segments.
-        flesh: parts and rings, for terms that trace more than the contour.
-        traced, occluders: (B,) parts that are compared with the image, and that can hide others.
-    """
-
-    number: NDArray[np.int64]
-    contour: Contour
-    contour_points: int
-    owners: NDArray[np.int64]
-    lens: Lens
-    columns: Array
-    origins: Array
-    flesh: FleshTable
-    traced: Mask
-    occluders: Mask
-
-
 @dataclass(frozen=True, eq=False)
 class Request:
     """Arguments of a call, the same for all terms.
@@ -146,10 +120,9 @@ class ImageTerm:
         meaning: quantities that it compares, which opens the descriptions of its parameters.
         settings: defaults.
         evidence: takes the evidence of the term from an image; None: the image lacks it.
-        inputs: makes the kernel's inputs: a NamedTuple that starts with the `Weighting`. Without
-            evidence (None) it has weight 0 and empty arrays of the same types.
-        kernel: compiled `kernel(view, inputs, wrenches, stiffnesses)`: adds the residuals of one
-            pose to the sums of the segments, returns the energy.
+        inputs: makes the inputs of the core: a NamedTuple that starts with the `Weighting`, read
+            member by member into the struct of its header. Without evidence (None) it has weight 0
+            and empty arrays of the same types.
         needs_contour: whether the contour has to be traced.
     """
 
@@ -158,5 +131,4 @@ class ImageTerm:
     settings: TermSettings
     evidence: Callable[[ImageWindow], Any]
     inputs: Callable[[Weighting, Any, Request], Any]
-    kernel: Any
     needs_contour: bool = False

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.skeleton import Skeleton, other_side
+from hmt_ros.core import exchange_posteriors, keypoint_errors, record_keypoints
 from hmt_ros.image.keypoint_schemes import (
     MIRROR,
     landmarks_of,
@@ -28,17 +30,9 @@ from hmt_ros.image.keypoint_schemes import (
     scheme_of,
 )
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, middle_of_hips
-from hmt_ros.image.surface import lens_of
+from hmt_ros.image.surface import Lens, lens_of
 from hmt_ros.image.terms.image_term import TermSettings
-from hmt_ros.image.terms.keypoint_kernel import (
-    KeypointInputs,
-    Lifted,
-    Points,
-    exchange_posteriors,
-    keypoint_errors,
-    record_keypoints,
-)
-from hmt_ros.image.terms.residuals import RECORDED, tree_of
+from hmt_ros.image.terms.residuals import RECORDED, Tree, tree_of
 from hmt_ros.inference.arrays import Array, Index
 
 KEYPOINTS = TermSettings(0.5, 1.0, 3.0)
@@ -194,6 +188,76 @@ class Keypoints:
         if len(seen) < 2:
             return 1.0
         return max(float((seen.max(0) - seen.min(0)).max()) / USUAL_EXTENT, 1e-3)
+
+
+class Points(NamedTuple):
+    """Keypoints (P,), each with its landmark, and its landmark if sides are exchanged.
+
+    Attributes:
+        segments: (P, 2) that carry the landmarks.
+        offsets: (P, 2, 3) of the landmarks in the frames of the segments, m.
+        pixels: (P, 2).
+        whiteners: (P, 2, 2) W, W' W is the precision.
+        groups: (P,) that are exchanged together.
+    """
+
+    segments: Index
+    offsets: Array
+    pixels: Array
+    whiteners: Array
+    groups: Index
+
+
+class Lifted(NamedTuple):
+    """Depths of joints (J,) behind the middle of the hips, a mixture of C components.
+
+    Attributes:
+        segments: (J,) that carry the joints.
+        offsets: (J, 3) of the joints in the frames of the segments, m.
+        middle: (3,) middle of the hips in the frame of the root, m.
+        ray: (3,) line of sight, unit vector.
+        log_weights: (C,) with the normalisers of the components.
+        depths: (2, C, J) along the ray from the middle of the hips, m, as the sides are called and
+            exchanged.
+        precisions: (2, C, J) square roots, 1/m.
+        readings: (E,) 0 or 1: how an exchange of sides reads the mixture.
+        weight: factor on the energy; 0: there is no mixture.
+        scale: of the kernel, in standard deviations; it bounds the energy of a joint.
+    """
+
+    segments: Index
+    offsets: Array
+    middle: Array
+    ray: Array
+    log_weights: Array
+    depths: Array
+    precisions: Array
+    readings: Index
+    weight: float
+    scale: float
+
+
+class KeypointInputs(NamedTuple):
+    """Inputs of the energy of keypoints.
+
+    Attributes:
+        points: that were measured.
+        lifted: the mixture over whole poses.
+        tree, lens: skeleton and camera.
+        scale: of the kernel, in standard deviations.
+        weights: (G,) factors on the energies of the groups.
+        exchanged: (E, G) 1 where an exchange exchanges a group.
+        log_priors: (R, E) of the exchanges, a row a problem or one for all.
+    """
+
+    points: Points
+    lifted: Lifted
+    tree: Tree
+    lens: Lens
+    scale: float
+    weights: Array
+    exchanged: Index
+    log_priors: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,10 +423,7 @@ NOT_LIFTED = Lifted(
 
 @lru_cache(maxsize=16)
 def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lifted:
-    """A mixture over whole poses as compiled code reads it, in arrays of one layout.
-
-    Each layout of an array, and each array that can not be written, is a kernel to compile.
-    """
+    """A mixture over whole poses as compiled code reads it."""
     known = set(skeleton.joint_names)
     if poses is None or not known.issuperset(HIPS):
         return NOT_LIFTED

@@ -1,0 +1,84 @@
+// Energy of poses against the optical flow from one image to the next (KJS 2); see
+// hmt_ros/image/optical_flow.py.
+//
+//     E(x) = w / Q sum_q rho(|u_q(x) - p_q - f(p_q)| / (sigma + 0.15 |f(p_q)|))
+//
+// Q points of the surface were seen at pixels p_q of the image before; the pose x moves them to
+// u_q(x), and f is the flow.
+#pragma once
+
+#include "pose_view.h"
+#include "sampling.h"
+#include "surface_points.h"
+
+namespace hmt {
+
+// Standard deviation of the flow, px, and its further error, as a share of the displacement.
+inline constexpr double flow_sigma = 1.5, flow_share = 0.15;
+// Width of the Geman-McClure kernel, in standard deviations.
+inline constexpr double flow_scale = 2.0;
+
+struct FlowTerm {
+  SurfacePoints points;  // of K poses in the image before, one for each problem
+  ImageMap flow;         // from that image to this one
+  double weight;         // w, number of independent measurements; 0: off
+
+  void check() const {
+    if (weight > 0.0) expect_shape("flow.values", flow.values, {2, -1, -1});
+  }
+  // Points must be of segments that a body of so many has.
+  void check_segments(Index count) const {
+    expect_range("points.segments", points.segments, 0, count);
+  }
+};
+
+// Adds energy, and gradient (d,) and Hessian (d, d) where sums are wanted, of a pose of one
+// problem, a row of the points. Axes and origins (d, 3) are of the degrees of freedom; the sums are
+// room.
+inline void add_flow(const FlowTerm& term, const Tree& tree, const Lens& lens, Index row,
+                     const Frames& frames, const Table& axes, const Table& dof_origins,
+                     const Sums& sums, double& value, const Vector& gradient,
+                     const Matrix& hessian) {
+  const bool wanted = sums.wanted();
+  expect(0 <= row && row < term.points.counts.size(), "rows", "a row of the points");
+  if (wanted) {
+    sums.wrenches.fill(0.0);
+    sums.stiffnesses.fill(0.0);
+  }
+  const Index count = term.points.counts[row];
+  const double each = term.weight / double(std::max(count, fewest));
+  const auto segments = term.points.segments[row];
+  const Table local = term.points.local[row], pixels = term.points.pixels[row];
+  for (Index q = 0; q < count; ++q) {
+    const Index s = segments[q];
+    const double *x = local[q].data, *axis = frames.columns[s].data,
+                 *origin = frames.origins[s].data;
+    double p[3], pixel[2], projection[6];
+    for (int k = 0; k < 3; ++k) {
+      p[k] = origin[k] + axis[k] * x[0] + axis[3 + k] * x[1] + axis[6 + k] * x[2];
+    }
+    if (!project(lens, p[0], p[1], p[2], pixel, projection)) continue;
+    const double u = pixels(q, 0), v = pixels(q, 1);
+    const double fu = sample(term.flow, 0, u, v).value, fv = sample(term.flow, 1, u, v).value;
+    if (std::isnan(fu)) {
+      // Somebody else hides it: it has the usual cost, wherever it is.
+      value += geman_mcclure(1.0, flow_scale, each).value;
+      continue;
+    }
+    const double inverse = 1.0 / (flow_sigma + flow_share * std::sqrt(fu * fu + fv * fv));
+    const double errors[2] = {(pixel[0] - u - fu) * inverse, (pixel[1] - v - fv) * inverse};
+    const Robust robust =
+        geman_mcclure(std::sqrt(errors[0] * errors[0] + errors[1] * errors[1]), flow_scale, each);
+    value += robust.value;
+    for (int a = 0; a < 2; ++a) {
+      const double* j = projection + 3 * a;
+      sums.add(s, p, j[0] * inverse, j[1] * inverse, j[2] * inverse, robust.curvature * errors[a],
+               robust.curvature);
+    }
+  }
+  if (wanted) {
+    assemble_pose(tree, axes, dof_origins, sums.wrenches, sums.stiffnesses, gradient, hessian);
+  }
+}
+
+}  // namespace hmt

@@ -1,0 +1,275 @@
+// The linear algebra as generalised ufuncs; hmt_ros/inference/linear_algebra.py calls them.
+//
+// Where a matrix has no result, they fill it with no numbers and report what numpy calls invalid.
+#include "array_functions.h"
+#include "small_matrix.h"
+#include "ufunc.h"
+
+namespace hmt {
+
+using namespace matrices;
+
+namespace {
+
+// One call of a loop: the matrices of each item in turn.
+class Items {
+ public:
+  Items(char** pointers, const Index* counts, const Index* strides, int arrays)
+      : pointers_(pointers), count_(counts[0]), outer_(strides), inner_(strides + arrays) {}
+  Index size() const { return count_; }
+  // An array's part of item i, whose own strides begin at place `at`.
+  Strided<double> matrix(int array, Index i, int at) const {
+    return {pointers_[array] + i * outer_[array], inner_[at], inner_[at + 1]};
+  }
+  Strided<double> vector(int array, Index i, int at) const {
+    return {pointers_[array] + i * outer_[array], inner_[at], 0};
+  }
+  Strided<double> number(int array, Index i) const {
+    return {pointers_[array] + i * outer_[array], 0, 0};
+  }
+
+ private:
+  char** pointers_;
+  Index count_;
+  const Index *outer_, *inner_;
+};
+
+void read(Strided<double> from, Index m, Index n, Rows to, Index column = 0) {
+  for (Index i = 0; i < m; ++i) {
+    double* row = to[i] + column;
+    if (from.column == sizeof(double)) {
+      std::copy_n(&from(i, 0), n, row);
+    } else {
+      for (Index j = 0; j < n; ++j) row[j] = from(i, j);
+    }
+    std::fill(row + n, row + padded(n), 0.0);
+  }
+}
+void write(Rows from, Index column, bool good, Index m, Index n, Strided<double> to) {
+  for (Index i = 0; i < m; ++i) {
+    for (Index j = 0; j < n; ++j) to(i, j) = good ? from[i][column + j] : nan;
+  }
+}
+void set_identity(Rows rows, Index n, Index column = 0) {
+  for (Index i = 0; i < n; ++i) {
+    std::fill_n(rows[i] + column, padded(n), 0.0);
+    rows[i][column + i] = 1.0;
+  }
+}
+
+// (n,n)->(n,n)
+void cholesky_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Items items(pointers, counts, strides, 2);
+  const Index n = counts[1];
+  Scratch<double, 2> room(n, padded(n));
+  const Rows rows{room[0].data, padded(n)};
+  bool all = true;
+  for (Index i = 0; i < items.size(); ++i) {
+    const Strided<double> given = items.matrix(0, i, 0), result = items.matrix(1, i, 2);
+    read({given.data, given.column, given.row}, n, n, rows);  // its lower triangle, as numpy does
+    const bool good = factorise(rows, n);
+    all = all && good;
+    for (Index j = 0; j < n; ++j) {
+      for (Index k = 0; k < n; ++k) result(j, k) = !good ? nan : k > j ? 0.0 : rows[k][j];
+    }
+  }
+  report_only(all ? 0 : FE_INVALID);
+}
+
+// (n,n),(n,m)->(n,m)
+template <int triangle>  // -1 lower, 1 upper, 0 a full matrix
+void solve_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Items items(pointers, counts, strides, 3);
+  const Index n = counts[1], m = counts[2], width = padded(n) + padded(m);
+  Scratch<double, 2> room(n, width);
+  const Rows rows{room[0].data, width};
+  bool all = true;
+  for (Index i = 0; i < items.size(); ++i) {
+    read(items.matrix(0, i, 0), n, n, rows);
+    read(items.matrix(1, i, 2), n, m, rows, padded(n));
+    bool good = true;
+    for (Index k = 0; k < n; ++k) good = good && rows[k][k] != 0.0;
+    if (triangle == 0) good = eliminate(rows, n) != 0.0;
+    if (good) (triangle < 0 ? solve_lower : solve_upper)(rows, n, padded(n));
+    all = all && good;
+    write(rows, padded(n), good, n, m, items.matrix(2, i, 4));
+  }
+  report_only(all ? 0 : FE_INVALID);
+}
+
+// (n,n)->(n,n)
+void inverse_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Items items(pointers, counts, strides, 2);
+  const Index n = counts[1], width = 2 * padded(n);
+  Scratch<double, 2> room(n, width);
+  const Rows rows{room[0].data, width};
+  bool all = true;
+  for (Index i = 0; i < items.size(); ++i) {
+    read(items.matrix(0, i, 0), n, n, rows);
+    set_identity(rows, n, padded(n));
+    const bool good = eliminate(rows, n) != 0.0;
+    if (good) solve_upper(rows, n, padded(n));
+    all = all && good;
+    write(rows, padded(n), good, n, n, items.matrix(1, i, 2));
+  }
+  report_only(all ? 0 : FE_INVALID);
+}
+
+// (n,n)->(),(): the determinant, and the logarithm of its size.
+void determinant_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Items items(pointers, counts, strides, 3);
+  const Index n = counts[1];
+  Scratch<double, 2> room(n, padded(n));
+  const Rows rows{room[0].data, padded(n)};
+  for (Index i = 0; i < items.size(); ++i) {
+    read(items.matrix(0, i, 0), n, n, rows);
+    double product = eliminate(rows, n), sum = product == 0.0 ? -infinity : 0.0;
+    for (Index k = 0; k < n && product != 0.0; ++k) sum += elementary::log(std::abs(rows[k][k]));
+    for (Index k = 0; k < n && product != 0.0; ++k) product *= rows[k][k];
+    items.number(1, i)(0, 0) = product;
+    items.number(2, i)(0, 0) = sum;
+  }
+  report_only(0);
+}
+
+// Scales rows by a power of two, so that their largest number is near to 1; returns its inverse, or
+// no number if one is not finite.
+double scale(Rows rows, Index m, Index n) {
+  double largest = 0.0;
+  for (Index i = 0; i < m; ++i) {
+    for (Index j = 0; j < n; ++j) {
+      const double size = std::abs(rows[i][j]);
+      if (!(size <= largest)) largest = size;
+    }
+  }
+  if (!(largest < infinity)) return nan;
+  const double factor = scale_of(largest);
+  for (Index i = 0; i < m; ++i) {
+    for (Index j = 0; j < n; ++j) rows[i][j] *= factor;
+  }
+  return 1.0 / factor;
+}
+
+// The places of values in the order of their size.
+void sort_places(const double* values, Index n, Index* places, bool falling) {
+  for (Index i = 0; i < n; ++i) places[i] = i;
+  std::stable_sort(places, places + n, [&](Index a, Index b) {
+    return falling ? values[a] > values[b] : values[a] < values[b];
+  });
+}
+
+// (n,n)->(n),(n,n), or (n,n)->(n)
+template <bool with_vectors>
+void eigen_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Items items(pointers, counts, strides, with_vectors ? 3 : 2);
+  const Index n = counts[1];
+  Scratch<double, 2> room(n, padded(n)), vector_room(n, padded(n)), part(4, padded(n));
+  Scratch<Index, 1> places(n);
+  const Rows rows{room[0].data, padded(n)};
+  const Rows vectors{with_vectors ? vector_room[0].data : nullptr, padded(n)};
+  double* values = part[0].data;
+  double *beside = part[1].data, *scales = part[2].data, *work = part[3].data;
+  bool all = true;
+  for (Index i = 0; n > 0 && i < items.size(); ++i) {
+    read(items.matrix(0, i, 0), n, n, rows);
+    for (Index j = 0; j < n; ++j) {  // its lower triangle, as numpy does
+      for (Index k = 0; k < j; ++k) rows[k][j] = rows[j][k];
+    }
+    const double unit = scale(rows, n, n);
+    bool good = unit > 0.0;
+    if (good) make_tridiagonal(rows, n, values, beside, scales, work);
+    if (good && with_vectors) {
+      set_identity(vectors, n);
+      multiply_reflections(rows, n, scales, vectors, work);
+      for (Index j = 0; j < n; ++j) {
+        for (Index k = 0; k < j; ++k) std::swap(vectors[j][k], vectors[k][j]);
+      }
+    }
+    good = good && diagonalise(values, beside, n, vectors);
+    all = all && good;
+    sort_places(values, n, places.view().data, false);
+    for (Index j = 0; j < n; ++j) {
+      items.vector(1, i, 2)(j, 0) = good ? unit * values[places[j]] : nan;
+      for (Index k = 0; with_vectors && k < n; ++k) {
+        items.matrix(2, i, 3)(k, j) = good ? vectors[places[j]][k] : nan;
+      }
+    }
+  }
+  report_only(all ? 0 : FE_INVALID);
+}
+
+// (m,n)->(m,n),(n),(n,n): U, the singular values and V, for m >= n. A column of U of a singular
+// value 0 is 0.
+void svd_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Items items(pointers, counts, strides, 4);
+  const Index m = counts[1], n = counts[2];
+  Scratch<double, 2> room(n, padded(m)), turn_room(n, padded(n));
+  Scratch<double, 1> values(n);
+  Scratch<Index, 1> places(n);
+  const Rows columns{room[0].data, padded(m)}, turns{turn_room[0].data, padded(n)};
+  bool all = true;
+  for (Index i = 0; i < items.size(); ++i) {
+    const Strided<double> given = items.matrix(0, i, 0);
+    read({given.data, given.column, given.row}, n, m, columns);
+    set_identity(turns, n);
+    const double unit = scale(columns, n, m);
+    const bool good = unit > 0.0 && orthogonalise(columns, turns, n);
+    all = all && good;
+    for (Index j = 0; j < n; ++j) {
+      values[j] = std::sqrt(inner_product(columns[j], columns[j], columns.stride));
+    }
+    sort_places(values.view().data, n, places.view().data, true);
+    const Strided<double> u = items.matrix(1, i, 2), v = items.matrix(3, i, 5);
+    for (Index j = 0; j < n; ++j) {
+      const Index from = places[j];
+      const double value = values[from];
+      items.vector(2, i, 4)(j, 0) = good ? unit * value : nan;
+      for (Index k = 0; k < m; ++k) {
+        u(k, j) = !good ? nan : value > 0.0 ? columns[from][k] / value : 0.0;
+      }
+      for (Index k = 0; k < n; ++k) v(k, j) = good ? turns[from][k] : nan;
+    }
+  }
+  report_only(all ? 0 : FE_INVALID);
+}
+
+// (m?,k),(k,n?)->(m?,n?)
+template <class T>
+void product_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Index m = counts[1], inner = counts[2], n = counts[3];
+  Scratch<T, 1> room((inner + 1) * MatrixLanes<T>::count);
+  const Index* own = strides + 3;
+  for (Index i = 0; i < counts[0]; ++i) {
+    const Strided<T> a{pointers[0] + i * strides[0], own[0], own[1]};
+    const Strided<T> b{pointers[1] + i * strides[1], own[2], own[3]};
+    const Strided<T> result{pointers[2] + i * strides[2], own[4], own[5]};
+    multiply<T>(a, b, result, m, inner, n, room.view().data);
+  }
+  report_only(0);
+}
+
+}  // namespace
+
+void bind_matrix_functions(py::module_& m) {
+  bind_matrix_function(m, "cholesky", {cholesky_loop}, "(n,n)->(n,n)", 1, 1,
+                       "Lower Cholesky factor.");
+  bind_matrix_function(m, "solve", {solve_loop<0>}, "(n,n),(n,m)->(n,m)", 2, 1,
+                       "Solution X of A X = B.");
+  bind_matrix_function(m, "solve_lower", {solve_loop<-1>}, "(n,n),(n,m)->(n,m)", 2, 1,
+                       "Solution X of L X = B with the lower triangle of L.");
+  bind_matrix_function(m, "solve_upper", {solve_loop<1>}, "(n,n),(n,m)->(n,m)", 2, 1,
+                       "Solution X of U X = B with the upper triangle of U.");
+  bind_matrix_function(m, "inverse", {inverse_loop}, "(n,n)->(n,n)", 1, 1, "Inverse.");
+  bind_matrix_function(m, "determinant", {determinant_loop}, "(n,n)->(),()", 1, 2,
+                       "Determinant, and the logarithm of its size.");
+  bind_matrix_function(m, "symmetric_eigen", {eigen_loop<true>}, "(n,n)->(n),(n,n)", 1, 2,
+                       "Eigenvalues, rising, and eigenvectors by columns of a symmetric matrix.");
+  bind_matrix_function(m, "symmetric_eigenvalues", {eigen_loop<false>}, "(n,n)->(n)", 1, 1,
+                       "Eigenvalues, rising, of a symmetric matrix.");
+  bind_matrix_function(m, "singular_values", {svd_loop}, "(m,n)->(m,n),(n),(n,n)", 1, 3,
+                       "U, the singular values, falling, and V of a matrix with m >= n.");
+  bind_matrix_function(m, "product", {product_loop<float>, product_loop<double>},
+                       "(m?,k),(k,n?)->(m?,n?)", 2, 1, "Matrix product, as numpy.matmul.");
+}
+
+}  // namespace hmt

@@ -1,0 +1,205 @@
+// Steps of the bounded damped Newton method; see hmt_ros/inference/bounded_newton.py.
+#pragma once
+
+#include "arrays.h"
+
+namespace hmt {
+
+inline constexpr double damping_limit = 1e12;
+inline constexpr double least_factor = 1.0 / 3.0;  // a damping shrinks by at most this factor
+inline constexpr double least_ratio = 1e-3;  // of the predicted decrease, for a step that is taken
+
+// Decrease that the quadratic model predicts for a step (d,); `curve` (d,) becomes H step.
+inline double predicted_decrease(const Numbers& gradient, const Table& hessian, const Numbers& step,
+                                 const Vector& curve) {
+  const Index d = step.size();
+  curve.fill(0.0);
+  for (Index j = 0; j < d; ++j) {  // along rows of a symmetric matrix, many entries at once
+    const double moved = step[j];
+    const double* row = hessian[j].data;
+    for (Index i = 0; i < d; ++i) curve[i] += row[i] * moved;
+  }
+  double total = 0.0;
+  for (Index i = 0; i < d; ++i) total -= step[i] * (gradient[i] + 0.5 * curve[i]);
+  return total;
+}
+
+// Whether a variable at a limit is pushed outwards.
+inline bool rests(double low, double high, double slope) {
+  return (low >= 0.0 && slope > 0.0) || (high <= 0.0 && slope < 0.0);
+}
+
+// The minimiser of the damped model in a box around 0, by an active set.
+class BoxStep {
+ public:
+  explicit BoxStep(Index d)
+      : bound_(d), solution_(d), curve_(d), best_(d), factor_(d, d), free_(d) {}
+
+  // Sets the step (d,) and returns the decrease that the undamped model predicts. Where the limits
+  // have spoilt a step so that it gains nothing, steepest descent stands in.
+  double take(const Numbers& gradient, const Table& hessian, const Numbers& low,
+              const Numbers& high, double damping, const Numbers& metric, const Vector& step) {
+    minimise(gradient, hessian, low, high, damping, metric, step);
+    const double predicted = predicted_decrease(gradient, hessian, step, curve_);
+    return predicted <= 0.0 ? descend(gradient, hessian, low, high, metric, step) : predicted;
+  }
+
+ private:
+  void minimise(const Numbers& gradient, const Table& hessian, const Numbers& low,
+                const Numbers& high, double shift, const Numbers& metric, const Vector& step) {
+    const Index d = gradient.size();
+    best_.fill(0.0);
+    double largest = 0.0, smallest = infinity;
+    for (Index i = 0; i < d; ++i) {
+      bound_[i] = rests(low[i], high[i], gradient[i]);
+      step[i] = bound_[i] ? between(0.0, low[i], high[i]) : 0.0;
+      smallest = least(smallest, metric[i]);
+      for (Index j = 0; j < d; ++j) largest = most(largest, std::abs(hessian(i, j)));
+    }
+    double best_gain = -infinity;
+    for (Index turn = 0; turn < 3 * d + 3; ++turn) {
+      Index count = 0;
+      for (Index i = 0; i < d; ++i) {
+        if (!bound_[i]) free_[count++] = i;
+      }
+      while (!solve(gradient, hessian, shift, metric, count, step)) {
+        // Not positive definite: the least shift that Gershgorin asks for is far too careful.
+        const double more = most(4.0 * shift, 1e-3 * largest / smallest);
+        if (shift > damping_limit || !(more > shift)) break;
+        shift = more;
+      }
+      bool across = false;
+      for (Index c = 0; c < count; ++c) {
+        const Index i = free_[c];
+        step[i] = solution_[c];
+        if (step[i] < low[i] || step[i] > high[i]) {
+          across = bound_[i] = true;
+          step[i] = between(step[i], low[i], high[i]);
+        }
+      }
+      if (count == d && !across) return;
+      const double gain = predicted_decrease(gradient, hessian, step, curve_);
+      if (gain > best_gain) {
+        best_gain = gain;
+        best_.view().copy_from(step);
+      }
+      if (across) continue;
+      double worst = 0.0;
+      Index released = -1;
+      for (Index i = 0; i < d; ++i) {
+        if (!bound_[i] || !(low[i] < high[i])) continue;
+        const double slope = gradient[i] + curve_[i] + shift * metric[i] * step[i];
+        const bool away = (step[i] <= low[i] && slope < 0.0) || (step[i] >= high[i] && slope > 0.0);
+        if (away && std::abs(slope) > worst) {
+          worst = std::abs(slope);
+          released = i;
+        }
+      }
+      if (released < 0) return;
+      bound_[released] = false;
+    }
+    step.copy_from(best_);
+  }
+
+  // Solves the damped model for the free variables, the bound ones at their steps, by a Cholesky
+  // factorisation that runs along rows; false where the matrix is not positive definite.
+  bool solve(const Numbers& gradient, const Table& hessian, double shift, const Numbers& metric,
+             Index count, const Vector& step) {
+    for (Index a = 0; a < count; ++a) {
+      const Index i = free_[a];
+      for (Index b = a; b < count; ++b) factor_(a, b) = hessian(i, free_[b]);
+      factor_(a, a) += shift * metric[i];
+      double right = -gradient[i];
+      for (Index j = 0; j < step.size(); ++j) {
+        if (bound_[j]) right -= hessian(i, j) * step[j];
+      }
+      solution_[a] = right;
+    }
+    bool positive = true;
+    for (Index a = 0; a < count; ++a) {
+      double* row = factor_[a].data;
+      double pivot = row[a];
+      if (!(pivot > 0.0)) {
+        positive = false;
+        pivot = 1.0;
+      }
+      const double root = 1.0 / std::sqrt(pivot);
+      for (Index b = a; b < count; ++b) row[b] *= root;
+      solution_[a] *= root;
+      for (Index c = a + 1; c < count; ++c) {
+        const double scale = row[c];
+        solution_[c] -= scale * solution_[a];
+        if (scale == 0.0) continue;
+        double* other = factor_[c].data;
+        for (Index b = c; b < count; ++b) other[b] -= scale * row[b];
+      }
+      if (!positive) return false;
+    }
+    for (Index a = count - 1; a >= 0; --a) {
+      double total = solution_[a];
+      for (Index b = a + 1; b < count; ++b) total -= factor_(a, b) * solution_[b];
+      solution_[a] = total / factor_(a, a);
+    }
+    return true;
+  }
+
+  // Steepest descent in the metric, projected onto the box; returns its gain.
+  double descend(const Numbers& gradient, const Table& hessian, const Numbers& low,
+                 const Numbers& high, const Numbers& metric, const Vector& step) {
+    const Index d = gradient.size();
+    const Vector& direction = solution_;
+    double slope = 0.0;
+    for (Index i = 0; i < d; ++i) {
+      direction[i] = rests(low[i], high[i], gradient[i]) ? 0.0 : -gradient[i] / metric[i];
+      slope -= direction[i] * gradient[i];
+    }
+    double curvature = slope - predicted_decrease(gradient, hessian, direction, curve_);
+    curvature *= 2.0;
+    double length = curvature > 0.0 ? slope / curvature : 1.0, gain = 0.0;
+    for (int turn = 0; turn < 60; ++turn) {
+      for (Index i = 0; i < d; ++i) step[i] = between(length * direction[i], low[i], high[i]);
+      gain = predicted_decrease(gradient, hessian, step, curve_);
+      if (gain > 0.0 || slope <= 0.0) break;
+      length *= 0.5;
+    }
+    return gain;
+  }
+
+  Scratch<bool, 1> bound_;
+  Scratch<double, 1> solution_, curve_, best_;
+  Scratch<double, 2> factor_;
+  Scratch<Index, 1> free_;
+};
+
+// Steps from the points of some problems, and the decrease that the undamped model predicts.
+//
+// x, gradient, lower, upper: (N, d). hessian: (N, d, d). lam: (N,) damping; more where the Hessian
+// is not positive definite. metric: (d,) diagonal of W. rows: (n,) the problems.
+// step, predicted: (n, d), (n,) become the steps and the decreases.
+inline void box_steps(const Table& x, const Table& gradient, const Tables& hessian,
+                      const Table& lower, const Table& upper, const Numbers& lam,
+                      const Numbers& metric, const Places& rows, const Matrix& step,
+                      const Vector& predicted) {
+  const Index problems = x.size(), d = x.size(1), count = rows.size();
+  expect_shape("gradient", gradient, {problems, d});
+  expect_shape("hessian", hessian, {problems, d, d});
+  expect_shape("lower", lower, {problems, d});
+  expect_shape("upper", upper, {problems, d});
+  expect_shape("lam", lam, {problems});
+  expect_shape("metric", metric, {d});
+  expect_range("rows", rows, 0, problems);
+  expect_shape("step", step, {count, d});
+  expect_shape("predicted", predicted, {count});
+  const Scratch<double, 1> low(d), high(d);
+  BoxStep box(d);
+  for (Index k = 0; k < count; ++k) {
+    const Index n = rows[k];
+    for (Index i = 0; i < d; ++i) {
+      low[i] = lower(n, i) - x(n, i);
+      high[i] = upper(n, i) - x(n, i);
+    }
+    predicted[k] = box.take(gradient[n], hessian[n], low, high, lam[n], metric, step[k]);
+  }
+}
+
+}  // namespace hmt

@@ -1,0 +1,171 @@
+// Choice of few hypotheses that stand for all; see hmt_ros/tracking/selection.py.
+//
+//     min over S, |S| = K:   sum_i w_i min_{s in S} d(i, s)
+//
+// The K are chosen greedily, the heaviest first; d is the mean distance of the joints, each capped,
+// less what counts as none.
+#pragma once
+
+#include "arrays.h"
+#include "wide.h"
+
+namespace hmt {
+
+// Adds to `totals` how far the J joints of N hypotheses (J, 3, N) are from those of hypothesis a,
+// each capped, for this one and those after it.
+HMT_WIDE inline void add_distances(const float* rows, Index joints, Index n, Index a, float cap,
+                                   float* totals) {
+  for (Index k = 0; k < joints; ++k, rows += 3 * n) {
+    const float *xs = rows, *ys = rows + n, *zs = rows + 2 * n;
+    const float xa = xs[a], ya = ys[a], za = zs[a];
+    for (Index b = a; b < n; ++b) {
+      const float x = xa - xs[b], y = ya - ys[b], z = za - zs[b];
+      const float gap = std::sqrt(x * x + y * y + z * z);
+      totals[b] += gap < cap ? gap : cap;
+    }
+  }
+}
+
+// Fills the distances (N, N) of hypotheses by their joints (N, J, 3), m.
+inline void fill_distances(const Tables& joints, float same, float cap,
+                           const Array<float, 2>& distances) {
+  const Index n = joints.size(), count = joints.size(1);
+  // A row a coordinate, so that the innermost loops run along memory; single precision is
+  // micrometres here.
+  Scratch<float, 3> rows(count, 3, n);
+  for (Index k = 0; k < count; ++k) {
+    for (int x = 0; x < 3; ++x) {
+      for (Index a = 0; a < n; ++a) rows(k, x, a) = static_cast<float>(joints(a, k, x));
+    }
+  }
+  for (Index a = 0; a < n; ++a) {
+    float* own = distances[a].data;
+    add_distances(rows.view().data, count, n, a, cap, own);
+    for (Index b = a; b < n; ++b) {
+      const float distance = own[b] / static_cast<float>(count) - same;
+      own[b] = distances(b, a) = 0.0f > distance ? 0.0f : distance;
+    }
+  }
+}
+
+// Adds to `gains` (N,) what hypothesis i, at `nearest` from those that are kept, gains if any of N
+// at distances `away` is kept, too.
+HMT_WIDE inline void add_gains(const float* away, Index n, double weight, float nearest,
+                               double* gains) {
+  for (Index c = 0; c < n; ++c) {
+    gains[c] += weight * most(static_cast<double>(nearest - away[c]), 0.0);
+  }
+}
+
+// What N hypotheses gain if one that is `away` from them is kept, too. Sums are in order; only what
+// is summed can be computed side by side, so it is put down first.
+HMT_WIDE inline double gain_of(const float* away, const float* nearest, const double* weights,
+                               Index n) {
+  constexpr Index strip = 32;
+  double gain = 0.0, parts[strip];
+  for (Index first = 0; first < n; first += strip) {
+    const Index count = std::min(strip, n - first);
+    for (Index i = 0; i < count; ++i) {
+      const float less = nearest[first + i] - away[first + i];
+      parts[i] = weights[first + i] * most(static_cast<double>(less), 0.0);
+    }
+    for (Index i = 0; i < count; ++i) gain += parts[i];
+  }
+  return gain;
+}
+
+// The choice as it grows.
+class Selection {
+ public:
+  Selection(const Tables& joints, const Numbers& weights, float same, float cap)
+      : weights_(weights),
+        distances_(joints.size(), joints.size()),
+        nearest_(joints.size()),
+        gains_(joints.size()) {
+    fill_distances(joints, same, cap, distances_);
+    nearest_.fill(cap);
+  }
+
+  // Takes the gains of all; it is to be called before the first `best`.
+  void weigh() {
+    const Index n = weights_.size();
+    gains_.fill(0.0);
+    for (Index i = 0; i < n; ++i) {
+      add_gains(distances_[i].data, n, weights_[i], nearest_[i], gains_.view().data);
+    }
+  }
+
+  // The hypothesis that lessens the expected distance most; -1: none does.
+  Index best() {
+    Index best = -1;
+    double best_gain = 0.0;
+    // Gains only shrink as more are kept: a candidate whose last gain is no larger than the best of
+    // this round need not be looked at again. The one with the largest last gain comes first.
+    const Index likely = place_of_largest(gains_);
+    for (Index turn = -1; turn < weights_.size(); ++turn) {
+      const Index c = turn < 0 ? likely : turn;
+      const bool kept_already = nearest_[c] == 0.0f;  // or the same as one that is
+      if (turn == likely || kept_already || gains_[c] < best_gain ||
+          (gains_[c] == best_gain && c > best && best >= 0)) {
+        continue;
+      }
+      const double gain = gains_[c] =
+          gain_of(distances_[c].data, nearest_.view().data, weights_.data, weights_.size());
+      if (gain > best_gain || (gain == best_gain && gain > 0.0 && c < best)) {
+        best = c;
+        best_gain = gain;
+      }
+    }
+    return best;
+  }
+
+  // Keeps a hypothesis as number `kept` of the chosen, the owner of those that it is nearest to.
+  void keep(Index hypothesis, Index kept, const Array<Index, 1>& owner) {
+    const float* away = distances_[hypothesis].data;
+    for (Index i = 0; i < weights_.size(); ++i) {
+      if (away[i] < nearest_[i]) {
+        nearest_[i] = away[i];
+        owner[i] = kept;
+      }
+    }
+    owner[hypothesis] = kept;
+  }
+
+ private:
+  const Numbers weights_;
+  Scratch<float, 2> distances_;  // (N, N)
+  Scratch<float, 1> nearest_;    // distances to the nearest that is kept
+  Scratch<double, 1> gains_;     // of the candidates, when they were last looked at
+};
+
+// Chooses hypotheses that stand for all, by their joints (N, J, 3) and weights (N,); returns how
+// many, at most as `chosen` (K,) has place for.
+//
+// `same` and `cap` are the mean distance of hypotheses that are one, and the largest that a joint
+// counts with, m. Those in `first` are kept in any case, after the heaviest. `owner` (N,) becomes
+// the place in `chosen` of the one that stands for each.
+inline Index choose_representatives(const Tables& joints, const Numbers& weights, double same,
+                                    double cap, const Places& first, const Array<Index, 1>& chosen,
+                                    const Array<Index, 1>& owner) {
+  const Index n = joints.size();
+  expect_shape("joints", joints, {-1, -1, 3});
+  expect(joints.size(1) > 0, "joints", "one joint at least");
+  expect_shape("weights", weights, {n});
+  expect_range("first", first, 0, n);
+  expect(chosen.size() <= n, "chosen", "no more than there are hypotheses");
+  expect_shape("owner", owner, {n});
+  Selection selection(joints, weights, static_cast<float>(same), static_cast<float>(cap));
+  owner.fill(0);
+  for (Index kept = 0; kept < chosen.size(); ++kept) {
+    if (kept == 1 + first.size()) selection.weigh();
+    const Index best = kept == 0              ? place_of_largest(weights)
+                       : kept <= first.size() ? first[kept - 1]
+                                              : selection.best();
+    if (best < 0) return kept;
+    chosen[kept] = best;
+    selection.keep(best, kept, owner);
+  }
+  return chosen.size();
+}
+
+}  // namespace hmt

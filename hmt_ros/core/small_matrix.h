@@ -1,0 +1,330 @@
+// Linear algebra of matrices up to some hundreds of rows, with the same bytes on every processor.
+//
+// BLAS and LAPACK choose kernels by processor, which sum in different orders. Here every sum has a
+// fixed order; vectors run across columns, that is, across sums, so that their width changes none.
+#pragma once
+
+#include "arrays.h"
+#include "elementary.h"
+#include "wide.h"
+
+namespace hmt::matrices {
+
+// A row's numbers in groups of 64 bytes, whatever the processor has.
+template <class T>
+struct MatrixLanes {
+  typedef T Group __attribute__((vector_size(64), aligned(alignof(T)), may_alias));
+  static constexpr Index count = 64 / sizeof(T);
+};
+template <class T>
+using Group = typename MatrixLanes<T>::Group;
+
+inline constexpr Index matrix_lanes = MatrixLanes<double>::count;
+inline Index padded(Index n) { return (n + matrix_lanes - 1) / matrix_lanes * matrix_lanes; }
+HMT_INLINE Group<double>& group(double* row) { return *reinterpret_cast<Group<double>*>(row); }
+
+// Rows of numbers at distances that are a multiple of `matrix_lanes`.
+struct Rows {
+  double* data;
+  Index stride;
+  HMT_INLINE double* operator[](Index i) const { return data + i * stride; }
+};
+
+HMT_INLINE void subtract(double* row, double factor, double* other, Index first, Index last) {
+  for (Index b = first; b < last; b += matrix_lanes) group(row + b) -= factor * group(other + b);
+}
+HMT_INLINE void divide(double* row, double divisor, Index first, Index last) {
+  for (Index b = first; b < last; b += matrix_lanes) group(row + b) /= divisor;
+}
+
+// Cholesky factorisation, rows of the upper factor in place; reads and leaves right what is not
+// left of the diagonal. False for a matrix that is not positive definite.
+HMT_WIDE inline bool factorise(Rows u, Index n) {
+  for (Index a = 0; a < n; ++a) {
+    double* row = u[a];
+    if (!(row[a] > 0.0)) return false;
+    divide(row, std::sqrt(row[a]), a / matrix_lanes * matrix_lanes, u.stride);
+    for (Index c = a + 1; c < n; ++c)
+      subtract(u[c], row[c], row, c / matrix_lanes * matrix_lanes, u.stride);
+  }
+  return true;
+}
+
+// Gaussian elimination with partial pivoting of (n, n) and of what stands right of it, in place.
+// Returns the sign of the permutation, or 0 for a singular matrix.
+HMT_WIDE inline double eliminate(Rows u, Index n) {
+  double sign = 1.0;
+  for (Index j = 0; j < n; ++j) {
+    Index largest = j;
+    for (Index i = j + 1; i < n; ++i) {
+      if (std::abs(u[i][j]) > std::abs(u[largest][j])) largest = i;
+    }
+    double* row = u[j];
+    const Index first = j / matrix_lanes * matrix_lanes;
+    if (largest != j) {
+      sign = -sign;
+      for (Index b = first; b < u.stride; b += matrix_lanes) {
+        const Group<double> other = group(row + b);
+        group(row + b) = group(u[largest] + b);
+        group(u[largest] + b) = other;
+      }
+    }
+    if (row[j] == 0.0) return 0.0;
+    for (Index i = j + 1; i < n; ++i) {
+      if (u[i][j] != 0.0) subtract(u[i], u[i][j] / row[j], row, first, u.stride);
+    }
+  }
+  return sign;
+}
+
+// Solves for the columns from `first` on, in place: upper triangle, or lower triangle of rows.
+HMT_WIDE inline void solve_upper(Rows u, Index n, Index first) {
+  for (Index i = n - 1; i >= 0; --i) {
+    for (Index j = i + 1; j < n; ++j) subtract(u[i], u[i][j], u[j], first, u.stride);
+    divide(u[i], u[i][i], first, u.stride);
+  }
+}
+HMT_WIDE inline void solve_lower(Rows l, Index n, Index first) {
+  for (Index i = 0; i < n; ++i) {
+    for (Index j = 0; j < i; ++j) subtract(l[i], l[i][j], l[j], first, l.stride);
+    divide(l[i], l[i][i], first, l.stride);
+  }
+}
+
+// Turns two rows by an angle.
+HMT_INLINE void rotate(double* p, double* q, double cosine, double sine, Index width) {
+  for (Index b = 0; b < width; b += matrix_lanes) {
+    const Group<double> old = group(p + b);
+    group(p + b) = cosine * old - sine * group(q + b);
+    group(q + b) = sine * old + cosine * group(q + b);
+  }
+}
+
+inline constexpr int most_sweeps = 60;
+
+// Sum of products in `count` sums by place, which are then added in pairs.
+template <class T>
+HMT_INLINE T inner_product(const T* x, const T* y, Index n) {
+  constexpr Index count = MatrixLanes<T>::count;
+  Group<T> sums{};
+  Index i = 0;
+  for (; i + count <= n; i += count) {
+    sums += *reinterpret_cast<const Group<T>*>(x + i) * *reinterpret_cast<const Group<T>*>(y + i);
+  }
+  T each[count];
+  *reinterpret_cast<Group<T>*>(each) = sums;
+  for (Index k = 0; i + k < n; ++k) each[k] += x[i + k] * y[i + k];
+  for (Index half = count / 2; half > 0; half /= 2) {
+    for (Index k = 0; k < half; ++k) each[k] += each[k + half];
+  }
+  return each[0];
+}
+
+// Reduces a symmetric matrix to tridiagonal form by reflections: its diagonal and what lies beside
+// it. Row k keeps the reflection k right of its diagonal, `scales` its factor; `work` holds a row.
+HMT_WIDE inline void make_tridiagonal(Rows a, Index n, double* diagonal, double* beside,
+                                      double* scales, double* work) {
+  for (Index k = 0; k + 1 < n; ++k) {
+    double* v = a[k];
+    const Index first = (k + 1) / matrix_lanes * matrix_lanes;
+    diagonal[k] = v[k];
+    std::fill(v + first, v + k + 1, 0.0);
+    const double square = inner_product(v + first, v + first, a.stride - first);
+    const double length = v[k + 1] > 0.0 ? -std::sqrt(square) : std::sqrt(square);
+    const double own = v[k + 1] * length;
+    beside[k] = length;
+    scales[k] = square > 0.0 ? 1.0 / (square - own) : 0.0;
+    if (!(square > 0.0)) continue;
+    v[k + 1] -= length;
+    std::fill(work + first, work + a.stride, 0.0);
+    for (Index j = k + 1; j < n; ++j) subtract(work, -scales[k] * v[j], a[j], first, a.stride);
+    std::fill(work + first, work + k + 1, 0.0);
+    const double share = 0.5 * scales[k] * inner_product(work + first, v + first, a.stride - first);
+    subtract(work, share, v, first, a.stride);
+    for (Index j = k + 1; j < n; ++j) {
+      subtract(a[j], v[j], work, first, a.stride);
+      subtract(a[j], work[j], v, first, a.stride);
+    }
+  }
+  diagonal[n - 1] = a[n - 1][n - 1];
+  beside[n - 1] = 0.0;
+}
+
+// Rows of the product of the reflections of `make_tridiagonal`.
+HMT_WIDE inline void multiply_reflections(Rows a, Index n, const double* scales, Rows result,
+                                          double* work) {
+  for (Index k = n - 2; k >= 0; --k) {
+    const double* v = a[k];
+    std::fill(work, work + a.stride, 0.0);
+    for (Index j = k + 1; j < n; ++j) subtract(work, -scales[k] * v[j], result[j], 0, a.stride);
+    for (Index j = k + 1; j < n; ++j) subtract(result[j], v[j], work, 0, a.stride);
+  }
+}
+
+// Eigenvalues of a symmetric tridiagonal matrix by the QL method with implicit shifts; they replace
+// the diagonal, in no order. The rotations turn the rows of `vectors`, if there are any. False
+// where it does not converge.
+HMT_WIDE inline bool diagonalise(double* diagonal, double* beside, Index n, Rows vectors) {
+  for (Index first = 0; first < n; ++first) {
+    for (int sweep = 0;; ++sweep) {
+      Index last = first;  // of the block that does not fall apart
+      while (last + 1 < n &&
+             !(std::abs(beside[last]) <=
+               0x1p-53 * (std::abs(diagonal[last]) + std::abs(diagonal[last + 1])))) {
+        ++last;
+      }
+      if (last == first) break;
+      if (sweep == most_sweeps) return false;
+      const double half = (diagonal[first + 1] - diagonal[first]) / (2.0 * beside[first]);
+      const double root = std::sqrt(half * half + 1.0);
+      double g =
+          diagonal[last] - diagonal[first] + beside[first] / (half + (half < 0.0 ? -root : root));
+      double sine = 1.0, cosine = 1.0, moved = 0.0;
+      Index i = last - 1;
+      for (; i >= first; --i) {
+        const double f = sine * beside[i], b = cosine * beside[i], r = std::sqrt(f * f + g * g);
+        beside[i + 1] = r;
+        if (r == 0.0) {
+          diagonal[i + 1] -= moved;
+          beside[last] = 0.0;
+          break;
+        }
+        sine = f / r;
+        cosine = g / r;
+        g = diagonal[i + 1] - moved;
+        const double step = (diagonal[i] - g) * sine + 2.0 * cosine * b;
+        moved = sine * step;
+        diagonal[i + 1] = g + moved;
+        g = cosine * step - b;
+        if (vectors.data) rotate(vectors[i], vectors[i + 1], cosine, sine, vectors.stride);
+      }
+      if (i >= first) continue;
+      diagonal[first] -= moved;
+      beside[first] = g;
+      beside[last] = 0.0;
+    }
+  }
+  return true;
+}
+
+// Makes columns, the largest of them near to 1, orthogonal by rotations (one-sided Jacobi): rows of
+// `columns` and, with them, rows of `turns`, at first the identity. False where it does not
+// converge.
+HMT_WIDE inline bool orthogonalise(Rows columns, Rows turns, Index count) {
+  for (int sweep = 0; sweep < most_sweeps; ++sweep) {
+    bool turned = false;
+    for (Index p = 0; p < count; ++p) {
+      for (Index q = p + 1; q < count; ++q) {
+        const double own = inner_product(columns[p], columns[p], columns.stride);
+        const double others = inner_product(columns[q], columns[q], columns.stride);
+        const double x = inner_product(columns[p], columns[q], columns.stride);
+        const double small = 0x1p-49 * std::sqrt(own) * std::sqrt(others);
+        if (!(std::abs(x) > most(small, 0x1p-110))) continue;
+        turned = true;
+        // The smaller angle that makes [[own, x], [x, others]] diagonal.
+        const double ratio = (others - own) / (2.0 * x);
+        const double root = std::sqrt(ratio * ratio + 1.0);
+        const double tangent = 1.0 / (ratio + (ratio < 0.0 ? -root : root));
+        const double cosine = 1.0 / std::sqrt(tangent * tangent + 1.0);
+        rotate(columns[p], columns[q], cosine, tangent * cosine, columns.stride);
+        rotate(turns[p], turns[q], cosine, tangent * cosine, turns.stride);
+      }
+    }
+    if (!turned) return true;
+  }
+  return false;
+}
+
+// The power of two that takes numbers up to this size near to 1, so that squares neither overflow
+// nor vanish.
+inline double scale_of(double largest) {
+  int exponent = 0;
+  std::frexp(largest, &exponent);
+  return std::ldexp(1.0, std::clamp(-exponent, -1000, 1000));
+}
+
+// A matrix of numpy: strides in bytes.
+template <class T>
+struct Strided {
+  char* data;
+  Index row, column;
+  HMT_INLINE T& operator()(Index i, Index j) const {
+    return *reinterpret_cast<T*>(data + i * row + j * column);
+  }
+};
+
+// R rows and G groups of columns of a product: sums run along `inner` in order.
+template <class T, int R, int G>
+HMT_INLINE void multiply_rows(Strided<T> a, Index first, const T* b, Index b_stride, Index inner,
+                              Strided<T> result, Index column, Index columns) {
+  constexpr Index count = MatrixLanes<T>::count;
+  Group<T> sums[R][G] = {};
+  for (Index k = 0; k < inner; ++k) {
+    for (int c = 0; c < G; ++c) {
+      const auto right = *reinterpret_cast<const Group<T>*>(b + k * b_stride + c * count);
+      for (int r = 0; r < R; ++r) sums[r][c] += a(first + r, k) * right;
+    }
+  }
+  for (int r = 0; r < R; ++r) {
+    for (int c = 0; c < G; ++c) {
+      T each[count];
+      *reinterpret_cast<Group<T>*>(each) = sums[r][c];
+      const Index start = column + c * count, wanted = std::min(count, columns - c * count);
+      for (Index j = 0; j < wanted; ++j) result(first + r, start + j) = each[j];
+    }
+  }
+}
+template <class T, int G>
+HMT_INLINE void multiply_columns(Strided<T> a, const T* b, Index b_stride, Index m, Index inner,
+                                 Strided<T> result, Index column, Index columns) {
+  Index i = 0;
+  if constexpr (G == 1) {
+    for (; i + 6 <= m; i += 6) {
+      multiply_rows<T, 6, 1>(a, i, b, b_stride, inner, result, column, columns);
+    }
+    for (; i + 2 <= m; i += 2) {
+      multiply_rows<T, 2, 1>(a, i, b, b_stride, inner, result, column, columns);
+    }
+  }
+  for (; i < m; ++i) multiply_rows<T, 1, G>(a, i, b, b_stride, inner, result, column, columns);
+}
+
+// Matrix product (m, inner) (inner, n); `room` for inner groups of numbers. The sums of a single
+// column are those of `inner_product`.
+template <class T>
+HMT_WIDE void multiply(Strided<T> a, Strided<T> b, Strided<T> result, Index m, Index inner, Index n,
+                       T* room) {
+  constexpr Index count = MatrixLanes<T>::count;
+  if (n == 1) {
+    T* other = room + inner;
+    for (Index k = 0; k < inner; ++k) room[k] = b(k, 0);
+    for (Index i = 0; i < m; ++i) {
+      const T* row = &a(i, 0);
+      if (a.column != sizeof(T)) {
+        for (Index k = 0; k < inner; ++k) other[k] = a(i, k);
+        row = other;
+      }
+      result(i, 0) = inner_product(row, room, inner);
+    }
+    return;
+  }
+  const bool together = b.column == sizeof(T);
+  const Index stride = b.row / Index(sizeof(T));
+  Index column = 0;
+  for (; together && m < 6 && column + 4 * count <= n; column += 4 * count) {
+    multiply_columns<T, 4>(a, &b(0, column), stride, m, inner, result, column, 4 * count);
+  }
+  for (; together && column + count <= n; column += count) {
+    multiply_columns<T, 1>(a, &b(0, column), stride, m, inner, result, column, count);
+  }
+  for (; column < n; column += count) {
+    const Index columns = std::min(count, n - column);
+    for (Index k = 0; k < inner; ++k) {
+      for (Index j = 0; j < columns; ++j) room[k * count + j] = b(k, column + j);
+      for (Index j = columns; j < count; ++j) room[k * count + j] = T(0);
+    }
+    multiply_columns<T, 1>(a, room, count, m, inner, result, column, columns);
+  }
+}
+
+}  // namespace hmt::matrices

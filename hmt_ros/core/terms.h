@@ -1,0 +1,64 @@
+// All terms of the image likelihood, pose by pose; see hmt_ros/image/terms/registry.py.
+//
+//     E_image(x) = sum_t E_t(x)        over the terms t
+//
+// A new term is a header in terms/, with its inputs and its `add_term`, and a line in TermInputs.
+#pragma once
+
+#include <tuple>
+
+#include "terms/coverage.h"
+#include "terms/depth.h"
+#include "terms/edges.h"
+
+namespace hmt {
+
+// Inputs of the terms, in the order of TERMS; each starts with its weighting, `term`.
+using TermInputs = std::tuple<CoverageInputs,  //
+                              EdgeInputs,      //
+                              DepthInputs>;
+inline constexpr Index term_count = std::tuple_size_v<TermInputs>;
+
+// Inputs must have room for the results of so many poses.
+inline void check_poses(const TermInputs& inputs, Index poses) {
+  const auto one = [&](const auto& own) {
+    if constexpr (requires { own.check_poses(poses); }) own.check_poses(poses);
+  };
+  std::apply([&](const auto&... own) { (one(own), ...); }, inputs);
+}
+
+// Runs the terms that are on for the pose in a view; their energies (terms,) are set.
+inline void run_terms(const PoseView& view, const TermInputs& inputs, const Vector& energies,
+                      const Sums& sums) {
+  double* energy = energies.data;
+  const auto one = [&](const auto& own) {
+    if (own.term.weight > 0.0) *energy = add_term(view, own, sums);
+    ++energy;
+  };
+  std::apply([&](const auto&... own) { (one(own), ...); }, inputs);
+}
+
+// Lists the residuals (N, M, Sums::recorded) of N poses with frames (N, S, 3, 3), (N, S, 3),
+// instead of summing them. Entries (n, 0, 0) must be 0 and become the number of residuals of pose
+// n.
+inline void record_residuals(const Model& model, const TermInputs& inputs,
+                             const Array<const double, 4>& columns, const Tables& origins,
+                             const Tensor& residuals) {
+  const Index n = columns.size(), segments = model.tree.segments();
+  expect_shape("columns", columns, {n, segments, 3, 3});
+  expect_shape("origins", origins, {n, segments, 3});
+  expect_shape("residuals", residuals, {n, -1, Sums::recorded});
+  expect(residuals.size(1) > 0, "residuals", "a row that counts the residuals");
+  for (Index i = 0; i < n; ++i) expect(residuals(i, 0, 0) == 0.0, "residuals", "counts of 0");
+  check_poses(inputs, n);
+  PoseView view(model);
+  Scratch<double, 1> energies(term_count);
+  for (Index i = 0; i < n; ++i) {
+    view.columns.view().copy_from(columns[i]);
+    view.origins.view().copy_from(origins[i]);
+    look(view, i, true);
+    run_terms(view, inputs, energies, Sums{{}, {}, residuals[i]});
+  }
+}
+
+}  // namespace hmt

@@ -1,0 +1,126 @@
+"""Linear algebra with the same bytes on every processor.
+
+BLAS and LAPACK, which numpy calls, choose their kernels by processor, and these sum in different
+orders. The functions of this module sum in one order; they broadcast over leading axes, and a
+matrix without a result raises `numpy.linalg.LinAlgError`, as with numpy. They are made for
+matrices up to some hundreds of rows.
+"""
+
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.core import matrices
+
+Array = NDArray[np.float64]
+
+# The matrix product, as `numpy.matmul`; of float32 where both are, else of float64.
+product: Callable[..., Any] = matrices.product
+
+
+def _checked(what: str) -> np.errstate:
+    def fail(_kind: str, _flag: int) -> NoReturn:
+        raise np.linalg.LinAlgError(what)
+
+    return np.errstate(invalid='call', call=fail)
+
+
+_NOT_POSITIVE = 'matrix is not positive definite'
+_SINGULAR = 'singular matrix'
+_NOT_CONVERGED = 'no convergence, or a matrix that is not finite'
+
+
+def cholesky(matrix: ArrayLike) -> Array:
+    """Lower triangular factor L of L L^T, from the lower triangle of a matrix (..., n, n)."""
+    with _checked(_NOT_POSITIVE):
+        result: Array = matrices.cholesky(matrix)
+    return result
+
+
+def solve(matrix: ArrayLike, right: ArrayLike) -> Array:
+    """X of A X = B, for A (..., n, n) and B (..., n, m), or one vector (n,)."""
+    return _solved(matrices.solve, matrix, right)
+
+
+def solve_triangular(
+    factor: ArrayLike, right: ArrayLike, *, lower: bool = True, transposed: bool = False
+) -> Array:
+    """X of A X = B, or of A^T X = B, for a triangle A (..., n, n); the other half is not read."""
+    if transposed:
+        factor, lower = np.swapaxes(factor, -1, -2), not lower
+    return _solved(matrices.solve_lower if lower else matrices.solve_upper, factor, right)
+
+
+def solve_positive(factor: ArrayLike, right: ArrayLike) -> Array:
+    """X of L L^T X = B, for a lower factor L (..., n, n)."""
+    return solve_triangular(factor, solve_triangular(factor, right), transposed=True)
+
+
+def inverse(matrix: ArrayLike) -> Array:
+    """Inverse of a matrix (..., n, n)."""
+    with _checked(_SINGULAR):
+        result: Array = matrices.inverse(matrix)
+    return result
+
+
+def inverse_triangular(factor: ArrayLike) -> Array:
+    """Inverse of a lower triangle (..., n, n)."""
+    return solve_triangular(factor, np.eye(np.shape(factor)[-1]))
+
+
+def determinant(matrix: ArrayLike) -> Array:
+    """Determinant of a matrix (..., n, n)."""
+    result: Array = matrices.determinant(matrix)[0]
+    return result
+
+
+def log_determinant(matrix: ArrayLike) -> Array:
+    """Logarithm of the size of the determinant of a matrix (..., n, n); -inf if singular."""
+    result: Array = matrices.determinant(matrix)[1]
+    return result
+
+
+def symmetric_eigen(matrix: ArrayLike) -> tuple[Array, Array]:
+    """Eigenvalues (..., n), rising, and vectors (..., n, n) by columns, from the lower triangle."""
+    with _checked(_NOT_CONVERGED):
+        values, vectors = matrices.symmetric_eigen(matrix)
+    return values, vectors
+
+
+def symmetric_eigenvalues(matrix: ArrayLike) -> Array:
+    """Eigenvalues (..., n), rising, of a symmetric matrix, from its lower triangle."""
+    with _checked(_NOT_CONVERGED):
+        result: Array = matrices.symmetric_eigenvalues(matrix)
+    return result
+
+
+def singular_values(matrix: ArrayLike) -> tuple[Array, Array, Array]:
+    """U (..., m, k), the singular values (..., k), falling, and V^T (..., k, n); k = min(m, n).
+
+    A column of U, or a row of V^T if m < n, is 0 where its singular value is 0.
+    """
+    matrix = np.asarray(matrix)
+    if matrix.shape[-2] < matrix.shape[-1]:
+        v, values, u = singular_values(matrix.swapaxes(-1, -2))
+        return u.swapaxes(-1, -2), values, v.swapaxes(-1, -2)
+    with _checked(_NOT_CONVERGED):
+        u, values, v = matrices.singular_values(matrix)
+    return u, values, v.swapaxes(-1, -2)
+
+
+def pseudo_inverse(matrix: ArrayLike, tolerance: float = 1e-15) -> Array:
+    """Moore-Penrose inverse (..., n, m); singular values up to a share of the largest are 0."""
+    u, values, vt = singular_values(matrix)
+    large = values > tolerance * values[..., :1]
+    inverses = np.divide(1.0, values, out=np.zeros_like(values), where=large)
+    result: Array = product(vt.swapaxes(-1, -2) * inverses[..., None, :], u.swapaxes(-1, -2))
+    return result
+
+
+def _solved(function: Callable[..., Any], matrix: ArrayLike, right: ArrayLike) -> Array:
+    vector = np.ndim(right) == 1
+    with _checked(_SINGULAR):
+        result: Array = function(matrix, np.asarray(right)[:, None] if vector else right)
+    return result[..., 0] if vector else result

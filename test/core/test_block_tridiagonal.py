@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+
+from hmt_ros.core import add_band_product, add_diagonal, fill_lower, hold
+
+
+def dense(columns):
+    """The symmetric matrix in the columns of a band."""
+    size = len(columns)
+    matrix = np.zeros((size, size))
+    for j, column in enumerate(columns):
+        for b, value in enumerate(column[: size - j]):
+            matrix[j, j + b] = matrix[j + b, j] = value
+    return matrix
+
+
+@pytest.mark.parametrize(('times', 'n', 'd', 'width'), [(4, 3, 3, 6), (4, 3, 2, 4), (1, 2, 1, 2)])
+def test_a_band_holds_the_blocks_within_its_width(times, n, d, width):
+    rng = np.random.default_rng(0)
+    blocks, lower = rng.normal(size=(times, d, d)), rng.normal(size=(times - 1, n, n))
+    columns = np.zeros((times * n, width))
+    add_diagonal(columns, blocks, n)
+    fill_lower(columns, lower)
+    wanted = np.zeros((times * n, times * n))
+    for t in range(times):
+        upper = np.triu(blocks[t])
+        wanted[t * n : t * n + d, t * n : t * n + d] = upper + np.triu(upper, 1).T
+    for t in range(times - 1):
+        wanted[(t + 1) * n : (t + 2) * n, t * n : (t + 1) * n] = lower[t]
+    row, column = np.indices(wanted.shape)
+    wanted = np.where(row - column < width, np.tril(wanted), 0.0)
+    np.testing.assert_array_equal(np.tril(dense(columns)), wanted)
+
+
+def test_held_variables_have_the_rows_of_the_unit_matrix():
+    columns = np.random.default_rng(1).normal(size=(7, 3))
+    wanted = dense(columns)
+    hold(columns, np.array([0, 4, 6]))
+    for i in (0, 4, 6):
+        wanted[i], wanted[:, i] = 0.0, 0.0
+        wanted[i, i] = 1.0
+    np.testing.assert_array_equal(dense(columns), wanted)
+
+
+@pytest.mark.parametrize(
+    ('function', 'arguments', 'text'),
+    [
+        (add_diagonal, (np.zeros((4, 2)), np.zeros((2, 2, 3)), 2), 'blocks: wanted shape'),
+        (add_diagonal, (np.zeros((4, 2)), np.zeros((3, 2, 2)), 2), 'n: wanted'),
+        (add_diagonal, (np.zeros((4, 2)), np.zeros((2, 2, 2)), -2), 'n: wanted'),
+        (add_diagonal, (np.zeros((6, 2)), np.zeros((2, 3, 3)), 3), 'columns: wanted a band'),
+        (add_diagonal, (np.zeros((4, 2)).T, np.zeros((2, 2, 2)), 2), 'columns: wanted .*contig'),
+        (fill_lower, (np.zeros((4, 2)), np.zeros((2, 2, 2))), 'columns: wanted shape'),
+        (fill_lower, (np.zeros((4, 2)), np.zeros((1, 2, 2), np.float32)), 'lower: wanted'),
+        (add_band_product, (np.zeros((4, 2)), np.zeros((1, 3)), np.zeros((1, 4))), 'x: wanted'),
+        (add_band_product, (np.zeros((4, 2)), np.zeros((1, 4)), np.zeros((2, 4))), 'result: wan'),
+        (hold, (np.zeros((4, 2)), np.array([4])), 'held: wanted numbers'),
+        (hold, (np.zeros((4, 2)), np.array([-1])), 'held: wanted numbers'),
+        (hold, (np.zeros((4, 0)), np.array([0])), 'columns: wanted a diagonal'),
+    ],
+)
+def test_what_does_not_fit_is_refused(function, arguments, text):
+    with pytest.raises((ValueError, TypeError), match=text):
+        function(*arguments)
+
+
+def test_nothing_comes_of_nothing():
+    add_diagonal(np.zeros((0, 2)), np.zeros((0, 2, 2)), 2)
+    add_band_product(np.zeros((3, 0)), np.ones((1, 3)), np.zeros((1, 3)))
+    fill_lower(np.zeros((2, 0)), np.ones((0, 2, 2)))
+    hold(np.zeros((0, 1)), np.array([], np.int64))

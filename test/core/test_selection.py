@@ -1,0 +1,50 @@
+"""Choice of hypotheses: what does not fit is refused; values are those of the tests of tracking."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_ros.core import choose_representatives
+from test.core.arguments import assert_arguments_are_checked
+
+N = 5
+
+
+def arguments(**changes):
+    joints = np.random.default_rng(0).normal(size=(N, 4, 3))
+    given = {
+        'joints': joints,
+        'weights': np.full(N, 1.0 / N),
+        'same': 0.02,
+        'cap': 0.3,
+        'first': np.array([3]),
+        'chosen': np.zeros(3, dtype=np.int64),
+        'owner': np.zeros(N, dtype=np.int64),
+    }
+    return given | changes
+
+
+def test_a_choice_needs_arguments_that_fit():
+    assert_arguments_are_checked(
+        choose_representatives,
+        arguments(),
+        'chosen owner',
+        free='first chosen',
+        unread='chosen owner',
+    )
+    for changes in ({'chosen': np.zeros(N + 1, dtype=np.int64)}, {'joints': np.zeros((N, 0, 3))}):
+        with pytest.raises(ValueError, match=next(iter(changes))):
+            choose_representatives(*arguments(**changes).values())
+
+
+def test_those_that_are_kept_in_any_case_follow_the_heaviest():
+    given = arguments(weights=np.array([0.1, 0.2, 0.5, 0.1, 0.1]), first=np.array([3, 0]))
+    assert choose_representatives(*given.values()) == 3
+    assert list(given['chosen']) == [2, 3, 0]
+
+
+def test_none_is_kept_that_changes_nothing():
+    given = arguments(joints=np.zeros((N, 4, 3)), first=np.zeros(0, dtype=np.int64))
+    assert choose_representatives(*given.values()) == 1
+    assert not given['owner'].any()
