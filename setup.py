@@ -59,9 +59,10 @@ def opencv() -> list[str]:
     return ['opencv-python-headless'] if done.returncode else []
 
 
-# No fused products: every processor rounds alike. Without errno and traps loops become vectors.
+# No fused products: every processor rounds alike. Without errno and traps loops become vectors, and
+# those marked by "omp simd" do.
 CORE_OPTIONS = ['-std=c++20', '-O3', '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math']
-CORE_OPTIONS += ['-fvisibility=hidden']
+CORE_OPTIONS += ['-fvisibility=hidden', '-fopenmp-simd']
 # What the core is compiled with: condition of the preprocessor, what is missing, package of apt.
 CORE_NEEDS = [
     ('__cplusplus >= 202002L', 'compiler for C++20 (g++ 11, clang++ 14 or later)', 'g++'),

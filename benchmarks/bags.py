@@ -56,7 +56,7 @@ def replayed(folder: Path, *, quick: bool = False) -> list[dict[str, Any]]:
     if quick:
         ways = {'filter': ways['filter']}
     else:
-        # Kernels are compiled.
+        # What is read lies in the cache of files.
         _run(source, folder / 'first', ways['filter, smoother and BME'])
     found = []
     for number, (what, options) in enumerate(ways.items()):

@@ -72,7 +72,7 @@ POSTERIOR, SMOOTHED = 'pose_mixture', 'smoothed_pose_mixture'
 TOLD, LISTED = 'keep_out', 'people'
 # Options of a replay that leaves out the gravity of the bag.
 WITHOUT_GRAVITY = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
-START_SECONDS = 120.0  # until the person is tracked: the first images compile the kernels
+START_SECONDS = 120.0  # until the person is tracked
 PATIENCE = 3.0  # s, after the last image
 # Of a visit: how long a state may be late, s, and the share of the joints that are somebody.
 LATE, SOMEBODY = 1.0, 0.5
@@ -202,7 +202,7 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
             opened, player.domain, clip, case.transport, len(stamps), more,
             subscribers=1 if case.keypoints or case.together else 2, rate=rate,
         )  # fmt: skip
-        # The kernels are compiled and the track has started before the clip moves.
+        # The track has started before the clip moves.
         topic = _topic_of(case)
         camera.spin(player, lambda: len(arrived[topic]) > 2, START_SECONDS)
         shift, start_ns = camera.begin(player)

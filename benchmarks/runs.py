@@ -69,7 +69,7 @@ KEPT = ROOT / 'build' / 'benchmarks' / 'tracking'
 JOINTS = (ORIGIN, *EVALUATED_JOINTS)
 # Images a second of most clips.
 USUAL_RATE = 30.0
-# Images after which everything is compiled.
+# Images after which everything is loaded.
 WARMING = 2
 # Images after which the modes of an image are weighed by what became of them.
 LAG = 10
@@ -531,7 +531,7 @@ _warm: list[bool] = []
 
 
 def _warm_up(one: Run) -> None:
-    """Runs a few images, once in a process: the first ones also compile, which is not counted."""
+    """Runs a few images, once in a process: the first ones also load, which is not counted."""
     if not _warm:
         run(replace(one, limit=WARMING, rate=0.0))
         _warm.append(True)

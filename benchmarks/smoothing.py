@@ -38,7 +38,6 @@ from benchmarks.tracking_tables import Column
 from hmt_ros.body import Body
 from hmt_ros.body.mirror import propagated
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.reduction import leaders
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Output
@@ -47,6 +46,7 @@ from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import Transform
 from hmt_ros.tracking.camera_motion import CameraMotion
+from hmt_ros.tracking.selection import distinct_hypotheses
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.pose_mixtures import (
@@ -212,12 +212,9 @@ def modes_apart(record: Record) -> float:
     relative = record.joints - record.joints[:, :, :1]
     counts = []
     for joints, weights in zip(relative, record.weights, strict=True):
-        some = joints[weights > LIKELY]
-
-        def distances(i: int, some: Array = some) -> Array:
-            return np.asarray(np.nanmean(np.linalg.norm(some - some[i], axis=2), axis=1))
-
-        counts.append(len(leaders(weights[weights > LIKELY], distances, APART)))
+        likely = weights > LIKELY
+        some = joints[likely][:, np.isfinite(joints[likely]).all((0, 2))]
+        counts.append(len(distinct_hypotheses(some, weights[likely], APART)))
     return float(np.mean(counts))
 
 

@@ -36,7 +36,7 @@ def speed(clip: Clip) -> dict[str, Any]:
     subtractor = cv2.createBackgroundSubtractorMOG2()
     for _ in range(10):
         subtractor.apply(clip.background)
-    # Compile, or load what was compiled, before anything is timed.
+    # Load everything before anything is timed.
     for stamp, image in islice(zip(clip.stamps, clip.images, strict=True), 3):
         tracker.step(image, stamp)
     tracker = begun(clip, IMAGES)[0]
@@ -102,7 +102,7 @@ def costs(folder: Path, limit: int | None = None) -> list[dict[str, Any]]:
                 evaluations.append(tracker.estimate.evaluations)
             if len(spent) <= STARTING:
                 continue
-            # The first images start the track, and load what is compiled.
+            # The first images start the track, and load everything.
             steps, one = np.array(spent[STARTING:]), float(np.mean(floor[STARTING:]))
             rows.append(
                 {

@@ -17,7 +17,7 @@ from hmt_ros.sessions.handled import Handled
 OURS = '/hmt_ros/'
 # How long one message may take, s.
 PATIENCE = 30.0
-# How long a node may take to start, kernels included, and a case beyond its time, s.
+# How long a node may take to start, and a case beyond its time, s.
 _START, _OVERTIME = 300.0, 90.0
 # How long a valid message is waited for that may have been sent too early, s.
 SHORT = 2.0
@@ -26,7 +26,7 @@ SHORT = 2.0
 _QUEUE = 1000
 # Good answers in a row after which a session has begun: more than have to agree on a clock.
 _AGREEING = 4
-# Messages before memory is compared: kernels are compiled, buffers have grown.
+# Messages before memory is compared: buffers have grown.
 _WARM = 8
 
 

@@ -199,7 +199,7 @@ def _lift(arguments: argparse.Namespace) -> int:
     with BagWriter(folder / LIFTED, overwrite=arguments.overwrite) as bag:
         track, met = 1, stamps[0]
         for stamp, mixture in zip(stamps, mixtures, strict=True):
-            track += SAME_PERSON.transition(seconds(stamp - met))[1, 1] < 0.5
+            track += bool(SAME_PERSON.closed(1.0, seconds(stamp - met)) < 0.5)
             met = met if mixture is None else stamp
             info = camera_info_message(messages, camera, stamp, FRAME_ID)
             bag.write(CAMERA_INFO, stamp, info)

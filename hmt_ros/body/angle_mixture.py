@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.learned_file import (
@@ -28,7 +27,9 @@ from hmt_ros.body.learned_file import (
 from hmt_ros.body.mirror import mirror_order
 from hmt_ros.body.model_file import load_body, shipped_file
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import inverse_triangular, product, solve
 from hmt_ros.inference.mixture import GaussianMixture
 
 KIND = 'pose_prior'
@@ -97,26 +98,27 @@ class AngleMixture:
     @cached_property
     def whitening(self) -> Array:
         """Inverse Cholesky factors (C, n, n) of the covariances of `whole`, lower triangular."""
-        return np.ascontiguousarray(np.tril(np.linalg.inv(self.whole.cholesky())))
+        return inverse_triangular(self.whole.cholesky())
 
     @cached_property
     def precisions(self) -> Array:
         """Inverse covariances (C, n, n) of `whole`."""
-        result: Array = np.einsum('cki,ckj->cij', self.whitening, self.whitening)
-        return result
+        return np.asarray(product(self.whitening.swapaxes(1, 2), self.whitening))
 
     @cached_property
     def highest(self) -> float:
         """The largest log density."""
-        whole, precisions = self.whole, self.precisions
-        pulled = np.einsum('cij,cj->ci', precisions, whole.means)
+        whole, n = self.whole, self.whole.dimension
+        precisions = self.precisions.reshape(len(whole), n * n)
+        pulled = product(self.precisions, whole.means[..., None])[..., 0]
         points = whole.means.copy()
         for _ in range(CLIMB):
-            log = whole.component_log_densities(points) + np.log(whole.weights)
-            shares = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+            log = whole.component_log_densities(points) + elementary.log(whole.weights)
+            shares = elementary.exp(log - log.max(axis=1, keepdims=True))
+            shares /= shares.sum(1, keepdims=True)
             # The minimum of the quadratic that touches -log p here and lies above it elsewhere.
-            curvature = np.einsum('nc,cij->nij', shares, precisions)
-            moved = np.linalg.solve(curvature, (shares @ pulled)[..., None])[..., 0]
+            curvature = product(shares, precisions).reshape(-1, n, n)
+            moved = solve(curvature, product(shares, pulled)[..., None])[..., 0]
             step, points = float(np.abs(moved - points).max()), moved
             if step < ARRIVED:
                 break
@@ -153,7 +155,7 @@ class AngleMixture:
         factors = np.zeros((*means.shape, len(dofs)))
         lower = np.tril_indices(len(dofs))
         factors[:, lower[0], lower[1]] = arrays['factors']
-        covariances = factors @ factors.transpose(0, 2, 1)
+        covariances = product(factors, factors.swapaxes(1, 2))
         components = GaussianMixture(arrays['weights'], means, covariances)
         return cls(skeleton, dofs, components, card)
 

@@ -24,8 +24,9 @@ from numpy.typing import ArrayLike
 from hmt_ros.body import kinematics
 from hmt_ros.body.flesh import Flesh, Superquadric
 from hmt_ros.body.skeleton import Skeleton, sided_pairs
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.markov_chain import MarkovChain
+from hmt_ros.inference.linear_algebra import product
 
 # How a part of the flesh differs from that of the model, column by column: logarithms of factors on
 # the x and y radii, distances by which it exceeds the start and the end of its segment more than
@@ -74,7 +75,7 @@ class PartShape:
         width, depth, more_start, more_end, shift = (float(x) for x in growth)
         start, end = scale * self.extend[0] + more_start, scale * self.extend[1] + more_end
         cx, cy, cz = (scale * x for x in self.centre)
-        rx, ry = (scale * x * float(np.exp(g)) for x, g in zip(self.radii, (width, depth)))
+        rx, ry = (scale * x * float(elementary.exp(g)) for x, g in zip(self.radii, (width, depth)))
         if self.length is None:
             rz = scale * self.radii[2] + 0.5 * (more_start + more_end)
             cz += 0.5 * (more_start - more_end)
@@ -190,7 +191,7 @@ class Body:
         """Limbs: name -> segments from the root outwards."""
         return self.skeleton.chains
 
-    @property
+    @cached_property
     def chain_pairs(self) -> tuple[tuple[str, str], ...]:
         """Names of the chains that are the left and the right one of a pair."""
         return sided_pairs(self.skeleton.chains)
@@ -222,12 +223,12 @@ class Body:
         rate = 1.0 + self.stature_extra / self._sum_of(self.default_lengths)
         return np.array([rate if name in self.stature_lengths else 0.0 for name in names])
 
-    @property
+    @cached_property
     def stature(self) -> float:
         """Height of the person standing upright, m."""
         return self._sum_of(self.skeleton.lengths) + self.stature_extra * self.scale
 
-    @property
+    @cached_property
     def scale(self) -> float:
         """Ratio of the size of the body to that of its model file."""
         return self._sum_of(self.skeleton.lengths) / self._sum_of(self.default_lengths)
@@ -260,8 +261,7 @@ class Body:
 
     def relative_joints(self, poses: ArrayLike) -> Array:
         """Joints (N, J, 3) of poses (N, d) relative to the first, m, for comparisons of poses."""
-        joints = self.joint_positions(poses)
-        return joints - joints[:, :1]
+        return kinematics.joint_positions(self.skeleton, poses, relative=True)
 
     def joint_jacobians(self, poses: ArrayLike) -> Array:
         """Derivatives (N, J, 3, d) of the joint positions with respect to the poses (N, d)."""
@@ -300,6 +300,18 @@ class Body:
         """
         return replace(self, growth=np.asarray(growth, dtype=np.float64))
 
+    def with_beliefs(
+        self, *, prior_sigma: Array | None = None, joint_errors: Array | None = None
+    ) -> Body:
+        """The same body with another prior or other errors, which leave its flesh as it is."""
+        result = replace(
+            self,
+            prior_sigma=self.prior_sigma if prior_sigma is None else prior_sigma,
+            joint_errors=self.joint_errors if joint_errors is None else joint_errors,
+        )
+        result.__dict__['flesh'] = self.flesh
+        return result
+
     def levelled(self, level: Array) -> Body:
         """The same body, with the angles of the root measured against other axes.
 
@@ -313,7 +325,7 @@ class Body:
         if np.array_equal(level, self.level) or not {*ROOT_ANGLES} <= {*self.dof_names}:
             return self
         mounts = self.skeleton.mounts.copy()
-        mounts[0] = level @ self.level.T @ mounts[0]
+        mounts[0] = product(product(level, self.level.T), mounts[0])
         return replace(self, skeleton=replace(self.skeleton, mounts=mounts), level=level)
 
     def _sum_of(self, lengths: Array) -> float:
@@ -346,24 +358,19 @@ class Symmetry:
         if not 0.0 < self.rate < math.inf:
             raise ValueError(f'the rate of a symmetry must be positive, saw {self.rate} 1/s')
 
-    @cached_property
-    def chain(self) -> MarkovChain:
-        """The pose and the mapped one, as two states."""
-        return MarkovChain.of_two(self.rate, self.rate)
-
     def probability(self, dt: float) -> float:
         """p(dt) that the mapped pose is the one dt seconds later, (1)."""
-        return float(self.chain.transition(dt)[0, 1])
+        return float(-0.5 * elementary.expm1(-2.0 * self.rate * dt))
 
     def price(self, dt: float) -> float:
         """-log p(dt), nats; of no time it is infinite."""
-        return -math.log(self.probability(dt)) if dt > 0.0 else math.inf
+        return -float(elementary.log(self.probability(dt))) if dt > 0.0 else math.inf
 
     def after(self, log_odds: float, dt: float) -> float:
         """Log odds of the mapped pose dt seconds later."""
-        p = 1.0 / (1.0 + math.exp(-log_odds))
+        p = 1.0 / (1.0 + float(elementary.exp(-log_odds)))
         p += self.probability(dt) * (1.0 - 2.0 * p)
-        return math.log(p) - math.log1p(-p)
+        return float(elementary.log(p) - elementary.log1p(-p))
 
 
 def symmetries_of(entries: Mapping[str, Any]) -> Mapping[str, Symmetry]:

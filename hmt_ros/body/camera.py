@@ -17,7 +17,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import product
 
 # Number of coefficients of each model of sensor_msgs/distortion_models.
 DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
@@ -37,7 +39,8 @@ STEEP = 0.1
 STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
 # Tangents at which a distortion is checked, and the largest factor by which a lens magnifies more
 # farther out: calibrations of real lenses reach 2.5, at the corners of wide images.
-CHECKED = np.tan(0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2)
+_TURNS = 0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2
+CHECKED = elementary.sin(_TURNS) / elementary.cos(_TURNS)
 LARGEST_RISE = 4.0
 # Part of the way from the principal point to a corner on which a distortion must not fold. The ends
 # of the longer side lie there; polynomials of real calibrations may fold farther out.
@@ -225,7 +228,7 @@ class Camera:
         k1, k2, k3, k4 = self.distortion
         r = np.sqrt(a * a + b * b)
         safe = np.maximum(r, 1e-12)
-        theta = np.arctan(r)
+        theta = elementary.arctan(r)
         t = theta * theta
         bent = theta * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
         d_bent = 1 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + t * 9 * k4)))
@@ -282,13 +285,18 @@ def shortest_turn(start: Array, end: Array) -> Array:
     For opposite vectors in the plane of the image, where no rotation is the shortest, it is the one
     about the optical axis, as when the camera hangs upside down.
     """
-    cosine = float(start @ end)
+    cosine = float(product(start, end))
     if cosine <= -1.0 + 1e-9:
         return np.diag([-1.0, -1.0, 1.0])
     x, y, z = np.cross(start, end)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    result: Array = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+    result: Array = np.eye(3) + cross + product(cross, cross) / (1.0 + cosine)
     return result
+
+
+def tangent(angle: float) -> float:
+    """Tangent of an angle, rad."""
+    return float(elementary.sin(angle) / elementary.cos(angle))
 
 
 def log_prior_of_distance(camera: Camera, distance: float) -> float:
@@ -296,8 +304,8 @@ def log_prior_of_distance(camera: Camera, distance: float) -> float:
 
     Log-normal, and wide: it is a prior, and limits nothing.
     """
-    lens = camera.fx / (0.5 * camera.width / math.tan(0.5 * USUAL_LENS))
+    lens = camera.fx / (0.5 * camera.width / tangent(0.5 * USUAL_LENS))
     middle = math.sqrt(NEAREST_PERSON * FARTHEST_PERSON)
     # Two standard deviations on either side.
-    sigma = math.log(FARTHEST_PERSON / NEAREST_PERSON) / 4.0
-    return -0.5 * (math.log(max(distance, 1e-3) / (lens * middle)) / sigma) ** 2
+    sigma = float(elementary.log(FARTHEST_PERSON / NEAREST_PERSON)) / 4.0
+    return -0.5 * (float(elementary.log(max(distance, 1e-3) / (lens * middle))) / sigma) ** 2

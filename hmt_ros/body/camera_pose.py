@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from hmt_ros.body.camera import AXES, Camera
+from hmt_ros.body.rotations import rotation_vectors, rotations_of
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import determinant, length, product
 
 # Largest difference of an entry of R R' from the identity for R to be a rotation.
 NOT_ORTHOGONAL = 1e-3
@@ -42,8 +43,8 @@ class CameraPose(NamedTuple):
             )
         if (
             turn.shape != AXES.shape
-            or not np.abs(turn @ turn.T - AXES).max() < NOT_ORTHOGONAL
-            or np.linalg.det(turn) < 0
+            or not np.abs(product(turn, turn.T) - AXES).max() < NOT_ORTHOGONAL
+            or determinant(turn) < 0
         ):
             raise ValueError(
                 f'the rotation of the camera must be a rotation matrix (3, 3), saw {turn.tolist()}'
@@ -56,12 +57,12 @@ class CameraPose(NamedTuple):
 
     def shift(self, other: CameraPose, camera: Camera) -> float:
         """About how far the images of still points are apart from the two poses, px."""
-        angle = Rotation.from_matrix(self.rotation.T @ other.rotation).magnitude()
-        apart = float(np.linalg.norm(self.position - other.position))
+        angle = length(rotation_vectors(product(self.rotation.T, other.rotation)))
+        apart = length(self.position - other.position)
         return float(max(camera.fx, camera.fy) * (angle + apart / USUAL_DISTANCE))
 
     def towards(self, other: CameraPose, share: float) -> CameraPose:
         """The pose at a share of the constant motion to another pose; 0: here, 1: there."""
-        turn = Rotation.from_matrix(self.rotation.T @ other.rotation).as_rotvec()
-        rotation = self.rotation @ Rotation.from_rotvec(share * turn).as_matrix()
+        turn = rotation_vectors(product(self.rotation.T, other.rotation))
+        rotation = product(self.rotation, rotations_of(share * turn))
         return CameraPose(rotation, self.position + share * (other.position - self.position))

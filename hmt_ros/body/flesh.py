@@ -21,12 +21,13 @@ and e2 = 1 it has a closed form (`image.surface` solves it).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
+from hmt_ros.core import elementary, fill_rings, fill_surface
 from hmt_ros.inference.arrays import Array, Index
 
 
@@ -78,38 +79,23 @@ class Rings:
     exponent: Array
 
 
-def _rings(parts: Sequence[Superquadric], s: Array) -> tuple[Array, Array, Array, Array]:
-    """Centres (P, R, 3), radii, slopes and leans (P, R, 2) of P parts at heights s (R,)."""
-    radii, taper, bend, middle = (
-        np.array([getattr(part, name) for part in parts])[:, None]
-        for name in ('radii', 'taper', 'bend', 'centre')
-    )
-    power = 2.0 / np.array([part.exponents[0] for part in parts])[:, None, None]
-    az, s = radii[..., 2:], s[:, None]
-    inside = 1.0 - np.abs(s) ** power
-    # d log(profile) / ds
-    steep = -np.sign(s) * np.abs(s) ** (power - 1.0) / inside
-    widening = 1.0 + taper * s
-    radius = radii[..., :2] * inside ** (1.0 / power) * widening
-    slope = -(steep + taper / widening) / az
-    centre = np.concatenate([middle[..., :2] + bend * (1.0 - s * s), middle[..., 2:] - az * s], -1)
-    return centre, radius, slope, 2.0 * bend * s / az
+class Superquadrics(NamedTuple):
+    """P parts as the core reads them: arrays (P, 3) and (P, 2) of the attributes of each."""
+
+    centres: Array
+    radii: Array
+    exponents: Array
+    tapers: Array
+    bends: Array
 
 
-def surfaces(parts: Sequence[Superquadric], s: Array, w: Array) -> tuple[Array, Array]:
-    """Points and outward unit normals (P, R, 3) of P parts at heights s in (-1, 1) and angles w.
+def surfaces(parts: Superquadrics, s: Array, w: Array) -> tuple[Array, Array]:
+    """Points and outward unit normals (P, R + 2, 3) of P parts: at R heights and angles, and tips.
 
-    s, w: (R,).
+    s, w: (R,), with heights in (-1, 1).
     """
-    centre, radius, slope, lean = _rings(parts, s)
-    e2 = np.array([part.exponents[1] for part in parts])[:, None, None]
-    around = np.stack([np.cos(w), np.sin(w)], axis=1)
-    points = centre
-    points[..., :2] += radius * signed_power(around, e2)
-    lateral = signed_power(around, 2.0 - e2) / radius
-    along = -(slope * around**2 + lateral * lean).sum(-1)
-    normals = np.concatenate([lateral, along[..., None]], axis=-1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    points, normals = np.empty((2, len(parts.radii), len(s) + 2, 3))
+    fill_surface(parts, s, elementary.cos(w), elementary.sin(w), points, normals)
     return points, normals
 
 
@@ -132,15 +118,24 @@ class Flesh:
             raise ValueError(f'{len(self.ring_count)} ring counts for {len(self.parts)} parts')
 
     @cached_property
+    def table(self) -> Superquadrics:
+        """The parts as the core reads them."""
+        names, sizes = ('centre', 'radii', 'exponents', 'taper', 'bend'), (3, 3, 2, 2, 2)
+        return Superquadrics(
+            *(
+                np.array([getattr(part, name) for part in self.parts], np.float64).reshape(-1, size)
+                for name, size in zip(names, sizes, strict=True)
+            )
+        )
+
+    @cached_property
     def rings(self) -> Rings:
         """Rings of all parts, one part after the other."""
-        stacks = [
-            [x[0] for x in _rings((part,), np.sin(np.linspace(-0.42, 0.42, n) * np.pi))]
-            for part, n in zip(self.parts, self.ring_count, strict=True)
-        ]
-        exponents = np.repeat([part.exponents[1] for part in self.parts], self.ring_count)
-        centre, radius, slope, lean = map(np.concatenate, zip(*stacks, strict=True))
-        return Rings(centre, radius, slope, lean, exponents)
+        count = len(self.ring_parts)
+        centre, (radius, slope, lean) = np.empty((count, 3)), np.empty((3, count, 2))
+        heights = np.concatenate([np.zeros(0), *map(_ring_heights, self.ring_count)])
+        fill_rings(self.table, self.ring_parts, heights, centre, radius, slope, lean)
+        return Rings(centre, radius, slope, lean, self.table.exponents[self.ring_parts, 1])
 
     @cached_property
     def ring_parts(self) -> Index:
@@ -157,8 +152,8 @@ class Flesh:
 
     def points_on(self, segment: int, stacks: int = 9, slices: int = 12) -> Array:
         """Vertices (V, 3) of the same mesh that one segment carries, m."""
-        own = tuple(part for part in self.parts if part.segment == segment)
-        return Flesh(own).mesh(stacks, slices).vertices
+        own = Flesh(tuple(part for part in self.parts if part.segment == segment))
+        return surfaces(own.table, *_grid(stacks, slices))[0].reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,12 +174,6 @@ class Mesh:
     triangles: Index
 
 
-def signed_power(x: Array, exponent: Array | float) -> Array:
-    """sgn(x) |x|^exponent."""
-    result: Array = np.sign(x) * np.abs(x) ** exponent
-    return result
-
-
 @lru_cache(maxsize=32)
 def _triangles(stacks: int, slices: int) -> Index:
     """Triangles (F, 3) of one part."""
@@ -202,21 +191,23 @@ def _triangles(stacks: int, slices: int) -> Index:
     return np.array(body, dtype=np.intp)
 
 
+@lru_cache(maxsize=32)
+def _ring_heights(count: int) -> Array:
+    return np.asarray(elementary.sin(np.linspace(-0.42, 0.42, count) * np.pi))
+
+
+@lru_cache(maxsize=32)
+def _grid(stacks: int, slices: int) -> tuple[Array, Array]:
+    """Heights and angles of the vertices of a part."""
+    s = elementary.sin(np.linspace(-0.46, 0.46, stacks) * np.pi)
+    return np.repeat(s, slices), np.tile(np.arange(slices) * (2 * np.pi / slices), stacks)
+
+
 @lru_cache(maxsize=16)
 def _mesh(flesh: Flesh, stacks: int, slices: int) -> Mesh:
     parts, triangles = flesh.parts, _triangles(stacks, slices)
-    s = np.sin(np.linspace(-0.46, 0.46, stacks) * np.pi)
-    w = np.arange(slices) * (2 * np.pi / slices)
-    grid_s, grid_w = (x.ravel() for x in np.meshgrid(s, w, indexing='ij'))
-    count = stacks * slices + 2
-    vertices, normals = np.empty((2, len(parts), count, 3))
-    if parts:
-        vertices[:, :-2], normals[:, :-2] = surfaces(parts, grid_s, grid_w)
-    tip = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    for i, part in enumerate(parts):
-        vertices[i, -2:] = part.centre + part.radii[2] * tip
-        normals[i, -2:] = tip
-    which = np.arange(len(parts))
+    vertices, normals = surfaces(flesh.table, *_grid(stacks, slices))
+    which, count = np.arange(len(parts)), stacks * slices + 2
     return Mesh(
         vertices.reshape(-1, 3),
         normals.reshape(-1, 3),

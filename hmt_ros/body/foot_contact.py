@@ -15,11 +15,13 @@ in time (`hmt_ros.inference.error_model`), and the errors of images that are clo
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import expit, logit
 
 from hmt_ros.body.ground_terms import FloorPlane
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS, share_of_time
+from hmt_ros.inference.linear_algebra import product
+from hmt_ros.inference.logistic import log_odds, probability_of
 from hmt_ros.inference.markov_chain import MarkovChain
 
 # Rates at which a resting foot leaves the floor, and another comes to rest: those of walking, 1/s.
@@ -37,7 +39,7 @@ REST_HIGH, LIFT = 0.04, 0.25
 
 def first_contacts(plane: FloorPlane, points: Array) -> Array:
     """Probabilities (K, P) that points (K, P, 3) of soles rest, of which nothing was known."""
-    return np.asarray(expit(logit(CONTACT.usual[1]) + _height_evidence(plane, points)))
+    return probability_of(log_odds(CONTACT.usual[1]) + _height_evidence(plane, points))
 
 
 def contacts(
@@ -56,11 +58,11 @@ def contacts(
     prior = CONTACT.closed(rested, dt)
     evidence = _height_evidence(plane, points)
     if still:
-        stayed = rested * np.exp(-LEAVES * dt) / prior
+        stayed = rested * elementary.exp(-LEAVES * dt) / prior
         moved = _motion_evidence(before, points, dt)
-        evidence += np.log1p(stayed * np.expm1(moved))
+        evidence += elementary.log1p(stayed * elementary.expm1(moved))
     share = share_of_time(dt, ERRORS['image'].time)
-    return np.asarray(expit(logit(prior) + share * evidence))
+    return probability_of(log_odds(prior) + share * evidence)
 
 
 def _height_evidence(plane: FloorPlane, points: Array) -> Array:
@@ -68,8 +70,8 @@ def _height_evidence(plane: FloorPlane, points: Array) -> Array:
     if plane.height is None:
         return np.zeros(points.shape[:2])
     sigma = np.hypot(REST_HIGH, plane.height_sigma)
-    z = (points @ plane.up + plane.height) / sigma
-    result: Array = -0.5 * z * z - np.log(np.sqrt(2.0 * np.pi) * sigma / LIFT)
+    z = (product(points, plane.up) + plane.height) / sigma
+    result: Array = -0.5 * z * z - elementary.log(np.sqrt(2.0 * np.pi) * sigma / LIFT)
     return result
 
 
@@ -79,10 +81,12 @@ def _motion_evidence(before: Array, points: Array, dt: float) -> Array:
     moved = points - before
     along = (moved * ray).sum(2)
     across = (moved * moved).sum(2) - along**2
-    differs = np.sqrt(-np.expm1(-dt / ERRORS['image'].time))
+    differs = np.sqrt(-elementary.expm1(-dt / ERRORS['image'].time))
     result = np.zeros(points.shape[:2])
     for square, axes, error in ((across, 2, REST_ACROSS), (along**2, 1, REST_ALONG)):
         rest = error * differs
         free = np.hypot(rest, FREE_SPEED * dt)
-        result += axes * np.log(free / rest) - 0.5 * square * (rest**-2 - free**-2)
+        result += axes * elementary.log(free / rest) - 0.5 * square * (
+            1.0 / (rest * rest) - 1.0 / (free * free)
+        )
     return result

@@ -19,7 +19,7 @@ lengths, are those of [Winter, Biomechanics and Motor Control of Human Movement,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -27,9 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import Frames, forward, point_jacobians
-from hmt_ros.body.skeleton import other_side
+from hmt_ros.body.flesh import Flesh
+from hmt_ros.body.kinematics import Frames, forward, point_jacobians, point_positions
+from hmt_ros.body.skeleton import Skeleton, other_side
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 
 # Mean lean forwards of trunk and pelvis, and the deviations sideways and forwards or back, rad.
 # People differ: from hips to neck the clips lean from 9 degrees back to 9 forwards in the mean. The
@@ -145,22 +148,22 @@ class GroundTerm:
         """As compiled code reads it."""
         body, plane = self.body, self.plane
         skeleton, feet = body.skeleton, soles(body)
-        upright = upright_segments(body)
+        upright = upright_segments(skeleton)
         weights = self.settings.weights
         weights[0] *= len(upright.segments) > 0
         weights[1] *= len(feet) > 0 and plane.height is not None and plane.measured
-        lean = np.hypot(upright.sigma, plane.up_sigma)
-        floor = float(np.hypot(FLOOR_SIGMA, plane.height_sigma))
+        lean = elementary.hypot(upright.sigma, plane.up_sigma)
+        floor = float(elementary.hypot(FLOOR_SIGMA, plane.height_sigma))
         return Constants(
-            np.array(skeleton.dof_is_rotation),
+            skeleton.dof_is_rotation,
             skeleton.moves,
             weights,
             np.asarray(plane.up, dtype=np.float64).copy(),
             0.0 if plane.height is None else float(plane.height),
-            upright.segments.astype(np.int64),
+            upright.segments,
             upright.axes,
             lean,
-            feet.segments.astype(np.int64),
+            feet.segments,
             feet.local,
             0.0 if plane.height is None else 1.0 / floor,
             LEAN_TAILS,
@@ -184,16 +187,14 @@ class Upright(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def upright_segments(body: Body) -> Upright:
-    """Pelvis and trunk of a body whose root turns about z, y and x; nothing of another."""
-    if not len(_root_turns(body)) or 'neck' not in body.joint_names:
+def upright_segments(skeleton: Skeleton) -> Upright:
+    """Pelvis and trunk of a skeleton whose root turns about z, y and x; nothing of another."""
+    if not len(_root_turns(skeleton)) or 'neck' not in skeleton.joint_names:
         return Upright(np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)))
-    skeleton = body.skeleton
     neck = skeleton.joint_index(('neck',))[0]
     trunk = skeleton.parents[skeleton.joint_segments[neck]]
-    frames = forward(skeleton, np.zeros((1, body.dimension)))
-    columns = frames.columns[..., 0]
-    spine = frames.joints()[neck, :, 0] - frames.origins[max(trunk, 0), :, 0]
+    columns, origins, joints = _at_rest(skeleton)
+    spine = joints[neck] - origins[max(trunk, 0)]
     known = [(trunk, spine, TRUNK_LEAN, TRUNK_SIGMA)]
     if skeleton.segment_dofs[trunk]:
         known.append((0, columns[0, 2], PELVIS_LEAN, PELVIS_SIGMA))
@@ -204,6 +205,14 @@ def upright_segments(body: Body) -> Upright:
     )
 
 
+@lru_cache(maxsize=16)
+def _at_rest(skeleton: Skeleton) -> tuple[Array, Array, Array]:
+    """Columns (S, 3, 3), origins (S, 3) and joints (J, 3) where all angles are 0."""
+    frames = forward(skeleton, np.zeros((1, skeleton.dimension)))
+    (columns,), (origins,) = frames.segments
+    return columns, origins, frames.joints()[..., 0]
+
+
 def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
     """Axes (3, 3) in the frame of a segment: to the side, ahead and up.
 
@@ -212,23 +221,31 @@ def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
         along: (3,) its long axis upwards, as the columns.
         lean: how far the long axis leans forwards where the person stands as usual, rad.
     """
-    up = along / np.linalg.norm(along)
-    ahead = columns[0, 1] - up * float(up @ columns[0, 1])
-    ahead /= np.linalg.norm(ahead)
-    up, ahead = np.cos(lean) * up - np.sin(lean) * ahead, np.cos(lean) * ahead + np.sin(lean) * up
-    result: Array = np.array([np.cross(ahead, up), ahead, up]) @ columns[segment].T
-    return result
+    up = unit(along)
+    ahead = _across(columns[0, 1], up)
+    sine, cosine = elementary.sin(lean), elementary.cos(lean)
+    up, ahead = cosine * up - sine * ahead, cosine * ahead + sine * up
+    return np.asarray(product([np.cross(ahead, up), ahead, up], columns[segment].T))
+
+
+def unit(vectors: Array) -> Array:
+    """Vectors (..., 3) of length 1."""
+    return np.asarray(vectors / np.sqrt((vectors * vectors).sum(-1, keepdims=True)))
+
+
+def _across(vector: Array, axis: Array) -> Array:
+    """The direction (3,) of a vector across a unit vector."""
+    return unit(vector - axis * (axis * vector).sum())
 
 
 def root_lean_dofs(body: Body) -> Index:
     """The rotations of the root with a prior (L,): how far it leans, against the camera."""
-    turns = _root_turns(body)
+    turns = _root_turns(body.skeleton)
     return np.asarray(turns[np.isfinite(body.prior_sigma[turns])], dtype=np.intp)
 
 
-def _root_turns(body: Body) -> Index:
+def _root_turns(skeleton: Skeleton) -> Index:
     """The rotations of the root if they are those about z, y and x (3,); else none."""
-    skeleton = body.skeleton
     root = np.array(skeleton.segment_dofs[0], dtype=np.intp)
     turns = root[skeleton.dof_is_rotation[root]]
     names = [skeleton.dof_names[i] for i in turns]
@@ -242,7 +259,7 @@ def without_root_lean(body: Body) -> Body:
         return body
     sigma = body.prior_sigma.copy()
     sigma[lean] = np.inf
-    return replace(body, prior_sigma=sigma)
+    return body.with_beliefs(prior_sigma=sigma)
 
 
 FEET = ('left', 'right')
@@ -269,25 +286,29 @@ class Soles:
         return len(self.segments)
 
 
-@lru_cache(maxsize=16)
 def soles(body: Body) -> Soles:
     """The soles of a body; none where it lacks an ankle or a toe of either side."""
-    names = body.joint_names
+    return _soles(body.skeleton, body.flesh, body.stature)
+
+
+@lru_cache(maxsize=16)
+def _soles(skeleton: Skeleton, flesh: Flesh, stature: float) -> Soles:
     wanted = [f'{side}_{joint}' for side in FEET for joint in ('ankle', 'toe')]
-    if not set(wanted) <= set(names):
+    if not set(wanted) <= set(skeleton.joint_names):
         return Soles(np.zeros(0, dtype=np.intp), np.zeros((0, 3)))
-    joints = body.skeleton.joint_index(tuple(wanted)).reshape(2, 2)
+    joints = skeleton.joint_index(tuple(wanted)).reshape(2, 2)
     segments, local = [], []
+    sine, cosine = elementary.sin(PITCH), elementary.cos(PITCH)
     for ankle, toe in joints:
-        carrier = int(body.skeleton.joint_segments[toe])
-        down, ahead = _down_and_ahead(body, ankle, toe, carrier)
-        points = body.flesh.points_on(carrier)
+        carrier = int(skeleton.joint_segments[toe])
+        down, ahead = _down_and_ahead(skeleton, ankle, toe, carrier)
+        points = flesh.points_on(carrier)
         if not len(points):
-            own = body.skeleton.joint_offsets[toe]
-            heel = own - ahead * float(ahead @ own)
-            points = np.array([heel, own]) + ANKLE_HEIGHT * body.stature * down
+            own = skeleton.joint_offsets[toe]
+            heel = own - ahead * (ahead * own).sum()
+            points = np.array([heel, own]) + ANKLE_HEIGHT * stature * down
         for sign in (-1.0, 1.0):
-            lowest = points @ (np.cos(PITCH) * down + sign * np.sin(PITCH) * ahead)
+            lowest = product(points, cosine * down + sign * sine * ahead)
             # The middle of the equally low points: left and right of the middle line.
             local.append(points[lowest > lowest.max() - 1e-6].mean(0))
             segments.append(carrier)
@@ -297,8 +318,7 @@ def soles(body: Body) -> Soles:
 def sole_points(body: Body, poses: Array) -> Array:
     """Points (N, P, 3) of the soles of poses (N, d), camera frame, m."""
     feet = soles(body)
-    points = forward(body.skeleton, poses).points(feet.segments, feet.local)
-    return np.ascontiguousarray(points.transpose(2, 0, 1))
+    return point_positions(body.skeleton, poses, feet.segments, feet.local)
 
 
 def sole_jacobians(body: Body, poses: Array) -> Array:
@@ -308,20 +328,15 @@ def sole_jacobians(body: Body, poses: Array) -> Array:
     return np.ascontiguousarray(found.transpose(3, 0, 2, 1))
 
 
-def _down_and_ahead(body: Body, ankle: int, toe: int, carrier: int) -> tuple[Array, Array]:
+def _down_and_ahead(skeleton: Skeleton, ankle: int, toe: int, carrier: int) -> tuple[Array, Array]:
     """Unit vectors towards the sole and the toe, in the frame of the foot.
 
     Towards the sole is where the shin points when all angles are 0, across the foot.
     """
-    skeleton = body.skeleton
-    frames = forward(skeleton, np.zeros((1, body.dimension)))
-    joints, axes = frames.joints()[..., 0], frames.columns[carrier, ..., 0]
-    parent = skeleton.parents[carrier]
-    ahead = axes @ (joints[toe] - joints[ankle])
-    ahead /= np.linalg.norm(ahead)
-    shin = axes @ (joints[ankle] - frames.origins[parent, :, 0])
-    down = shin - ahead * float(ahead @ shin)
-    return down / np.linalg.norm(down), ahead
+    columns, origins, joints = _at_rest(skeleton)
+    shin = joints[ankle] - origins[skeleton.parents[carrier]]
+    ahead = unit(product(columns[carrier], joints[toe] - joints[ankle]))
+    return _across(product(columns[carrier], shin), ahead), ahead
 
 
 # By segment without its side: share of the mass, share of the way from its start to its end.
@@ -358,16 +373,14 @@ class Masses:
         return bool(self.shares.any())
 
     def centre_of_mass(self, frames: Frames) -> Array:
-        """Centres of mass (3, N) of poses, camera frame, m."""
-        every = np.arange(len(self.shares))
-        result: Array = np.einsum('s,sin->in', self.shares, frames.points(every, self.centres))
-        return result
+        """Centres of mass (N, 3) of poses, camera frame, m."""
+        places = frames.places(np.arange(len(self.shares)), self.centres)
+        return np.asarray(product(self.shares, places))
 
 
 @lru_cache(maxsize=16)
-def masses(body: Body) -> Masses:
-    """The masses of a body whose segments have the names of `SHARES`; else none are known."""
-    skeleton = body.skeleton
+def masses(skeleton: Skeleton) -> Masses:
+    """The masses of a skeleton with segments of the names in `SHARES`; else none are known."""
     count = len(skeleton.parents)
     shares, centres = np.zeros(count), np.zeros((count, 3))
     for s, name in enumerate(skeleton.segment_names):
@@ -375,18 +388,17 @@ def masses(body: Body) -> Masses:
         if bare not in SHARES:
             continue
         shares[s], way = SHARES[bare]
-        centres[s] = way * _end(body, s)
+        centres[s] = way * _end(skeleton, s)
     if shares.sum() < LEAST_SHARE:
         return Masses(np.zeros(count), centres)
     return Masses(shares / shares.sum(), centres)
 
 
-def _end(body: Body, segment: int) -> Array:
+def _end(skeleton: Skeleton, segment: int) -> Array:
     """Where a segment ends (3,): its farthest joint, or where the next segment starts, m."""
-    skeleton = body.skeleton
     ends = [np.zeros(3), *skeleton.joint_offsets[skeleton.joint_segments == segment]]
     children = [s for s, parent in enumerate(skeleton.parents) if parent == segment]
     # Of several segments that start here, the middle: both shoulders, or the neck between them.
     if children:
         ends.append(np.mean([skeleton.offsets[s] for s in children], axis=0))
-    return np.asarray(max(ends, key=lambda end: float(end @ end)), dtype=np.float64)
+    return np.asarray(max(ends, key=lambda end: float((end * end).sum())), dtype=np.float64)

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward, point_jacobians
-from hmt_ros.core import find_not_held
+from hmt_ros.core import elementary, find_not_held
 from hmt_ros.inference.arrays import Array, Index, Mask
+from hmt_ros.inference.linear_algebra import product, symmetric_eigen
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Error of the body model in its tails, m.
@@ -104,7 +104,10 @@ class Capsules:
         side /= np.linalg.norm(side, axis=1, keepdims=True)
         other = np.cross(along, side)
         angles = np.arange(8) * (np.pi / 4)
-        ring = np.cos(angles)[:, None] * side[:, None] + np.sin(angles)[:, None] * other[:, None]
+        ring = (
+            elementary.cos(angles)[:, None] * side[:, None]
+            + elementary.sin(angles)[:, None] * other[:, None]
+        )
         ring *= self.radii[:, None, None]
         places = self.starts[:, None] + np.array([0.0, 0.5, 1.0])[:, None] * axes[:, None]
         around = (places[:, :, None] + ring[:, None]).reshape(len(self), -1, 3)
@@ -137,13 +140,13 @@ def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float =
     some = mixture.sorted().normalised()
     count = int(np.searchsorted(np.cumsum(some.weights), probability)) + 1
     some = some[np.arange(min(count, len(some)))]
-    wide = float(np.sqrt(chdtri(3, 1.0 - probability)))
+    wide = _radius(probability)
     segments, local, radii = _parts(body)
     frames = forward(body.skeleton, some.means)
     ends = frames.points(segments, local)
     jacobians = point_jacobians(frames, segments, ends).transpose(3, 0, 2, 1)
-    spread = jacobians @ some.covariances[:, None] @ jacobians.swapaxes(2, 3)
-    variances, directions = np.linalg.eigh(spread)
+    spread = product(product(jacobians, some.covariances[:, None]), jacobians.swapaxes(2, 3))
+    variances, directions = symmetric_eigen(spread)
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     # (K, B, 2, ...): both ends of each part.
     places = ends.transpose(2, 0, 1).reshape(len(some), -1, 2, 3)
@@ -189,3 +192,19 @@ def _parts(body: Body) -> tuple[Index, Array, Array]:
             ends += [skeleton.joint_offsets[joint] for joint in joints]
             radii.append(BARE)
     return np.array(segments, dtype=np.intp), np.array(ends), np.array(radii)
+
+
+def _radius(probability: float) -> float:
+    """Length that a vector of three standard normal numbers does not exceed, with a probability.
+
+    P(x) = sqrt(2 / pi) exp(-x^2 / 2) sum_k x^(2 k + 3) / (1 3 5 ... (2 k + 3))
+    """
+    low, high = 0.0, 9.0
+    while low < (x := 0.5 * (low + high)) < high:
+        term, total, k = x * x * x / 3.0, 0.0, 3
+        while total + term > total:
+            total, k = total + term, k + 2
+            term *= x * x / k
+        mass = np.sqrt(2.0 / np.pi) * elementary.exp(-0.5 * x * x) * total
+        low, high = (x, high) if mass < probability else (low, x)
+    return high

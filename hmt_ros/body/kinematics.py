@@ -17,15 +17,16 @@ with s_j the twist of degree of freedom j and F_j, K_j the sums over all that j 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.skeleton import Skeleton
-from hmt_ros.core import derive_along, lift_origins, place_joints, place_poses
+from hmt_ros.core import derive_along, lift_origins, place_points, place_poses
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,23 +36,41 @@ class Frames:
     Attributes:
         skeleton: the skeleton.
         poses: (N, d) whose frames they are.
-        columns: (S, 3, 3, N): columns[s, i, :, n] is the i-th axis of segment s.
-        origins: (S, 3, N) origins of the segments.
-        axes: (d, 3, N) unit vector of each degree of freedom.
-        dof_origins: (d, 3, N) a point on the axis of each rotation.
+        segments: columns (N, S, 3, 3) and origins (N, S, 3): columns[n, s, i] is the i-th axis of
+            segment s.
+        dofs: unit vectors of the degrees of freedom, and points on the axes of rotations,
+            (N, d, 3).
     """
 
     skeleton: Skeleton
     poses: Array
-    columns: Array
-    origins: Array
-    axes: Array
-    dof_origins: Array
+    segments: tuple[Array, Array]
+    dofs: tuple[Array, Array]
 
     @property
     def count(self) -> int:
         """Number of poses, N."""
-        return int(self.origins.shape[-1])
+        return len(self.poses)
+
+    @cached_property
+    def columns(self) -> Array:
+        """The axes of the segments, (S, 3, 3, N)."""
+        return _poses_last(self.segments[0])
+
+    @cached_property
+    def origins(self) -> Array:
+        """The origins of the segments, (S, 3, N)."""
+        return _poses_last(self.segments[1])
+
+    @cached_property
+    def axes(self) -> Array:
+        """The unit vectors of the degrees of freedom, (d, 3, N)."""
+        return _poses_last(self.dofs[0])
+
+    @cached_property
+    def dof_origins(self) -> Array:
+        """Points on the axes of rotations, (d, 3, N)."""
+        return _poses_last(self.dofs[1])
 
     def points(self, segments: Index, local: Array) -> Array:
         """Points given in segment frames, in the camera frame.
@@ -71,6 +90,12 @@ class Frames:
         result += c[:, 2] * local[:, 2, None]
         result += self.origins[segments]
         return result
+
+    def places(self, segments: Index, local: Array) -> Array:
+        """Points (N, P, 3) given in segment frames (P, 3), in the camera frame, pose by pose, m."""
+        columns, origins = self.segments
+        turned = product(local[:, None], columns[:, segments])[..., 0, :]
+        return np.asarray(origins[:, segments] + turned)
 
     def directions(self, segments: Index, local: Array) -> Array:
         """Directions given in segment frames (P, 3), in the camera frame, (P, 3, N)."""
@@ -94,21 +119,15 @@ class Frames:
 
     def by_pose(self) -> tuple[Array, Array]:
         """Columns (N, S, 3, 3) and origins (N, S, 3), pose by pose in memory."""
-        return (
-            np.ascontiguousarray(self.columns.transpose(3, 0, 1, 2)),
-            np.ascontiguousarray(self.origins.transpose(2, 0, 1)),
-        )
+        return self.segments
 
     def dofs_by_pose(self) -> tuple[Array, Array]:
         """Axes and points on them (N, d, 3) of the degrees of freedom, pose by pose in memory."""
-        return (
-            np.ascontiguousarray(self.axes.transpose(2, 0, 1)),
-            np.ascontiguousarray(self.dof_origins.transpose(2, 0, 1)),
-        )
+        return self.dofs
 
     def rotations(self) -> Array:
         """Rotation matrices (N, S, 3, 3) from the segments' frames to the camera frame."""
-        return np.ascontiguousarray(self.columns.transpose(3, 0, 2, 1))
+        return np.ascontiguousarray(self.segments[0].swapaxes(2, 3))
 
 
 def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
@@ -119,37 +138,55 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     """
     q = _checked(skeleton, poses)
     n, s, d = len(q), len(skeleton.parents), skeleton.dimension
-    placed = np.empty((n, s, 3, 3)), np.empty((n, s, 3)), np.empty((n, d, 3)), np.zeros((n, d, 3))
-    place_poses(placing_of(skeleton), q, *placed)
-    return Frames(skeleton, q, *(np.ascontiguousarray(np.moveaxis(x, 0, -1)) for x in placed))
+    segments, dofs = (np.empty((n, s, 3, 3)), np.empty((n, s, 3))), np.zeros((2, n, d, 3))
+    place_poses(placing_of(skeleton), q, *segments, *dofs)
+    return Frames(skeleton, q, segments, (dofs[0], dofs[1]))
 
 
-def joint_positions(skeleton: Skeleton, poses: ArrayLike) -> Array:
-    """Joint positions (N, J, 3) of poses (N, d), camera frame, m.
+def joint_positions(skeleton: Skeleton, poses: ArrayLike, *, relative: bool = False) -> Array:
+    """Joint positions (N, J, 3) of poses (N, d), camera frame or relative to the first joint, m.
+
+    Raises:
+        ValueError: as `forward`.
+    """
+    return point_positions(
+        skeleton, poses, skeleton.joint_segments, skeleton.joint_offsets, relative=relative
+    )
+
+
+def point_positions(
+    skeleton: Skeleton, poses: ArrayLike, segments: Index, local: Array, *, relative: bool = False
+) -> Array:
+    """Positions (N, P, 3) of points on segments (P,) at places there (P, 3) at poses (N, d), m.
+
+    Args:
+        relative: to the first point, instead of in the camera frame.
 
     Raises:
         ValueError: as `forward`.
     """
     q = _checked(skeleton, poses)
-    result = np.empty((len(q), len(skeleton.joint_segments), 3))
-    place_joints(placing_of(skeleton), q, skeleton.joint_segments, skeleton.joint_offsets, result)
+    result = np.empty((len(q), len(segments), 3))
+    place_points(placing_of(skeleton), q, segments, local, relative, result)
     return result
 
 
 def _checked(skeleton: Skeleton, poses: ArrayLike) -> Array:
-    """Poses (N, d) as an array.
+    """Poses (N, d) as an array; the core checks that they are finite.
 
     Raises:
-        ValueError: they do not have d columns or are not finite.
+        ValueError: they do not have d columns.
     """
-    q = np.require(poses, np.float64, 'C')
+    q = np.ascontiguousarray(poses, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != skeleton.dimension:
         raise ValueError(
             f'poses of {skeleton.name} must have shape (N, {skeleton.dimension}), saw {q.shape}'
         )
-    if not np.isfinite(q).all():
-        raise ValueError(f'poses of {skeleton.name} must be finite')
     return q
+
+
+def _poses_last(array: Array) -> Array:
+    return np.ascontiguousarray(np.moveaxis(array, 0, -1))
 
 
 def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:
@@ -178,7 +215,7 @@ def directed_derivatives(
         (M, d) a . dp / dx.
     """
     skeleton = frames.skeleton
-    axes, origins = (x[0] for x in frames.dofs_by_pose())
+    axes, origins = (x[0] for x in frames.dofs)
     points, directions = (np.ascontiguousarray(x) for x in (points, directions))
     result = np.empty((len(points), skeleton.dimension))
     derive_along(
@@ -195,9 +232,10 @@ def directed_derivatives(
 
 
 def origin_length_jacobians(skeleton: Skeleton, frames: Frames) -> Array:
-    """Derivatives (S, 3, L, N) of the origins of the segments with respect to the lengths."""
-    result = np.empty((len(skeleton.parents), 3, len(skeleton.length_names), frames.count))
-    lift_origins(placing_of(skeleton).parents, skeleton.offset_basis, frames.columns, result)
+    """Derivatives (N, S, 3, L) of the origins of the segments with respect to the lengths."""
+    columns = frames.segments[0]
+    result = np.empty((*columns.shape[:3], len(skeleton.lengths)))
+    lift_origins(placing_of(skeleton).parents, skeleton.offset_basis, columns, result)
     return result
 
 
@@ -205,10 +243,9 @@ def joint_length_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
     """Derivatives (N, J, 3, L) of the joint positions with respect to the lengths."""
     frames = forward(skeleton, poses)
     segments = skeleton.joint_segments
-    result = origin_length_jacobians(skeleton, frames)[segments] + np.einsum(
-        'jixn,jil->jxln', frames.columns[segments], skeleton.joint_basis
-    )
-    return np.ascontiguousarray(result.transpose(3, 0, 1, 2))
+    result = product(frames.rotations()[:, segments], skeleton.joint_basis)
+    result += origin_length_jacobians(skeleton, frames)[:, segments]
+    return np.asarray(result)
 
 
 def segment_sums(

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.model_file import load_body, model_names
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import cholesky
 from hmt_ros.inference.mixture import GaussianMixture
 from msg_tools.files.array_file import read_archive
 from msg_tools.files.error_line import error_line
@@ -178,7 +179,7 @@ def check_covariances(name: str, values: Array, slack: float = -LEAST_EIGENVALUE
     correlations = values / deviations[..., None] / deviations[..., None, :]
     same = np.allclose(correlations, np.swapaxes(correlations, -1, -2), atol=1e-6)
     require(same, f'{name} is not symmetric')
-    np.linalg.cholesky(correlations + slack * np.eye(values.shape[-1]))
+    cholesky(correlations + slack * np.eye(values.shape[-1]))
 
 
 def write_model(

@@ -15,12 +15,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_rotation_dofs, rotations_of
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import determinant, length, product, singular_values
 
 SIDES = ('left', 'right')
 ARM = ('shoulder', 'elbow', 'wrist', 'hand')
@@ -54,7 +55,7 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> A
         if parent < 0:
             turns[s] = _set_root(skeleton, place, poses)
             continue
-        turn = turns[parent] @ skeleton.mounts[s]
+        turn = product(turns[parent], skeleton.mounts[s])
         own, axes = rotations_of(skeleton, s)
         if s in aims and axes:
             start, end, next_end = aims[s]
@@ -65,10 +66,10 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> A
                 )
             if start in place and end in place:
                 along = _local(turn, place[start] - place[end])
-                a = np.arctan2(-along[:, 1], along[:, 2])
+                a = elementary.arctan2(-along[:, 1], along[:, 2])
                 poses[:, own[0]] = a
                 if len(axes) > 1:
-                    poses[:, own[1]] = np.arcsin(np.clip(along[:, 0], -1.0, 1.0))
+                    poses[:, own[1]] = elementary.arcsin(np.clip(along[:, 0], -1.0, 1.0))
             turn = _turned(skeleton, own[:2], poses, turn)
             if len(axes) == 3:
                 poses[:, own[2]] = _twist(skeleton, s, turn, place, next_end, fps)
@@ -89,7 +90,7 @@ def trunk_start(skeleton: Skeleton, place: Mapping[str, Array]) -> Array:
     rest = frames.joints()[skeleton.joint_index(HIPS)].transpose(0, 2, 1)
     offset = frames.origins[trunk, :, 0] - rest[0, 0]
     at_rest = np.einsum('tij,i->tj', _pelvis_axes(*rest), offset)[0]
-    drop = np.linalg.norm(rest[1:].mean(0) - rest[0])
+    drop = length(rest[1:].mean(0) - rest[0])
     places = [place[name] for name in HIPS]
     drops = np.linalg.norm(0.5 * (places[1] + places[2]) - places[0], axis=1)
     shift = np.einsum('tij,j->ti', _pelvis_axes(*places), at_rest / max(float(drop), 1e-9))
@@ -143,22 +144,32 @@ def _set_root(skeleton: Skeleton, place: Mapping[str, Array], poses: Array) -> A
     seen = np.stack([place[n] for n in names], axis=1)
     turn = _aligned(rest, seen, weights)
     poses[:, shifts] = place['pelvis']
-    rotation: Array = turn @ skeleton.mounts[0]
-    own = skeleton.mounts[0].T @ rotation
-    poses[:, rotations[0]] = np.unwrap(np.arctan2(own[:, 1, 0], own[:, 0, 0]))
-    poses[:, rotations[1]] = np.arcsin(np.clip(-own[:, 2, 0], -1.0, 1.0))
-    poses[:, rotations[2]] = np.arctan2(own[:, 2, 1], own[:, 2, 2])
+    rotation: Array = product(turn, skeleton.mounts[0])
+    own = product(skeleton.mounts[0].T, rotation)
+    poses[:, rotations[0]] = np.unwrap(elementary.arctan2(own[:, 1, 0], own[:, 0, 0]))
+    poses[:, rotations[1]] = elementary.arcsin(np.clip(-own[:, 2, 0], -1.0, 1.0))
+    poses[:, rotations[2]] = elementary.arctan2(own[:, 2, 1], own[:, 2, 2])
     return rotation
 
 
 def _aligned(rest: Array, seen: Array, weights: Array) -> Array:
     """Rotations (T, 3, 3) that best take points (P, 3) to (T, P, 3) about their weighted means."""
     w = weights / weights.sum()
-    a, b = rest - w @ rest, seen - np.einsum('p,tpi->ti', w, seen)[:, None]
-    u, _, vt = np.linalg.svd(np.einsum('tpi,p,pj->tij', b, w, a))
-    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    result: Array = u @ vt
+    a, b = rest - product(w, rest), seen - np.einsum('p,tpi->ti', w, seen)[:, None]
+    u, _, vt = singular_values(np.einsum('tpi,p,pj->tij', b, w, a))
+    u[:, :, 2] *= np.sign(determinant(product(u, vt)))[:, None]
+    result: Array = product(u, vt)
     return result
+
+
+def _smoothed(values: Array, sigma: float) -> Array:
+    """Means of values (T, n) over time with Gaussian weights; the ends go on as they are."""
+    reach = int(4.0 * sigma + 0.5)
+    weights = elementary.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    weights /= weights.sum()
+    padded = np.pad(values, ((reach, reach), (0, 0)), mode='edge')
+    windows = np.lib.stride_tricks.sliding_window_view(padded, len(weights), axis=0)
+    return np.asarray(np.einsum('tnw,w->tn', windows, weights))
 
 
 def _twist(
@@ -171,7 +182,7 @@ def _twist(
     """
     if not next_end:
         line = _local(turn, place['right_shoulder'] - place['left_shoulder'])
-        return np.unwrap(np.arctan2(line[:, 1], line[:, 0]))
+        return np.unwrap(elementary.arctan2(line[:, 1], line[:, 0]))
     side, _, joint = next_end.partition('_')
     middle_joint = f'{side}_{"knee" if joint == "ankle" else "elbow"}'
     hinge = next(i for i, t in enumerate(skeleton.dof_segments) if skeleton.parents[t] == s)
@@ -182,9 +193,9 @@ def _twist(
     if joint == 'ankle' and toe in place:
         forward_of_foot = _local(turn, place[toe] - place[next_end])
         said += FOOT * np.stack([forward_of_foot[:, 1], -forward_of_foot[:, 0]], axis=1)
-    around = gaussian_filter1d(said, AROUND_TIME * fps, axis=0, mode='nearest')
+    around = _smoothed(said, AROUND_TIME * fps)
     said = said + AROUND * around + [REST, 0.0]
-    twist: Array = np.arctan2(said[:, 1], said[:, 0])
+    twist: Array = elementary.arctan2(said[:, 1], said[:, 0])
     return twist
 
 
@@ -199,7 +210,7 @@ def _turned(skeleton: Skeleton, dofs: Sequence[int], poses: Array, turn: Array) 
     for dof in dofs:
         axis = int(skeleton.dof_axes[dof])
         i, j = (axis + 1) % 3, (axis + 2) % 3
-        cos, sin = np.cos(poses[:, dof])[:, None], np.sin(poses[:, dof])[:, None]
+        cos, sin = elementary.cos(poses[:, dof])[:, None], elementary.sin(poses[:, dof])[:, None]
         new = turn.copy()
         new[:, :, i] = cos * turn[:, :, i] + sin * turn[:, :, j]
         new[:, :, j] = cos * turn[:, :, j] - sin * turn[:, :, i]

@@ -12,14 +12,20 @@ by their variables has to take turns out first.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import ROOT_ANGLES, Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, other_side
+from hmt_ros.core import elementary, face_back, point_left
 from hmt_ros.inference.arrays import Array, Index, Mask
+from hmt_ros.inference.linear_algebra import product, solve
 from hmt_ros.inference.mixture import GaussianMixture
+
+arctan2 = elementary.arctan2
 
 # A person whose front is turned away from the image plane by less than this is seen from the side,
 # as sine of the angle.
@@ -63,12 +69,12 @@ def reverse_depth(body: Body, poses: ArrayLike) -> Array:
     dofs = root_rotation_dofs(skeleton)
     frames = forward(skeleton, q)
     pelvis = frames.joints()[skeleton.joint_index(('pelvis',))[0]].T
-    ray = pelvis / np.linalg.norm(pelvis, axis=1, keepdims=True)
+    ray = pelvis / np.sqrt((pelvis * pelvis).sum(1, keepdims=True))
     across = np.eye(3) - 2.0 * ray[:, :, None] * ray[:, None, :]
     result = mirror(body, q)
     result[:, :3] = q[:, :3]
     left_for_right = np.diag([-1.0, 1.0, 1.0])
-    turned = across @ root_rotations(body, q) @ left_for_right
+    turned = product(product(across, root_rotations(body, q)), left_for_right)
     result[:, dofs] = root_angles(body, turned)
     return np.clip(result, body.lower, body.upper)
 
@@ -102,11 +108,11 @@ def root_angles(body: Body, rotations: Array) -> Array:
 
     The angle about z is between -pi and pi.
     """
-    r = body.skeleton.mounts[0].T @ rotations
-    y = np.arctan2(-r[:, 2, 0], np.hypot(r[:, 2, 1], r[:, 2, 2]))
+    r = product(body.skeleton.mounts[0].T, rotations)
+    y = arctan2(-r[:, 2, 0], elementary.hypot(r[:, 2, 1], r[:, 2, 2]))
     limits = root_rotation_dofs(body.skeleton)[1]
     y = np.clip(y, body.lower[limits], body.upper[limits])
-    z, x = np.arctan2(r[:, 1, 0], r[:, 0, 0]), np.arctan2(r[:, 2, 1], r[:, 2, 2])
+    z, x = arctan2(r[:, 1, 0], r[:, 0, 0]), arctan2(r[:, 2, 1], r[:, 2, 2])
     return np.stack([z, y, x], axis=1)
 
 
@@ -123,7 +129,7 @@ def turned(
         turn: angle about z by which the roots have turned before, up to whole turns, rad.
     """
     root, rotations = root_rotation_dofs(body.skeleton), root_rotations(body, poses)
-    angles = root_angles(to, rotations if rotation is None else rotation @ rotations)
+    angles = root_angles(to, rotations if rotation is None else product(rotation, rotations))
     # The turn nearest to that of before.
     offset_of_turns = poses[:, root[0]] + turn - angles[:, 0]
     angles[:, 0] += TURN * np.round(offset_of_turns / TURN)
@@ -143,8 +149,8 @@ def turn_jacobians(
         for one, poses in ((body, before), (to, after))
     )
     result = np.tile(np.eye(body.dimension), (len(before), 1, 1))
-    moved = old if rotation is None else rotation @ old
-    result[np.ix_(range(len(before)), root, root)] = np.linalg.solve(new, moved)
+    moved = old if rotation is None else product(rotation, old)
+    result[np.ix_(range(len(before)), root, root)] = solve(new, moved)
     return result
 
 
@@ -177,8 +183,26 @@ def clear_level(body: Body, pose: Array) -> Array:
 
 def propagated(jacobians: Array, covariances: Array) -> Array:
     """Covariances J S J' (N, n, n), from Jacobians J (N, n, m) and covariances S (N, m, m)."""
-    result: Array = jacobians @ covariances @ jacobians.swapaxes(1, 2)
+    result: Array = product(product(jacobians, covariances), jacobians.swapaxes(1, 2))
     return 0.5 * (result + result.swapaxes(1, 2))
+
+
+class Trunk(NamedTuple):
+    """The joints (L,) of the trunk on its left, and those on its right, for the core."""
+
+    left: Index
+    right: Index
+
+
+def trunk_of(body: Body) -> Trunk:
+    """The trunk, which tells where a person faces.
+
+    Raises:
+        ValueError: a body without shoulders and hips.
+    """
+    if not body.trunk_pairs:
+        raise ValueError(f'body {body.name} has neither shoulders nor hips: it faces nowhere')
+    return Trunk(*(body.skeleton.joint_index(x) for x in zip(*body.trunk_pairs, strict=True)))
 
 
 def left_directions(body: Body, poses: Array) -> Array:
@@ -187,25 +211,13 @@ def left_directions(body: Body, poses: Array) -> Array:
     Raises:
         ValueError: a body without shoulders and hips.
     """
-    return _left_of(body, body.joint_positions(poses))
+    result = np.empty((len(poses), 3))
+    point_left(trunk_of(body), body.joint_positions(poses), result)
+    return result
 
 
-def _left_of(body: Body, joints: Array) -> Array:
-    """Unit vectors (N, 3) to the left of persons with joints (N, J, 3)."""
-    if not body.trunk_pairs:
-        raise ValueError(f'body {body.name} has neither shoulders nor hips: it faces nowhere')
-    ends = [body.skeleton.joint_index(side) for side in zip(*body.trunk_pairs, strict=True)]
-    return _units(joints[:, ends[0]].sum(1) - joints[:, ends[1]].sum(1))
-
-
-def _units(vectors: Array) -> Array:
-    """Vectors (N, 3) divided by their lengths."""
-    lengths = np.sqrt((vectors * vectors).sum(1, keepdims=True))
-    return np.asarray(vectors / np.maximum(lengths, 1e-12))
-
-
-def faces_back(body: Body, poses: Array, reference: Array) -> Mask:
-    """Whether poses (N, d) face another way than a reference pose (d,).
+def faces_back(body: Body, joints: Array, reference: Array) -> Mask:
+    """Whether persons with joints (N, J, 3) face another way than one with joints (J, 3).
 
     They face away from it, or one faces the camera where the other turns its back: a turn, seen
     from the side, may go either way on.
@@ -213,13 +225,10 @@ def faces_back(body: Body, poses: Array, reference: Array) -> Mask:
     Raises:
         ValueError: a body without shoulders and hips.
     """
-    joints = body.joint_positions(np.concatenate([reference[None], poses]))
-    left, pelvis = _left_of(body, joints), joints[:, 0]
-    up = _units(joints[:, body.skeleton.joint_index(['neck'])[0]] - pelvis)
-    # How far the front, left x up, points away from the camera.
-    away = np.linalg.det(np.stack([left, up, _units(pelvis)], axis=1))
-    apart = (away[1:] * away[0] < 0) & (np.abs(away[1:] - away[0]) > 2 * SIDEWAYS)
-    return np.asarray((left[1:] @ left[0] < 0) | apart, dtype=np.bool_)
+    (neck,) = body.skeleton.joint_index(('neck',))
+    result = np.empty(len(joints), dtype=np.bool_)
+    face_back(trunk_of(body), joints, reference, neck, SIDEWAYS, result)
+    return result
 
 
 def endless(body: Body) -> Mask:
@@ -241,6 +250,7 @@ def without_turns(body: Body, poses: Array, before: Array) -> Array:
     not change with whole turns.
     """
     joints, known = (body.relative_joints(x) for x in (poses, before))
-    nearest = np.linalg.norm(joints[:, None] - known, axis=3).mean(2).argmin(1)
+    apart = joints[:, None] - known
+    nearest = np.sqrt((apart * apart).sum(3)).mean(2).argmin(1)
     turns = np.round((before[nearest] - poses) / TURN)
     return np.asarray(poses + TURN * np.where(endless(body), turns, 0.0))

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 from hmt_ros.body.body import Body, PartShape, symmetries_of
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import length, product, solve
 from msg_tools.files.plain_yaml import load_plain_yaml, read_plain_yaml
 
 AXES = {
@@ -182,11 +183,11 @@ def _mount(entry: dict[str, Any]) -> Array:
     """Rotation whose negative z axis points where the segment points, with the x axis as given."""
     x = np.array(entry.get('x_axis', [1, 0, 0]), dtype=float)
     down = np.array(entry.get('points', [0, 0, -1]), dtype=float)
-    x /= np.linalg.norm(x)
-    down = down - x * (x @ down)
-    if not np.linalg.norm(down) > 1e-6:
+    x /= length(x)
+    down = down - x * product(x, down)
+    if not length(down) > 1e-6:
         raise ValueError(f'segment {entry["name"]}: `points` and `x_axis` must differ in direction')
-    z = -down / np.linalg.norm(down)
+    z = -down / length(down)
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
@@ -438,7 +439,7 @@ def held(covariance: Array, functions: ArrayLike, sigma: ArrayLike) -> Array:
     """
     rows = np.asarray(functions, dtype=np.float64)
     noise = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
-    cross = rows @ covariance
-    result = covariance - cross.T @ np.linalg.solve(cross @ rows.T + noise, cross)
+    cross = product(rows, covariance)
+    result = covariance - product(cross.T, solve(product(cross, rows.T) + noise, cross))
     symmetric: Array = 0.5 * (result + result.T)
     return symmetric

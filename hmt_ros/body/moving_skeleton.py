@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import product
 
 # From the optical frame of a level camera, y down and z forward, to y up and z to the camera.
 CAMERA_TO_ROOM = np.diag([1.0, -1.0, -1.0])
@@ -64,25 +65,25 @@ class MovingSkeleton:
         if moved.any() or skeleton.parents.count(-1) != 1:
             raise ValueError(f'{body.name}: wanted one root, which alone moves along axes')
         frames, rest = forward(skeleton, poses), forward(skeleton, np.zeros((1, body.dimension)))
-        upright = CAMERA_TO_ROOM @ rest.rotations()[0]
-        turned = room @ frames.rotations() @ upright.transpose(0, 2, 1)
+        upright = product(CAMERA_TO_ROOM, rest.rotations()[0])
+        turned = product(product(room, frames.rotations()), upright.transpose(0, 2, 1))
         carried = list(skeleton.parents)
-        offsets = [upright[p] @ x for p, x in zip(carried, skeleton.offsets, strict=True)]
+        offsets = [product(upright[p], x) for p, x in zip(carried, skeleton.offsets, strict=True)]
         offsets[0] = np.zeros(3)
         names, tips = list(skeleton.segment_names), []
         for j, s in enumerate(skeleton.joint_segments):
             if np.any(skeleton.joint_offsets[j]):
                 tips.append(skeleton.joint_names[j])
                 carried.append(int(s))
-                offsets.append(upright[s] @ skeleton.joint_offsets[j])
+                offsets.append(product(upright[s], skeleton.joint_offsets[j]))
             else:
                 names[s] = skeleton.joint_names[j]
         local = np.tile(np.eye(3), (len(poses), len(carried), 1, 1))
         local[:, 0] = turned[:, 0]
         parents = list(skeleton.parents[1:])
-        local[:, 1 : len(names)] = turned[:, parents].swapaxes(-1, -2) @ turned[:, 1:]
+        local[:, 1 : len(names)] = product(turned[:, parents].swapaxes(-1, -2), turned[:, 1:])
         names = [f'{name}_segment' if name in tips else name for name in names]
-        places = frames.by_pose()[1][:, 0] @ room.T + [0.0, height, 0.0]
+        places = product(frames.by_pose()[1][:, 0], room.T) + np.array([0.0, height, 0.0])
         return MovingSkeleton(
             np.asarray(times), (*names, *tips), tuple(carried), np.array(offsets), local, places
         )

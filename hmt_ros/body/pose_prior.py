@@ -13,6 +13,7 @@ H is positive definite, and the quadratic with the value and gradient of E that 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -21,9 +22,10 @@ import numpy as np
 
 from hmt_ros.body.angle_mixture import AngleMixture, shipped_prior
 from hmt_ros.body.body import Body
-from hmt_ros.core import evaluate_prior_at
+from hmt_ros.core import elementary, evaluate_prior_at
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Energy
+from hmt_ros.inference.linear_algebra import product
 
 LEARNED, ANGLES = 'learned', 'angles'
 KINDS = (LEARNED, ANGLES)
@@ -76,15 +78,16 @@ class MixturePrior:
         """As compiled code reads it."""
         mixture, whole = self.mixture, self.mixture.whole
         n = whole.dimension
-        log_det = -np.log(np.diagonal(mixture.whitening, axis1=1, axis2=2)).sum(1)
+        log_det = -elementary.log(np.diagonal(mixture.whitening, axis1=1, axis2=2)).sum(1)
+        log_weights = elementary.log(whole.weights)
         rest = self.body.prior_sigma**-2.0
         rest[mixture.indices] = 0.0
         return PriorModel(
             mixture.whitening,
-            np.einsum('cij,cj->ci', mixture.whitening, whole.means),
-            np.log(whole.weights) - log_det - 0.5 * n * np.log(2.0 * np.pi) - mixture.highest,
+            product(mixture.whitening, whole.means[..., None])[..., 0],
+            log_weights - log_det - 0.5 * n * math.log(2.0 * math.pi) - mixture.highest,
             mixture.precisions,
-            np.array(mixture.indices, dtype=np.int64),
+            mixture.indices,
             self.body.prior_mean,
             rest,
             self.weight,

@@ -18,7 +18,9 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import mirror_order
 from hmt_ros.body.model_file import usual_postures
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import log_sum_exp, product, pseudo_inverse
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Share of the mode's own guess, which goes on from what is seen of the person, where a limb has not
@@ -63,11 +65,13 @@ class Postures:
         told = differs & np.isfinite(unseen)
         total = noise[:, None, told] + variances[:, told]
         offsets = modes.means[:, None, told] - self.means[:, told]
-        log_shares = np.log(self.shares) - 0.5 * (offsets**2 / total + np.log(total)).sum(2)
+        log_shares = elementary.log(self.shares) - 0.5 * (
+            offsets**2 / total + elementary.log(total)
+        ).sum(2)
         if not differs[hidden].any():
             log_shares[:, 1:] = -np.inf
-        shares = np.exp(log_shares - np.logaddexp.reduce(log_shares, axis=1)[:, None])
-        other = (1.0 - SUPPOSED) * -np.expm1(-unseen.max() / FORGOTTEN)
+        shares = elementary.exp(log_shares - log_sum_exp(log_shares, axis=1)[:, None])
+        other = (1.0 - SUPPOSED) * -elementary.expm1(-unseen.max() / FORGOTTEN)
         shares = np.insert(other * shares, 0, 1.0 - other, axis=1)
         weights = modes.normalised().weights[:, None]
         shares[(weights * shares < LIGHTEST) & (np.arange(shares.shape[1]) > 0)] = 0.0
@@ -103,9 +107,9 @@ class Postures:
         slopes = self.body.joint_jacobians(poses)[:, top].reshape(len(poses), -1, len(unseen))
         moves = np.zeros((len(poses), len(unseen), len(own)))
         moves[:, own, np.arange(len(own))] = 1.0
-        moves[:, root] = -np.linalg.pinv(slopes[..., root]) @ slopes[..., own]
+        moves[:, root] = product(-pseudo_inverse(slopes[..., root]), slopes[..., own])
         drift = np.minimum(self.body.prior_sigma**2, self.body.rates * unseen)[own]
-        return np.asarray((moves * drift) @ moves.swapaxes(1, 2))
+        return np.asarray(product(moves * drift, moves.swapaxes(1, 2)))
 
 
 def postures_of(body: Body) -> Postures:

@@ -24,7 +24,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import length, product
 
 # Joints of the reference with the ranges that it gives them, rad.
 _LIMB_RANGES = {
@@ -61,7 +63,7 @@ NEEDED = (
 # Sine of the angle below which two bones have one direction, and length that counts as 0, m.
 _STRAIGHT, _NOTHING = 1e-4, 1e-3
 # Angle at which the hips lie before the line down from the pelvis joint, rad: that of our bodies.
-HIPS_AHEAD = np.arctan(0.33)
+HIPS_AHEAD = elementary.arctan(0.33)
 # Weight of a change of angles from image to image against angles beyond their ranges.
 _STEADY = 0.2
 
@@ -108,9 +110,9 @@ class ReferenceHuman:
         frames = {'body': (np.eye(3), np.zeros(3))}
         for joint in self.joints:
             rotation, place = frames[joint.parent]
-            place = place + rotation @ joint.origin
+            place = place + product(rotation, joint.origin)
             if joint.axis is not None:
-                rotation = rotation @ _turn(joint.axis, self.angles[joint.name])
+                rotation = product(rotation, _turn(joint.axis, self.angles[joint.name]))
             frames[joint.child] = (rotation, place)
         del frames['body']
         rotations, places = zip(*frames.values(), strict=True)
@@ -148,22 +150,22 @@ def fit_reference_human(
     before = dict.fromkeys((*REFERENCE_JOINTS, *ADDED_JOINTS), 0.0) | dict(previous or {})
     origin = (at['left_hip'] + at['right_hip']) / 2
     rotation = _body_axes(at, origin)
-    in_body = {name: rotation.T @ (place - origin) for name, place in at.items()}
+    in_body = {name: product(rotation.T, place - origin) for name, place in at.items()}
     # The trunk starts over the middle of the hips, before the pelvis joint.
     in_body['pelvis'] = in_body['pelvis'] * [0.0, 1.0, 1.0]
     angles: dict[str, float] = {}
     torso = _fit_trunk(in_body, angles, additions=additions)
-    head = torso.T @ _direction(in_body, 'neck', 'head')
-    angles['p_head'] = float(np.arcsin(np.clip(-head[0], -1.0, 1.0)))
-    angles['r_head'] = float(np.arctan2(-head[1], head[2]))
+    head = product(torso.T, _direction(in_body, 'neck', 'head'))
+    angles['p_head'] = float(elementary.arcsin(np.clip(-head[0], -1.0, 1.0)))
+    angles['r_head'] = float(elementary.arctan2(-head[1], head[2]))
     angles['y_head'] = 0.0
     ahead = {side: 0.0 for side, _ in SIDES.values()}
     for letter, (side, sign) in SIDES.items():
         if additions:
-            ahead[side], out, up = torso.T @ (in_body[f'{side}_shoulder'] - in_body['neck'])
-            angles[f'{letter}_clavicle'] = float(np.arctan2(up, sign * out))
+            ahead[side], out, up = product(torso.T, in_body[f'{side}_shoulder'] - in_body['neck'])
+            angles[f'{letter}_clavicle'] = float(elementary.arctan2(up, sign * out))
         lifted = angles.get(f'{letter}_clavicle', 0.0)
-        base = torso @ _turn(np.array([sign, 0.0, 0.0]), lifted)
+        base = product(torso, _turn(np.array([sign, 0.0, 0.0]), lifted))
         _fit_arm(in_body, letter, base, before, angles)
         _fit_leg(in_body, letter, before, angles)
     joints = _joints(in_body, ahead, additions=additions)
@@ -177,10 +179,10 @@ def _direction(at: Mapping[str, Array], first: str, last: str) -> Array:
 
 
 def _unit(vector: Array, what: str) -> Array:
-    length = float(np.linalg.norm(vector))
-    if not length > _NOTHING:
+    size = length(vector)
+    if not size > _NOTHING:
         raise ValueError(f'{what} are at one place: they have no direction')
-    result: Array = vector / length
+    result: Array = vector / size
     return result
 
 
@@ -188,10 +190,10 @@ def _body_axes(at: Mapping[str, Array], origin: Array) -> Array:
     """Columns x forward, y from the right hip to the left, z up along the pelvis."""
     y = _direction(at, 'right_hip', 'left_hip')
     up = at['pelvis'] - origin
-    up = np.cos(HIPS_AHEAD) * up + np.sin(HIPS_AHEAD) * np.cross(y, up)
-    if np.linalg.norm(up - y * (y @ up)) < _NOTHING:
+    up = elementary.cos(HIPS_AHEAD) * up + elementary.sin(HIPS_AHEAD) * np.cross(y, up)
+    if length(up - y * product(y, up)) < _NOTHING:
         up = at['neck'] - origin
-    z = _unit(up - y * (y @ up), 'the line of the hips and the trunk')
+    z = _unit(up - y * product(y, up), 'the line of the hips and the trunk')
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 
@@ -199,15 +201,15 @@ def _fit_trunk(at: Mapping[str, Array], angles: dict[str, float], *, additions: 
     """Angles of the trunk; returns the axes (3, 3) of the torso in the frame of the body."""
     z = _direction(at, 'pelvis', 'neck')
     if not additions:
-        angles['waist'] = float(np.arctan2(z[0], z[2]))
+        angles['waist'] = float(elementary.arctan2(z[0], z[2]))
         return _turn(np.array([0.0, 1.0, 0.0]), angles['waist'])
     across = at['left_shoulder'] - at['right_shoulder']
-    y = _unit(across - z * (z @ across), 'the shoulders')
+    y = _unit(across - z * product(z, across), 'the shoulders')
     r = np.stack([np.cross(y, z), y, z], axis=1)
     # r = Ry(waist) Rx(r_torso) Rz(y_torso)
-    angles['waist'] = float(np.arctan2(r[0, 2], r[2, 2]))
-    angles['r_torso'] = float(np.arcsin(np.clip(-r[1, 2], -1.0, 1.0)))
-    angles['y_torso'] = float(np.arctan2(r[1, 0], r[1, 1]))
+    angles['waist'] = float(elementary.arctan2(r[0, 2], r[2, 2]))
+    angles['r_torso'] = float(elementary.arcsin(np.clip(-r[1, 2], -1.0, 1.0)))
+    angles['y_torso'] = float(elementary.arctan2(r[1, 0], r[1, 1]))
     return r
 
 
@@ -224,19 +226,19 @@ def _fit_arm(
     """
     side, s = SIDES[letter]
     names = [f'{letter}_{axis}_shoulder' for axis in 'ypr']
-    upper = base.T @ _direction(at, f'{side}_shoulder', f'{side}_elbow')
-    lower = base.T @ _direction(at, f'{side}_elbow', f'{side}_wrist')
+    upper = product(base.T, _direction(at, f'{side}_shoulder', f'{side}_elbow'))
+    lower = product(base.T, _direction(at, f'{side}_elbow', f'{side}_wrist'))
     bend = np.cross(lower, upper)
-    sine = float(np.linalg.norm(bend))
-    angles[f'{letter}_elbow'] = float(np.arctan2(sine, upper @ lower))
-    b = float(np.arctan2(np.hypot(upper[0], upper[1]), -upper[2]))
-    hangs = np.sin(b) < _STRAIGHT
-    a = before[names[0]] if hangs else float(np.arctan2(upper[0], s * upper[1]))
+    sine = length(bend)
+    angles[f'{letter}_elbow'] = float(elementary.arctan2(sine, product(upper, lower)))
+    b = float(elementary.arctan2(np.hypot(upper[0], upper[1]), -upper[2]))
+    hangs = elementary.sin(b) < _STRAIGHT
+    a = before[names[0]] if hangs else float(elementary.arctan2(upper[0], s * upper[1]))
     c = before[names[2]]
     if sine > _STRAIGHT:
         # The elbow bends forward: its axis is the y axis of the upper arm.
-        axis = (_turn_z(-s * a) @ _turn_x(s * b)).T @ (bend / sine)
-        c = s * float(np.arctan2(-axis[0], axis[1]))
+        axis = product(product(_turn_z(-s * a), _turn_x(s * b)).T, bend / sine)
+        c = s * float(elementary.arctan2(-axis[0], axis[1]))
     found = [(a, b, c), (a + np.pi, -b, c + np.pi)]
     angles.update(zip(names, _best_angles(found, names, before), strict=True))
 
@@ -250,24 +252,24 @@ def _fit_leg(
     thigh = _direction(at, f'{side}_hip', f'{side}_knee')
     shin = _direction(at, f'{side}_knee', f'{side}_ankle')
     bend = np.cross(thigh, shin)
-    sine = float(np.linalg.norm(bend))
-    angles[f'{letter}_knee'] = -float(np.arctan2(sine, thigh @ shin))
+    sine = length(bend)
+    angles[f'{letter}_knee'] = -float(elementary.arctan2(sine, product(thigh, shin)))
     found = []
     if sine > _STRAIGHT:
         # The knee bends backward: its axis is the y axis of the thigh, (-sin, cos cos, sin).
         y = bend / sine
-        b = float(np.arcsin(np.clip(y[2], -1.0, 1.0)))
+        b = float(elementary.arcsin(np.clip(y[2], -1.0, 1.0)))
         level = np.hypot(y[0], y[1]) > _STRAIGHT
-        a = float(np.arctan2(y[0], y[1])) if level else before[names[0]]
+        a = float(elementary.arctan2(y[0], y[1])) if level else before[names[0]]
         turns = [(a, b), (a + np.pi, np.pi - b)]
     else:
         # With the last yaw: the direction of the thigh is Rz(-a) Rx(s b) (sin c, 0, -cos c).
         a = before[names[0]]
-        x, y_, z = _turn_z(a) @ thigh
-        turns = [(a, float(np.arctan2(y_, -z))), (a, float(np.arctan2(-y_, z)))]
+        x, y_, z = product(_turn_z(a), thigh)
+        turns = [(a, float(elementary.arctan2(y_, -z))), (a, float(elementary.arctan2(-y_, z)))]
     for a, b in turns:
-        x, _, z = (_turn_z(-a) @ _turn_x(b)).T @ thigh
-        found.append((a, s * b, float(np.arctan2(x, -z))))
+        x, _, z = product(product(_turn_z(-a), _turn_x(b)).T, thigh)
+        found.append((a, s * b, float(elementary.arctan2(x, -z))))
     angles.update(zip(names, _best_angles(found, names, before), strict=True))
 
 
@@ -300,10 +302,10 @@ def _joints(
         ahead: how far the shoulders lie before the neck, by side, m.
     """
 
-    def length(first: str, last: str) -> float:
-        return float(np.linalg.norm(at[last] - at[first]))
+    def distance(first: str, last: str) -> float:
+        return length(at[last] - at[first])
 
-    trunk, head = length('pelvis', 'neck'), length('neck', 'head')
+    trunk, head = distance('pelvis', 'neck'), distance('neck', 'head')
     result = [
         # In the reference the trunk leans about the hips.
         _joint('waist', 'body', 'waist', (0, 0, float(at['pelvis'][2])), (0, 1, 0)),
@@ -321,13 +323,13 @@ def _joints(
         _joint('head', 'p_head', 'head', (0, 0, head), None),
     ]
     for x, (side, s) in SIDES.items():
-        out = math.sqrt(max(length('neck', f'{side}_shoulder') ** 2 - ahead[side] ** 2, 0.0))
+        out = math.sqrt(max(distance('neck', f'{side}_shoulder') ** 2 - ahead[side] ** 2, 0.0))
         shoulder = (ahead[side], s * out, 0)
-        arm = (0, 0, -length(f'{side}_shoulder', f'{side}_elbow'))
-        forearm = (0, 0, -length(f'{side}_elbow', f'{side}_wrist'))
-        hip = (0, s * length('left_hip', 'right_hip') / 2, 0)
-        thigh = (0, 0, -length(f'{side}_hip', f'{side}_knee'))
-        shin = (0, 0, -length(f'{side}_knee', f'{side}_ankle'))
+        arm = (0, 0, -distance(f'{side}_shoulder', f'{side}_elbow'))
+        forearm = (0, 0, -distance(f'{side}_elbow', f'{side}_wrist'))
+        hip = (0, s * distance('left_hip', 'right_hip') / 2, 0)
+        thigh = (0, 0, -distance(f'{side}_hip', f'{side}_knee'))
+        shin = (0, 0, -distance(f'{side}_knee', f'{side}_ankle'))
         upper, yaw, pitch = f'{x}_shoulder', f'{x}_y_shoulder', f'{x}_p_shoulder'
         clavicle = f'{x}_clavicle'
         if additions:
@@ -362,7 +364,11 @@ def _turn(axis: Array, angle: float) -> Array:
     """Rotation (3, 3) about a unit vector; Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    result: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    result: Array = (
+        np.eye(3)
+        + elementary.sin(angle) * cross
+        + (1.0 - elementary.cos(angle)) * product(cross, cross)
+    )
     return result
 
 

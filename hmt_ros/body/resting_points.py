@@ -22,8 +22,10 @@ import numpy as np
 
 from hmt_ros.body import Body
 from hmt_ros.body.ground_terms import sole_jacobians, sole_points, soles
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
+from hmt_ros.inference.linear_algebra import product, symmetric_eigen
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 
 # Standard deviations of the speed across and along the direction known least, m/s, of points that
@@ -77,15 +79,15 @@ class RestingPoints:
         each = jacobians.reshape(count, -1, d)
         before, after = each[:-1], each[1:]
         # p(x_{t+1}) - p(x_t) as a linear function of both poses.
-        places = points.reshape(count, -1, 1) - each @ poses[:, :, None]
+        places = points.reshape(count, -1, 1) - product(each, poses[:, :, None])
         rest = weights * (places[1:] - places[:-1])
         diagonal, lower = prior.precision.diagonal.copy(), prior.precision.lower.copy()
         information = prior.information.copy()
-        diagonal[:-1, :d, :d] += before.swapaxes(1, 2) @ (weights * before)
-        diagonal[1:, :d, :d] += after.swapaxes(1, 2) @ (weights * after)
-        lower[:, :d, :d] -= after.swapaxes(1, 2) @ (weights * before)
-        information[:-1, :d] += (before.swapaxes(1, 2) @ rest)[:, :, 0]
-        information[1:, :d] -= (after.swapaxes(1, 2) @ rest)[:, :, 0]
+        diagonal[:-1, :d, :d] += product(before.swapaxes(1, 2), weights * before)
+        diagonal[1:, :d, :d] += product(after.swapaxes(1, 2), weights * after)
+        lower[:, :d, :d] -= product(after.swapaxes(1, 2), weights * before)
+        information[:-1, :d] += product(before.swapaxes(1, 2), rest)[:, :, 0]
+        information[1:, :d] -= product(after.swapaxes(1, 2), rest)[:, :, 0]
         return replace(prior, precision=BlockTridiagonal(diagonal, lower), information=information)
 
 
@@ -99,21 +101,23 @@ def rest_probabilities(
         covariances: (T, d, d); only the directions in which points are known least count.
         intervals: (T-1,) s.
     """
-    spread = jacobians @ covariances[:, None] @ jacobians.swapaxes(2, 3)
-    least_known = np.linalg.eigh(spread[1:])[1][..., -1]
+    spread = product(product(jacobians, covariances[:, None]), jacobians.swapaxes(2, 3))
+    least_known = symmetric_eigen(spread[1:])[1][..., -1]
     velocities = np.diff(points, axis=0) / intervals[:, None, None]
     away = np.einsum('tpi,tpi->tp', velocities, least_known)
     across = np.linalg.norm(velocities - away[:, :, None] * least_known, axis=2)
     log = np.stack([_log_density(across, away, sigmas) for sigmas in (RESTS, MOVES)])
-    changes = 0.5 * -np.expm1(-2.0 * CHANGES * intervals)
-    return np.asarray(_smoothed_chain(np.exp(log - log.max(0)), changes)[0])
+    changes = 0.5 * -elementary.expm1(-2.0 * CHANGES * intervals)
+    return np.asarray(_smoothed_chain(elementary.exp(log - log.max(0)), changes)[0])
 
 
 def _log_density(across: Array, away: Array, sigmas: tuple[float, float]) -> Array:
     """Log density of speeds across and along a direction, up to a constant."""
     wide, deep = sigmas
     return np.asarray(
-        -2.0 * np.log(wide) - np.log(deep) - 0.5 * ((across / wide) ** 2 + (away / deep) ** 2)
+        -2.0 * elementary.log(wide)
+        - elementary.log(deep)
+        - 0.5 * ((across / wide) ** 2 + (away / deep) ** 2)
     )
 
 

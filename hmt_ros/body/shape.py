@@ -103,10 +103,9 @@ class ShapeSpace:
         n, size, skeleton = frames.count, self.size, self.body.skeleton
         d = skeleton.dimension
         result = np.zeros((n, size)), np.zeros((n, size, size)), np.zeros((n, size, d))
-        lifts = origin_length_jacobians(skeleton, frames).transpose(3, 0, 1, 2)
         sum_shape_residuals(
             self._table,
-            np.ascontiguousarray(lifts),
+            origin_length_jacobians(skeleton, frames),
             placing_of(skeleton).parents,
             skeleton.dof_segments,
             skeleton.dof_is_rotation,

@@ -13,13 +13,15 @@ estimated.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +115,12 @@ class Skeleton:
     @cached_property
     def offsets(self) -> Array:
         """Offsets (S, 3) of the segments in their parents' frames, m."""
-        result: Array = self.fixed_offsets + self.offset_basis @ self.lengths
-        return result
+        return np.asarray(self.fixed_offsets + product(self.offset_basis, self.lengths))
 
     @cached_property
     def joint_offsets(self) -> Array:
         """Positions (J, 3) of the joints in the frames of their segments, m."""
-        result: Array = self.joint_basis @ self.lengths
-        return result
+        return np.asarray(product(self.joint_basis, self.lengths))
 
     @cached_property
     def segment_dofs(self) -> tuple[tuple[int, ...], ...]:
@@ -228,7 +228,16 @@ class Skeleton:
         new[where] = [float(x) for x in lengths.values()]
         if not np.isfinite(new).all():
             raise ValueError(f'{self.name}: lengths must be finite, saw {dict(lengths)}')
-        return replace(self, lengths=new)
+        new.setflags(write=False)
+        result = copy(self)
+        object.__setattr__(result, 'lengths', new)
+        for name in _BY_LENGTHS:
+            result.__dict__.pop(name, None)
+        return result
+
+
+# What follows from the lengths of a skeleton; all else stays when they change.
+_BY_LENGTHS = ('offsets', 'joint_offsets', 'trunk_joints', 'bones')
 
 
 def sided_pairs(names: Iterable[str]) -> tuple[tuple[str, str], ...]:
@@ -238,6 +247,7 @@ def sided_pairs(names: Iterable[str]) -> tuple[tuple[str, str], ...]:
     return tuple(pair for pair in pairs if pair[1] in known)
 
 
+@lru_cache(maxsize=256)
 def other_side(name: str) -> str:
     """The name with left for right and right for left."""
     for side, other in (('left_', 'right_'), ('right_', 'left_')):

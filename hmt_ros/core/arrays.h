@@ -152,7 +152,8 @@ inline std::string in_brackets(const Index* shape, int axes) {
 
 // An array of this name must have these extents; -1 fits any.
 template <class T, int N>
-void expect_shape(const char* name, const Array<T, N>& array, std::array<Index, N> wanted) {
+[[gnu::noinline]] void expect_shape(const char* name, const Array<T, N>& array,
+                                    std::array<Index, N> wanted) {
   for (int axis = 0; axis < N; ++axis) {
     if (wanted[axis] >= 0 && wanted[axis] != array.shape[axis]) {
       throw Misfit(std::string(name) + ": wanted shape " + in_brackets(wanted.data(), N) +
@@ -163,7 +164,8 @@ void expect_shape(const char* name, const Array<T, N>& array, std::array<Index, 
 
 // All entries must be at least `low` and less than `high`.
 template <class T, int N>
-void expect_range(const char* name, const Array<T, N>& array, Index low, Index high) {
+[[gnu::noinline]] void expect_range(const char* name, const Array<T, N>& array, Index low,
+                                    Index high) {
   for (Index entry : array) {
     if (entry < low || entry >= high) {
       throw Misfit(std::string(name) + ": wanted numbers from " + std::to_string(low) + " up to " +
@@ -172,7 +174,7 @@ void expect_range(const char* name, const Array<T, N>& array, Index low, Index h
   }
 }
 
-inline void expect(bool fits, const char* name, const char* wanted) {
+[[gnu::noinline]] inline void expect(bool fits, const char* name, const char* wanted) {
   if (!fits) throw Misfit(std::string(name) + ": wanted " + wanted);
 }
 

@@ -2,7 +2,9 @@
 // [j, i - j] = P[i, j]; see hmt_ros/inference/block_tridiagonal.py.
 #pragma once
 
-#include "fused_products.h"
+#include "lanes.h"
+#include "small_matrix.h"
+#include "wide.h"
 
 namespace hmt {
 
@@ -37,8 +39,7 @@ inline void fill_lower(const Matrix& columns, const Tables& lower) {
 }
 
 // Adds P x, (S, T n), of vectors x (S, T n).
-HMT_FUSED inline void add_band_product(const Matrix& columns, const Table& x,
-                                       const Matrix& result) {
+HMT_WIDE inline void add_band_product(const Matrix& columns, const Table& x, const Matrix& result) {
   const Index total = columns.size(), width = columns.size(1), count = x.size();
   expect_shape("x", x, {count, total});
   expect_shape("result", result, {count, total});
@@ -63,6 +64,150 @@ inline void hold(const Matrix& columns, const Places& held) {
     columns[j].fill(0.0);
     for (Index b = 1; b <= std::min(columns.size(1) - 1, j); ++b) columns(j - b, b) = 0.0;
     columns(j, 0) = 1.0;
+  }
+}
+
+// ---- Cholesky factors, in place. Read by rows i and columns c, the band is a matrix [i, c] whose
+// columns begin `width` numbers apart.
+
+inline constexpr Index panel_columns = matrices::matrix_lanes;  // eliminated at a time
+
+// The numbers of a group, of which only `count` are there.
+HMT_INLINE void take(const double* from, Index count, matrices::Group<double>& to) {
+  double each[matrices::matrix_lanes] = {};
+  std::copy_n(from, count, each);
+  to = matrices::group(each);
+}
+
+// Subtracts from R columns, from row `c` of the first on, the products of the rows of a panel:
+// target[i, c + r] -= sum over k of panel[k, c + r] panel[k, i]. `from` is the panel's column c.
+template <int R>
+HMT_INLINE void subtract_products(double* target, Index width, const double* from, Index stride,
+                                  Index count, Index rows) {
+  constexpr Index lanes = matrices::matrix_lanes;
+  for (Index i = 0; i < rows; i += lanes) {
+    const Index here = std::min(lanes, rows - i);
+    const bool whole = here == lanes && i > 0;
+    matrices::Group<double> sums[R];
+    for (int r = 0; r < R; ++r) {
+      double* column = target + r * width + i;
+      if (here == lanes) {
+        sums[r] = matrices::group(column);
+      } else {
+        take(column, here, sums[r]);
+      }
+    }
+    for (Index k = 0; k < count; ++k) {
+      const double* row = from + k * stride;
+      const auto right = *reinterpret_cast<const matrices::Group<double>*>(row + i);
+      for (int r = 0; r < R; ++r) sums[r] -= row[r] * right;
+    }
+    for (int r = 0; r < R; ++r) {
+      double* column = target + r * width + i;
+      if (whole) {
+        matrices::group(column) = sums[r];
+      } else {  // neither above the diagonal nor below the band
+        double each[lanes];
+        matrices::group(each) = sums[r];
+        for (Index b = i == 0 ? r : 0; b < here; ++b) column[b] = each[b];
+      }
+    }
+  }
+}
+
+// Returns how many columns have a pivot that is positive and finite: all, or the matrix is not
+// positive definite.
+HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& room) {
+  constexpr Index lanes = matrices::matrix_lanes;
+  const Index total = columns.size(), width = columns.size(1) - 1, stride = room.size(1);
+  for (Index first = 0; first < total; first += panel_columns) {
+    const Index count = std::min(panel_columns, total - first);
+    const Index rows = std::min(width + count, total - first);
+    for (Index k = 0; k < count; ++k) {
+      double* row = room.data + k * stride;
+      std::fill_n(row, stride, 0.0);
+      std::copy_n(columns[first + k].data, std::min(width + 1, rows - k), row + k);
+    }
+    for (Index k = 0; k < count; ++k) {
+      double* row = room.data + k * stride;
+      const double pivot = row[k];
+      if (!(pivot > 0.0 && pivot < infinity)) return first + k;
+      const double root = std::sqrt(pivot), inverse = 1.0 / root;
+      for (Index b = 0; b < stride; b += lanes) matrices::group(row + b) *= inverse;
+      row[k] = root;
+      for (Index p = k + 1; p < count; ++p) {
+        matrices::subtract(room.data + p * stride, row[p], row, 0, stride);
+      }
+      std::copy_n(row + k, std::min(width + 1, rows - k), columns[first + k].data);
+    }
+    Index c = count;
+    for (; c + 4 <= rows; c += 4) {
+      subtract_products<4>(columns[first + c].data, width, room.data + c, stride, count, rows - c);
+    }
+    for (; c < rows; ++c) {
+      subtract_products<1>(columns[first + c].data, width, room.data + c, stride, count, rows - c);
+    }
+  }
+  return total;
+}
+inline Index factorise_band(const Matrix& columns) {
+  expect(columns.size(1) > 0, "columns", "a diagonal");
+  const Index longest = matrices::padded(columns.size(1) + panel_columns);
+  const Scratch<double, 2> room(panel_columns, longest + matrices::matrix_lanes);
+  return factorise_columns(columns, room.view());
+}
+
+inline void expect_vectors(const Matrix& columns, const Matrix& x) {
+  expect(columns.size(1) > 0, "columns", "a diagonal");
+  expect_shape("x", x, {-1, columns.size()});
+}
+
+// L^-1 x of vectors x (S, T n), in place.
+HMT_WIDE inline void solve_band_lower(const Matrix& columns, const Matrix& x) {
+  expect_vectors(columns, x);
+  constexpr Index lanes = matrices::matrix_lanes;
+  const Index total = columns.size(), width = columns.size(1) - 1;
+  for (Index c = 0; c < total; ++c) {
+    const double* column = columns.data + c * (width + 1);
+    const Index last = std::min(width + 1, total - c);
+    for (Index s = 0; s < x.size(); ++s) {
+      double* to = x.data + s * total + c;
+      const double own = to[0] /= column[0];
+      Index b = 1;
+      for (; b + lanes <= last; b += lanes) {
+        matrices::group(to + b) -=
+            own * *reinterpret_cast<const matrices::Group<double>*>(column + b);
+      }
+      for (; b < last; ++b) to[b] -= own * column[b];
+    }
+  }
+}
+
+// L'^-1 x of vectors x (S, T n), in place.
+HMT_WIDE inline void solve_band_transposed(const Matrix& columns, const Matrix& x) {
+  expect_vectors(columns, x);
+  const Index total = columns.size(), width = columns.size(1) - 1;
+  for (Index c = total - 1; c >= 0; --c) {
+    const double* column = columns.data + c * (width + 1);
+    const Index last = std::min(width, total - 1 - c);
+    for (Index s = 0; s < x.size(); ++s) {
+      double* to = x.data + s * total + c;
+      to[0] = (to[0] - matrices::inner_product(column + 1, to + 1, last)) / column[0];
+    }
+  }
+}
+
+// L' x of vectors x (S, T n), in place.
+HMT_WIDE inline void multiply_band_transposed(const Matrix& columns, const Matrix& x) {
+  expect_vectors(columns, x);
+  const Index total = columns.size(), width = columns.size(1) - 1;
+  for (Index c = 0; c < total; ++c) {
+    const double* column = columns.data + c * (width + 1);
+    const Index last = std::min(width + 1, total - c);
+    for (Index s = 0; s < x.size(); ++s) {
+      double* to = x.data + s * total + c;
+      to[0] = matrices::inner_product<double>(column, to, last);
+    }
   }
 }
 

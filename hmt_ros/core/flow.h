@@ -32,19 +32,10 @@ struct FlowTerm {
   }
 };
 
-// Adds energy, and gradient (d,) and Hessian (d, d) where sums are wanted, of a pose of one
-// problem, a row of the points. Axes and origins (d, 3) are of the degrees of freedom; the sums are
-// room.
-inline void add_flow(const FlowTerm& term, const Tree& tree, const Lens& lens, Index row,
-                     const Frames& frames, const Table& axes, const Table& dof_origins,
-                     const Sums& sums, double& value, const Vector& gradient,
-                     const Matrix& hessian) {
-  const bool wanted = sums.wanted();
+// Adds the energy, and residuals to the sums, of a pose of one problem, a row of the points.
+inline void add_flow(const FlowTerm& term, const Lens& lens, Index row, const Frames& frames,
+                     const Sums& sums, double& value) {
   expect(0 <= row && row < term.points.counts.size(), "rows", "a row of the points");
-  if (wanted) {
-    sums.wrenches.fill(0.0);
-    sums.stiffnesses.fill(0.0);
-  }
   const Index count = term.points.counts[row];
   const double each = term.weight / double(std::max(count, fewest));
   const auto segments = term.points.segments[row];
@@ -75,9 +66,6 @@ inline void add_flow(const FlowTerm& term, const Tree& tree, const Lens& lens, I
       sums.add(s, p, j[0] * inverse, j[1] * inverse, j[2] * inverse, robust.curvature * errors[a],
                robust.curvature);
     }
-  }
-  if (wanted) {
-    assemble_pose(tree, axes, dof_origins, sums.wrenches, sums.stiffnesses, gradient, hessian);
   }
 }
 

@@ -4,6 +4,7 @@
 #pragma once
 
 #include "arrays.h"
+#include "elementary.h"
 #include "wide.h"
 
 namespace hmt {
@@ -80,7 +81,7 @@ inline void whiten_pairs(const Table& means_a, const Tables& covariances_a, cons
       double squared = 0.0, log_determinant = 0.0;
       for (Index a = 0; a < d; ++a) {
         squared += square(factor(d, a)[p - first]);
-        log_determinant -= 2.0 * std::log(factor(a, a)[p - first]);
+        log_determinant -= 2.0 * elementary::log(factor(a, a)[p - first]);
       }
       squares[p] = squared;
       log_determinants[p] = log_determinant;

@@ -1,7 +1,7 @@
 // Frames of the segments of poses; see hmt_ros/body/kinematics.py.
 #pragma once
 
-#include "arrays.h"
+#include "elementary.h"
 
 namespace hmt {
 
@@ -44,50 +44,65 @@ inline void expect_frames(Index segments, Index d, const Tables& columns, const 
   expect_shape("dof_origins", dof_origins, {d, 3});
 }
 
-// Fills the frame of segment s of a pose (d,) whose parent is placed; see `place_pose`.
-inline void place_segment(const Placing& tree, Index s, const Numbers& pose, const Tensor& columns,
-                          const Matrix& origins, const Matrix& axes, const Matrix& dof_origins) {
+// Where a pose is placed, or several side by side in numbers of the type T: columns (S, 3, 3),
+// origins (S, 3), and of the degrees of freedom axes and points on them (d, 3).
+template <class T>
+struct FramesOf {
+  T *columns, *origins, *axes, *dof_origins;
+};
+
+// Places segment s of a pose (d,) whose parent is placed; see `place_pose`. Sine and cosine of an
+// angle are those that `turn_of` gives.
+template <class T, class TurnOf>
+HMT_INLINE void place_one(const Placing& tree, Index s, const T* pose, const TurnOf& turn_of,
+                          const FramesOf<T>& placed) {
   const Index parent = tree.parents[s];
-  for (int k = 0; k < 3; ++k) origins(s, k) = tree.offsets(s, k);
-  if (parent >= 0) {
+  const double *offset = tree.offsets[s].data, *mount = tree.mounts[s].data;
+  T *columns = placed.columns + 9 * s, *origin = placed.origins + 3 * s;
+  if (parent < 0) {
+    for (int k = 0; k < 3; ++k) origin[k] = T{} + offset[k];
+    for (int i = 0; i < 9; ++i) columns[i] = T{} + mount[i % 3 * 3 + i / 3];
+  } else {
+    const T *above = placed.columns + 9 * parent, *from = placed.origins + 3 * parent;
     for (int k = 0; k < 3; ++k) {
-      origins(s, k) = origins(parent, k);
-      for (int i = 0; i < 3; ++i) origins(s, k) += tree.offsets(s, i) * columns(parent, i, k);
-    }
-  }
-  for (int i = 0; i < 3; ++i) {
-    for (int k = 0; k < 3; ++k) {
-      if (parent >= 0) {
-        double total = 0.0;
-        for (int j = 0; j < 3; ++j) total += tree.mounts(s, j, i) * columns(parent, j, k);
-        columns(s, i, k) = total;
-      } else {
-        columns(s, i, k) = tree.mounts(s, k, i);
+      origin[k] =
+          from[k] + offset[0] * above[k] + offset[1] * above[3 + k] + offset[2] * above[6 + k];
+      for (int i = 0; i < 3; ++i) {
+        columns[3 * i + k] =
+            mount[i] * above[k] + mount[3 + i] * above[3 + k] + mount[6 + i] * above[6 + k];
       }
     }
   }
   for (Index d = tree.first_dofs[s]; d < tree.first_dofs[s + 1]; ++d) {
     const Index axis = tree.dof_axes[d];
-    const double value = pose[d];
+    T *own = placed.axes + 3 * d, *on_axis = placed.dof_origins + 3 * d;
     if (tree.dof_is_rotation[d]) {
-      const double cosine = std::cos(value), sine = std::sin(value);
-      const Index i = (axis + 1) % 3, j = (axis + 2) % 3;
+      const auto [sine, cosine] = turn_of(d);
+      T* const first = columns + 3 * ((axis + 1) % 3);
+      T* const second = columns + 3 * ((axis + 2) % 3);
       for (int k = 0; k < 3; ++k) {
-        axes(d, k) = columns(s, axis, k);
-        dof_origins(d, k) = origins(s, k);
-        const double a = columns(s, i, k), b = columns(s, j, k);
-        columns(s, i, k) = cosine * a + sine * b;
-        columns(s, j, k) = cosine * b - sine * a;
+        own[k] = columns[3 * axis + k];
+        on_axis[k] = origin[k];
+        const T a = first[k], b = second[k];
+        first[k] = cosine * a + sine * b;
+        second[k] = cosine * b - sine * a;
       }
     } else {
       for (int k = 0; k < 3; ++k) {
-        double along = k == axis ? 1.0 : 0.0;
-        if (parent >= 0) along = columns(parent, axis, k);
-        axes(d, k) = along;
-        origins(s, k) += along * value;
+        own[k] =
+            parent < 0 ? T{} + (k == axis ? 1.0 : 0.0) : placed.columns[9 * parent + 3 * axis + k];
+        origin[k] += own[k] * pose[d];
       }
     }
   }
+}
+
+// Fills the frame of segment s of a pose (d,) whose parent is placed; see `place_pose`.
+inline void place_segment(const Placing& tree, Index s, const Numbers& pose, const Tensor& columns,
+                          const Matrix& origins, const Matrix& axes, const Matrix& dof_origins) {
+  const auto turn_of = [&](Index d) { return elementary::sincos(pose[d]); };
+  place_one<double>(tree, s, pose.data, turn_of,
+                    {columns.data, origins.data, axes.data, dof_origins.data});
 }
 
 // Fills the frames of one pose (d,): columns (S, 3, 3), origins (S, 3), and for each degree of
@@ -99,11 +114,16 @@ inline void place_pose(const Placing& tree, const Numbers& pose, const Tensor& c
   }
 }
 
+inline void expect_poses(const Table& poses, Index d) {
+  expect_shape("poses", poses, {-1, d});
+  for (double x : poses) expect(std::isfinite(x), "poses", "numbers, which must be finite");
+}
+
 // Fills the frames of N poses (N, d), pose by pose.
 inline void place_poses(const Placing& tree, const Table& poses, const Array<double, 4>& columns,
                         const Tensor& origins, const Tensor& axes, const Tensor& dof_origins) {
   const Index n = poses.size(), s = tree.segments(), d = tree.dimension();
-  expect_shape("poses", poses, {n, d});
+  expect_poses(poses, d);
   expect_shape("columns", columns, {n, s, 3, 3});
   expect_shape("origins", origins, {n, s, 3});
   expect_shape("axes", axes, {n, d, 3});
@@ -113,28 +133,79 @@ inline void place_poses(const Placing& tree, const Table& poses, const Array<dou
   }
 }
 
-// Fills the joints (N, J, 3) of poses (N, d); they are given by segments (J,) and by places there
-// (J, 3).
-inline void place_joints(const Placing& tree, const Table& poses, const Places& joint_segments,
-                         const Table& joint_offsets, const Tensor& joints) {
-  const Index n = poses.size(), s = tree.segments(), d = tree.dimension();
-  const Index count = joint_segments.size();
-  expect_shape("poses", poses, {n, d});
-  expect_range("joint_segments", joint_segments, 0, s);
-  expect_shape("joint_offsets", joint_offsets, {count, 3});
-  expect_shape("joints", joints, {n, count, 3});
-  const Scratch<double, 3> columns(s, 3, 3);
-  const Scratch<double, 2> origins(s, 3), axes(d, 3), dof_origins(d, 3);
-  for (Index i = 0; i < n; ++i) {
-    place_pose(tree, poses[i], columns, origins, axes, dof_origins);
-    for (Index j = 0; j < count; ++j) {
-      const double* column = columns[joint_segments[j]].data;
-      const double *origin = origins[joint_segments[j]].data, *offset = joint_offsets[j].data;
-      for (int x = 0; x < 3; ++x) {
-        joints(i, j, x) = column[x] * offset[0] + column[3 + x] * offset[1] +
-                          column[6 + x] * offset[2] + origin[x];
-      }
+// Poses are placed so many side by side.
+inline constexpr Index abreast = 8;
+typedef double Abreast __attribute__((vector_size(abreast * sizeof(double))));
+// Room for such poses.
+struct AbreastRoom {
+  Scratch<Abreast, 2> pose, sines, cosines, columns, origins, axes, dof_origins;
+  AbreastRoom(Index s, Index d)
+      : pose(d, 1),
+        sines(d, 1),
+        cosines(d, 1),
+        columns(s, 9),
+        origins(s, 3),
+        axes(d, 3),
+        dof_origins(d, 3) {}
+};
+
+// Places points, given by segments (P,) and by places there (P, 3), of up to `abreast` poses (n,
+// d).
+HMT_WIDE inline void place_abreast(const Placing& tree, const Table& poses, const Places& segments,
+                                   const Table& local, const AbreastRoom& room,
+                                   const Tensor& points) {
+  const Index n = poses.size(), d = tree.dimension();
+  Abreast* const pose = room.pose.view().data;
+  Abreast *const sines = room.sines.view().data, *const cosines = room.cosines.view().data;
+  bool far = false;
+  for (Index j = 0; j < d; ++j) {
+    for (Index i = 0; i < abreast; ++i) pose[j][i] = poses(std::min(i, n - 1), j);
+    for (Index i = 0; i < abreast; ++i) far = far || elementary::is_far(pose[j][i]);
+  }
+  const double* const angles = reinterpret_cast<const double*>(pose);
+  double* const sine = reinterpret_cast<double*>(sines);
+  double* const cosine = reinterpret_cast<double*>(cosines);
+  for (Index i = 0; i < d * abreast; ++i) {
+    sine[i] = elementary::sin_near(angles[i]);
+    cosine[i] = elementary::cos_near(angles[i]);
+  }
+  for (Index i = 0; far && i < d * abreast; ++i) {
+    sine[i] = elementary::sin(angles[i]);
+    cosine[i] = elementary::cos(angles[i]);
+  }
+  const FramesOf<Abreast> placed{room.columns.view().data, room.origins.view().data,
+                                 room.axes.view().data, room.dof_origins.view().data};
+  const auto turn_of = [&](Index j) { return std::pair(sines[j], cosines[j]); };
+  for (Index s = 0; s < tree.segments(); ++s) place_one(tree, s, pose, turn_of, placed);
+  for (Index j = 0; j < segments.size(); ++j) {
+    const Abreast* const columns = placed.columns + 9 * segments[j];
+    const Abreast* const origin = placed.origins + 3 * segments[j];
+    const double* const place = local[j].data;
+    for (int x = 0; x < 3; ++x) {
+      const Abreast found =
+          columns[x] * place[0] + columns[3 + x] * place[1] + columns[6 + x] * place[2] + origin[x];
+      for (Index i = 0; i < n; ++i) points(i, j, x) = found[i];
     }
+  }
+}
+
+// Fills the points (N, P, 3), given by segments (P,) and by places there (P, 3), of poses (N, d);
+// relative ones less the first.
+inline void place_points(const Placing& tree, const Table& poses, const Places& segments,
+                         const Table& local, bool relative, const Tensor& points) {
+  const Index n = poses.size(), s = tree.segments(), d = tree.dimension(), count = segments.size();
+  expect_poses(poses, d);
+  expect_range("segments", segments, 0, s);
+  expect_shape("local", local, {count, 3});
+  expect_shape("points", points, {n, count, 3});
+  const AbreastRoom room(s, d);
+  for (Index i = 0; i < n; i += abreast) {
+    const Index last = std::min(i + abreast, n);
+    place_abreast(tree, poses.rows(i, last), segments, local, room, points.rows(i, last));
+  }
+  for (Index i = 0; relative && i < n; ++i) {
+    double* const first = points[i].data;
+    for (Index k = 3 * count - 1; k >= 0; --k) first[k] -= first[k % 3];
   }
 }
 
@@ -169,31 +240,31 @@ inline void derive_along(const Array<const bool, 2>& moves, const Mask& is_rotat
   }
 }
 
-// Fills the derivatives (S, 3, L, N) of the origins by the lengths: of those on the segments, the
-// basis (S, 3, L), and of the parents. Columns are (S, 3, 3, N).
+// Fills the derivatives (N, S, 3, L) of the origins by the lengths: of those on the segments, the
+// basis (S, 3, L), and of the parents. Columns are (N, S, 3, 3).
 inline void lift_origins(const Places& parents, const Tables& basis,
                          const Array<const double, 4>& columns, const Array<double, 4>& result) {
-  const Index count = parents.size(), lengths = basis.size(2), poses = columns.size(3);
+  const Index count = parents.size(), lengths = basis.size(2), poses = columns.size();
   expect_range("parents", parents, -1, count);
+  for (Index s = 0; s < count; ++s) expect(parents[s] < s, "parents", "parents before children");
   expect_shape("basis", basis, {count, 3, lengths});
-  expect_shape("columns", columns, {count, 3, 3, poses});
-  expect_shape("result", result, {count, 3, lengths, poses});
-  for (Index s = 0; s < count; ++s) {
-    const Index parent = parents[s];
-    expect(parent < s, "parents", "parents before children");
-    for (int x = 0; x < 3; ++x) {
-      for (Index k = 0; k < lengths; ++k) {
-        double* lift = result[s][x][k].data;
-        if (parent < 0) {
-          std::fill(lift, lift + poses, basis(s, x, k));
-          continue;
-        }
-        const double* above = result[parent][x][k].data;
-        const double *first = columns[parent][0][x].data, *second = columns[parent][1][x].data;
-        const double* third = columns[parent][2][x].data;
-        const double a = basis(s, 0, k), b = basis(s, 1, k), c = basis(s, 2, k);
-        for (Index n = 0; n < poses; ++n) {
-          lift[n] = above[n] + first[n] * a + second[n] * b + third[n] * c;
+  expect_shape("columns", columns, {poses, count, 3, 3});
+  expect_shape("result", result, {poses, count, 3, lengths});
+  for (Index n = 0; n < poses; ++n) {
+    for (Index s = 0; s < count; ++s) {
+      const Index parent = parents[s];
+      const double *own = basis[s].data, *column = columns[n][std::max<Index>(parent, 0)].data;
+      double* lift = result[n][s].data;
+      if (parent < 0) {
+        std::copy_n(own, 3 * lengths, lift);
+        continue;
+      }
+      const double* above = result[n][parent].data;
+      for (int x = 0; x < 3; ++x) {
+        for (Index k = 0; k < lengths; ++k) {
+          lift[x * lengths + k] = above[x * lengths + k] + column[x] * own[k] +
+                                  column[3 + x] * own[lengths + k] +
+                                  column[6 + x] * own[2 * lengths + k];
         }
       }
     }

@@ -2,6 +2,7 @@
 //
 // Where a matrix has no result, they fill it with no numbers and report what numpy calls invalid.
 #include "array_functions.h"
+#include "log_sum_exp.h"
 #include "small_matrix.h"
 #include "ufunc.h"
 
@@ -248,6 +249,95 @@ void product_loop(char** pointers, const Index* counts, const Index* strides, vo
   report_only(0);
 }
 
+// (n,n)->(n,n): the exponential, by scaling and squaring of a Pade approximant of degree 13 [Higham
+// 2005].
+void exponential_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  // clang-format off
+  constexpr double b[] = {
+      64764752532480000, 32382376266240000, 7771770303897600, 1187353796428800, 129060195264000,
+      10559470521600, 670442572800, 33522128640, 1323241920, 40840800, 960960, 16380, 182, 1};
+  // clang-format on
+  constexpr double theta = 5.371920351148152;  // the largest norm of full accuracy
+  const Items items(pointers, counts, strides, 2);
+  const Index n = counts[1], width = padded(n), area = n * width;
+  const Scratch<double, 2> powers(4, area), room(2, 2 * area);
+  const Scratch<double, 1> lanes((n + 1) * matrix_lanes);
+  const auto matrix = [&](double* data) {
+    return Strided<double>{reinterpret_cast<char*>(data), width * Index(sizeof(double)),
+                           sizeof(double)};
+  };
+  const auto times = [&](double* left, double* right, double* to) {
+    multiply<double>(matrix(left), matrix(right), matrix(to), n, n, n, lanes.view().data);
+  };
+  double *one = powers[0].data, *two = powers[1].data, *four = powers[2].data;
+  double *six = powers[3].data, *odd = room[0].data, *even = odd + area;
+  const Rows both{room[1].data, 2 * width};
+  bool all = true;
+  for (Index item = 0; item < items.size(); ++item) {
+    read(items.matrix(0, item, 0), n, n, {one, width});
+    double norm = 0.0;
+    for (Index j = 0; j < n; ++j) {
+      double sum = 0.0;
+      for (Index i = 0; i < n; ++i) sum += std::abs(one[i * width + j]);
+      if (!(sum <= norm)) norm = sum;
+    }
+    bool good = norm < 1e300;
+    int halvings = 0;
+    for (; good && norm > theta; norm *= 0.5) ++halvings;
+    for (Index i = 0; i < area; ++i) one[i] = std::ldexp(one[i], -halvings);
+    times(one, one, two);
+    times(two, two, four);
+    times(two, four, six);
+    const auto add = [&](double* to, double sixth, double fourth, double second, double none) {
+      for (Index i = 0; i < area; ++i) to[i] += sixth * six[i] + fourth * four[i] + second * two[i];
+      for (Index i = 0; i < n; ++i) to[i * width + i] += none;
+    };
+    // U = A (A^6 (..) + ..) and V = A^6 (..) + ..; exp A = (V - U)^-1 (V + U)
+    double *high = both.data, *part = high + area;
+    for (const bool is_odd : {true, false}) {
+      const double* c = b + is_odd;
+      std::fill_n(high, area, 0.0);
+      add(high, c[12], c[10], c[8], 0.0);
+      times(six, high, part);
+      add(part, c[6], c[4], c[2], c[0]);
+      if (is_odd) {
+        times(one, part, odd);
+      } else {
+        std::copy_n(part, area, even);
+      }
+    }
+    for (Index i = 0; i < n; ++i) {
+      for (Index j = 0; j < width; ++j) {
+        const double u = odd[i * width + j], v = even[i * width + j];
+        both[i][j] = v - u;
+        both[i][width + j] = v + u;
+      }
+    }
+    good = good && eliminate(both, n) != 0.0;
+    if (good) solve_upper(both, n, width);
+    for (Index i = 0; i < n; ++i) std::copy_n(both[i] + width, width, odd + i * width);
+    for (; halvings > 0; --halvings) {
+      times(odd, odd, even);
+      std::swap(odd, even);
+    }
+    all = all && good;
+    write({odd, width}, 0, good, n, n, items.matrix(1, item, 2));
+  }
+  report_only(all ? 0 : FE_INVALID);
+}
+
+// (n)->()
+void log_sum_exp_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Scratch<double, 1> room(counts[1]);
+  for (Index i = 0; i < counts[0]; ++i) {
+    const Strided<double> given{pointers[0] + i * strides[0], strides[2], 0};
+    for (Index k = 0; k < counts[1]; ++k) room[k] = given(k, 0);
+    *reinterpret_cast<double*>(pointers[1] + i * strides[1]) =
+        log_sum_exp(room.view().data, counts[1]);
+  }
+  report_only(0);
+}
+
 }  // namespace
 
 void bind_matrix_functions(py::module_& m) {
@@ -260,6 +350,7 @@ void bind_matrix_functions(py::module_& m) {
   bind_matrix_function(m, "solve_upper", {solve_loop<1>}, "(n,n),(n,m)->(n,m)", 2, 1,
                        "Solution X of U X = B with the upper triangle of U.");
   bind_matrix_function(m, "inverse", {inverse_loop}, "(n,n)->(n,n)", 1, 1, "Inverse.");
+  bind_matrix_function(m, "exponential", {exponential_loop}, "(n,n)->(n,n)", 1, 1, "Exponential.");
   bind_matrix_function(m, "determinant", {determinant_loop}, "(n,n)->(),()", 1, 2,
                        "Determinant, and the logarithm of its size.");
   bind_matrix_function(m, "symmetric_eigen", {eigen_loop<true>}, "(n,n)->(n),(n,n)", 1, 2,
@@ -270,6 +361,8 @@ void bind_matrix_functions(py::module_& m) {
                        "U, the singular values, falling, and V of a matrix with m >= n.");
   bind_matrix_function(m, "product", {product_loop<float>, product_loop<double>},
                        "(m?,k),(k,n?)->(m?,n?)", 2, 1, "Matrix product, as numpy.matmul.");
+  bind_matrix_function(m, "log_sum_exp", {log_sum_exp_loop}, "(n)->()", 1, 1,
+                       "log sum exp(x) along the last axis, or along `axis`.");
 }
 
 }  // namespace hmt

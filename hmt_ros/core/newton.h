@@ -1,7 +1,8 @@
 // Steps of the bounded damped Newton method; see hmt_ros/inference/bounded_newton.py.
 #pragma once
 
-#include "arrays.h"
+#include "lanes.h"
+#include "wide.h"
 
 namespace hmt {
 
@@ -37,8 +38,9 @@ class BoxStep {
 
   // Sets the step (d,) and returns the decrease that the undamped model predicts. Where the limits
   // have spoilt a step so that it gains nothing, steepest descent stands in.
-  double take(const Numbers& gradient, const Table& hessian, const Numbers& low,
-              const Numbers& high, double damping, const Numbers& metric, const Vector& step) {
+  HMT_WIDE double take(const Numbers& gradient, const Table& hessian, const Numbers& low,
+                       const Numbers& high, double damping, const Numbers& metric,
+                       const Vector& step) {
     minimise(gradient, hessian, low, high, damping, metric, step);
     const double predicted = predicted_decrease(gradient, hessian, step, curve_);
     return predicted <= 0.0 ? descend(gradient, hessian, low, high, metric, step) : predicted;
@@ -131,14 +133,14 @@ class BoxStep {
         solution_[c] -= scale * solution_[a];
         if (scale == 0.0) continue;
         double* other = factor_[c].data;
-        for (Index b = c; b < count; ++b) other[b] -= scale * row[b];
+        add_scaled(-scale, row + c, other + c, count - c);
       }
       if (!positive) return false;
     }
     for (Index a = count - 1; a >= 0; --a) {
-      double total = solution_[a];
-      for (Index b = a + 1; b < count; ++b) total -= factor_(a, b) * solution_[b];
-      solution_[a] = total / factor_(a, a);
+      const double* row = factor_[a].data;
+      solution_[a] =
+          (solution_[a] - dot(row + a + 1, &solution_[0] + a + 1, count - a - 1)) / row[a];
     }
     return true;
   }

@@ -1,8 +1,175 @@
 #include "pose_energy.h"
 
+#include "wide.h"
+
 namespace hmt {
 
 namespace {
+
+// Working space for one pose after the other.
+class PoseEnergy {
+ public:
+  // `point` (d,) holds the values of the variables that are not free (f,); `apart`: whether cues
+  // are summed apart.
+  PoseEnergy(const Terms& terms, const Numbers& point, const Places& free, bool apart)
+      : terms_(terms),
+        free_(free),
+        cues_(apart ? 3 : 1),
+        pose_(point.size()),
+        axes_(point.size(), 3),
+        dof_origins_(point.size(), 3),
+        view_(terms.model),
+        segments_(terms.placing.segments()),
+        energies_(term_count),
+        values_(cues_),
+        gradients_(cues_, point.size()),
+        hessians_(cues_, point.size(), point.size()),
+        prior_room_(terms.prior),
+        keypoint_room_(terms.keypoints),
+        overlap_room_(terms.overlaps),
+        pulled_(free.size()) {
+    pose_.view().copy_from(point);
+    for (Index i = 0; i < free.size(); ++i) all_free_ &= free[i] == i;
+  }
+
+  const Vector& values() const { return values_; }
+  const Tensor& hessians() const { return hessians_; }
+
+  // Energy at x (f,) of point `number` of a call, which belongs to the problem `row`; slope (f,)
+  // and curve (f, f) become its derivatives, where they are wanted. `exact`: the Hessian of the
+  // prior is the exact one.
+  double at(Index number, Index row, const Numbers& x, bool exact, bool wanted, const Vector& slope,
+            const Matrix& curve) {
+    const Index f = free_.size();
+    for (Index i = 0; i < f; ++i) pose_[free_[i]] = x[i];
+    double value = add_terms(number, row, exact, wanted);
+    if (wanted && all_free_) {
+      slope.copy_from(gradients_[0]);
+      curve.copy_from(hessians_[0]);
+    } else if (wanted) {
+      for (Index i = 0; i < f; ++i) slope[i] = gradients_(0, free_[i]);
+      for (Index i = 0; i < f; ++i) {
+        for (Index j = 0; j < f; ++j) curve(i, j) = hessians_(0, free_[i], free_[j]);
+      }
+    }
+    if (wanted) {
+      for (Index cue = 1; cue < cues_; ++cue) {
+        for (Index i = 0; i < f; ++i) {
+          slope[i] += gradients_(cue, free_[i]);
+          for (Index j = 0; j < f; ++j) curve(i, j) += hessians_(cue, free_[i], free_[j]);
+        }
+      }
+    }
+    if (terms_.centres.size() > 0) {
+      const Index own = terms_.centres.size() > 1 ? row : 0;
+      value += add_motion(terms_.centres[own], terms_.precisions[own], x, wanted, slope, curve);
+    }
+    return value;
+  }
+
+ private:
+  // Energy of the pose without the motion; derivatives become those by the pose.
+  double add_terms(Index number, Index row, bool exact, bool wanted) {
+    const Index keypoints = std::min<Index>(1, cues_ - 1), others = cues_ - 1;
+    const Tensor& columns = view_.columns;
+    const Matrix& origins = view_.origins;
+    const Vector slope = gradients_[others];
+    const Matrix curve = hessians_[others];
+    const Sums sums = wanted ? Sums{segments_.view(), {}} : Sums{};
+    values_.fill(0.0);
+    if (wanted) {  // the prior sets those of the others
+      gradients_.view().rows(0, others).fill(0.0);
+      hessians_.view().rows(0, others).fill(0.0);
+    }
+    sums.clear();
+    place_pose(terms_.placing, pose_, columns, origins, axes_, dof_origins_);
+    values_[others] = evaluate_prior(terms_.prior, pose_, exact, wanted, slope, curve, prior_room_);
+    if (terms_.image) {
+      look(view_, number, terms_.contour);
+      energies_.fill(0.0);
+      run_terms(view_, terms_.inputs, energies_, sums);
+      double energy = 0.0;
+      for (Index term = 0; term < term_count; ++term) energy += energies_[term];
+      values_[0] += energy;
+      if (wanted && cues_ > 1) assemble(0);
+    }
+    const KeypointInputs& seen = terms_.keypoints;
+    if (seen.points.groups.size() > 0 || seen.lifted.weight > 0.0) {
+      const Numbers log_prior = seen.log_priors[seen.log_priors.size() > 1 ? row : 0];
+      values_[keypoints] +=
+          add_keypoints(seen, log_prior, columns, origins, axes_, dof_origins_, sums,
+                        gradients_[keypoints], hessians_[keypoints], keypoint_room_);
+      if (wanted && cues_ > 1) assemble(keypoints);
+    }
+    double& known = values_[others];
+    if (terms_.overlaps.sigma < infinity) {
+      add_overlaps(terms_.overlaps, columns, origins, axes_, dof_origins_, wanted, known, slope,
+                   curve, overlap_room_);
+    }
+    if (terms_.ground.on()) {
+      known += add_ground_energy(terms_.ground, columns, origins, axes_, dof_origins_, wanted,
+                                 slope, curve);
+    }
+    if (terms_.flow.weight > 0.0) {
+      add_flow(terms_.flow, terms_.model.lens, row, view_.frames(), sums, known);
+    }
+    if (wanted) assemble(others);
+    double total = 0.0;
+    for (Index cue = 0; cue < cues_; ++cue) total += values_[cue];
+    return total;
+  }
+
+  // Takes the sums over the segments to the derivatives of a cue; they begin anew.
+  void assemble(Index cue) {
+    assemble_pose(terms_.model.tree, axes_, dof_origins_, segments_, gradients_[cue],
+                  hessians_[cue]);
+    segments_.fill({});
+  }
+
+  // Energy of the motion at x (f,); adds its derivatives where they are wanted.
+  double add_motion(const Numbers& centre, const Table& precision, const Numbers& x, bool wanted,
+                    const Vector& slope, const Matrix& curve) {
+    const Index f = x.size();
+    const double nu = terms_.tails;
+    pulled_.fill(0.0);
+    for (Index j = 0; j < f; ++j) {  // along rows of a symmetric matrix, many entries at once
+      const double moved = x[j] - centre[j];
+      const double* line = precision[j].data;
+      for (Index i = 0; i < f; ++i) pulled_[i] += line[i] * moved;
+    }
+    double distance = 0.0;
+    for (Index i = 0; i < f; ++i) distance += pulled_[i] * (x[i] - centre[i]);
+    double value = 0.5 * distance, shrinkage = 1.0;
+    if (nu > 0.0) {
+      value = 0.5 * (nu + f) * std::log1p(distance / nu);
+      shrinkage = (nu + f) / (nu + distance);
+    }
+    if (!wanted) return value;
+    for (Index i = 0; i < f; ++i) {
+      slope[i] += shrinkage * pulled_[i];
+      const double* line = precision[i].data;
+      double* own = curve[i].data;
+      for (Index j = 0; j < f; ++j) own[j] += shrinkage * line[j];
+    }
+    return value;
+  }
+
+  const Terms& terms_;
+  const Places free_;
+  const Index cues_;
+  bool all_free_ = free_.size() == terms_.placing.dimension();
+  Scratch<double, 1> pose_;
+  Scratch<double, 2> axes_, dof_origins_;
+  PoseView view_;
+  Scratch<SegmentSums, 1> segments_;
+  Scratch<double, 1> energies_, values_;
+  Scratch<double, 2> gradients_;
+  Scratch<double, 3> hessians_;
+  PriorRoom prior_room_;
+  KeypointRoom keypoint_room_;
+  OverlapRoom overlap_room_;
+  Scratch<double, 1> pulled_;
+};
 
 // Sets the next trial from a step, between the limits: rounding must not leave a variable a hair
 // away from its limit.
@@ -111,6 +278,26 @@ void solve(Index first, Index last, const Terms& terms, const Numbers& point, co
       if (result != Status::iteration_limit) break;
     }
     status[n] = static_cast<std::int8_t>(result);
+  }
+}
+
+void record_residuals(const Model& model, const TermInputs& inputs,
+                      const Array<const double, 4>& columns, const Tables& origins,
+                      const Tensor& residuals) {
+  const Index n = columns.size(), segments = model.tree.segments();
+  expect_shape("columns", columns, {n, segments, 3, 3});
+  expect_shape("origins", origins, {n, segments, 3});
+  expect_shape("residuals", residuals, {n, -1, Sums::recorded});
+  expect(residuals.size(1) > 0, "residuals", "a row that counts the residuals");
+  for (Index i = 0; i < n; ++i) expect(residuals(i, 0, 0) == 0.0, "residuals", "counts of 0");
+  check_poses(inputs, n);
+  PoseView view(model);
+  Scratch<double, 1> energies(term_count);
+  for (Index i = 0; i < n; ++i) {
+    view.columns.view().copy_from(columns[i]);
+    view.origins.view().copy_from(origins[i]);
+    look(view, i, true);
+    run_terms(view, inputs, energies, Sums{{}, residuals[i]});
   }
 }
 

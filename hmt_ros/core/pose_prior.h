@@ -8,7 +8,8 @@
 //     dE = sum_c r_c g_c,     H = sum_c r_c P_c,     d2E = H - sum_c r_c g_c g_c' + dE dE'
 #pragma once
 
-#include "arrays.h"
+#include "lanes.h"
+#include "wide.h"
 
 namespace hmt {
 
@@ -87,12 +88,10 @@ inline void add_component(const PriorModel& model, Index c, double share, bool e
   const double *w = model.whitening[c].data, *precision = model.precisions[c].data;
   const double* z = room.whitened[c].data;
   room.pull.fill(0.0);
-  for (Index i = 0; i < n; ++i, w += n) {
-    for (Index j = 0; j <= i; ++j) pull[j] += w[j] * z[i];
-  }
+  for (Index i = 0; i < n; ++i, w += n) add_scaled(z[i], w, pull, n);  // 0 above the diagonal
   double* curve = room.curvature.view().data;
-  for (Index i = 0; i < n; ++i) pulls[i] += share * pull[i];
-  for (Index i = 0; i < n * n; ++i) curve[i] += share * precision[i];
+  add_scaled(share, pull, pulls, n);
+  add_scaled(share, precision, curve, n * n);
   if (!exact) return;
   for (Index i = 0; i < n; ++i, curve += n) {
     for (Index j = 0; j < n; ++j) curve[j] -= share * pull[i] * pull[j];
@@ -101,8 +100,9 @@ inline void add_component(const PriorModel& model, Index c, double share, bool e
 
 // The energy of a pose (d,); gradient (d,) and Hessian (d, d) become its derivatives, where they
 // are wanted. `exact`: the Hessian is the exact one, not the positive definite one.
-inline double evaluate_prior(const PriorModel& model, const Numbers& pose, bool exact, bool wanted,
-                             const Vector& gradient, const Matrix& hessian, const PriorRoom& room) {
+HMT_WIDE inline double evaluate_prior(const PriorModel& model, const Numbers& pose, bool exact,
+                                      bool wanted, const Vector& gradient, const Matrix& hessian,
+                                      const PriorRoom& room) {
   const Index count = model.components(), n = model.angles(), d = model.dimension();
   const double weight = model.weight;
   const Vector& log = room.log;

@@ -31,43 +31,139 @@ struct Model {
   }
 };
 
+// Sums over residuals at the points of a contour: of pull and curvature times the derivatives by
+// the pixel.
+struct PixelSums {
+  explicit PixelSums(Index points) : rows(5, points) {}
+  double* pull(int axis) const { return rows[axis].data; }
+  double* curvature(int axes) const { return rows[2 + axes].data; }  // of uu, uv, vv
+
+  Scratch<double, 2> rows;
+};
+
 // Room for one pose after the other; it is made once. `model` must outlive it.
-struct PoseView {
+class PoseView {
+ public:
   explicit PoseView(const Model& body)
       : model(body),
         columns(body.tree.segments(), 3, 3),
         origins(body.tree.segments(), 3),
-        room(2 * body.flesh.rings()),
-        front_room(2 * body.flesh.rings()),
-        contour(room.contour()),
-        front(front_room.contour()) {}
+        rings(body.flesh, body.traced),
+        frames_of_rings(rings),
+        room_(rings),
+        front_room_(rings),
+        contour(room_.contour()),
+        front(front_room_.contour()),
+        pixel_sums(contour.count),
+        occluders(body.flesh.parts()) {}
 
   const Model& model;
   Index number = 0;            // of the pose, of those of a call
   Scratch<double, 3> columns;  // (S, 3, 3) of the segments
   Scratch<double, 2> origins;  // (S, 3)
-  ContourRoom room, front_room;
-  Contour contour;  // traced if some term asks for it
-  Contour front;    // room for other points of the rings
+  const RingLanes rings;
+  const RingFrames frames_of_rings;
+
+ private:
+  const ContourRoom room_, front_room_;
+  mutable std::vector<double> rows_;
+
+ public:
+  const Contour contour;  // traced if some term asks for it
+  const Contour front;    // room for other points of the rings
+  const PixelSums pixel_sums;
+  const Occluders occluders;
 
   Frames frames() const { return {columns.view(), origins.view()}; }
   // Segment of a part of the flesh.
   Index owner(Index part) const { return model.flesh.part_segments[part]; }
+  // Room for a term, of so many rows; the next term gets the same.
+  Matrix rows(Index count, Index length) const {
+    rows_.resize(std::max<std::size_t>(rows_.size(), count * length));
+    return {rows_.data(), {count, length}};
+  }
+
+  // Adds a residual at contour point i, with derivatives gu and gv by its pixel; or lists it.
+  void add(Index i, double gu, double gv, double pull, double curvature, const Sums& sums) const {
+    if (sums.list.data) {
+      const auto by = [&](int k) { return gu * contour.by[k][i] + gv * contour.by[3 + k][i]; };
+      const auto point = contour.point(i);
+      sums.add(owner(contour.parts[i]), point.data(), by(0), by(1), by(2), pull, curvature);
+      return;
+    }
+    pixel_sums.pull(0)[i] += pull * gu;
+    pixel_sums.pull(1)[i] += pull * gv;
+    pixel_sums.curvature(0)[i] += curvature * gu * gu;
+    pixel_sums.curvature(1)[i] += curvature * gu * gv;
+    pixel_sums.curvature(2)[i] += curvature * gv * gv;
+  }
+  // Adds one residual at each contour point (P,) that is seen.
+  void add_all(const double* gu, const double* gv, const double* pull, const double* curvature,
+               const Sums& sums) const {
+    if (sums.list.data) {
+      for (Index i = 0; i < contour.count; ++i) {
+        if (contour.shows(i)) add(i, gu[i], gv[i], pull[i], curvature[i], sums);
+      }
+      return;
+    }
+    const Sums none;
+#pragma omp simd
+    for (Index i = 0; i < contour.count; ++i) {
+      add(i, gu[i], gv[i], pull[i], curvature[i], none);
+    }
+  }
 };
 
 // Marks which points of the pose in a view other parts hide.
 inline void mark_points(const PoseView& view, const Contour& points) {
-  mark_visibility(view.model.flesh, view.model.occluders, view.columns, view.origins, points.parts,
-                  points.points, points.valid, points.covered, points.hidden);
+  mark_hidden(view.model.flesh, view.model.occluders, view.rings.extents(), view.columns,
+              view.origins, view.occluders,
+              {points.count, points.parts, points.x, points.y, points.z, points.valid,
+               points.covered, points.hidden});
 }
 
 // Takes in the pose, of this number, whose frames are in a view; its contour if it is to be traced.
 inline void look(PoseView& view, Index number, bool traced) {
   view.number = number;
+  view.pixel_sums.rows.fill(0.0);
+  view.frames_of_rings.place(view.rings, view.columns, view.origins);
   if (!traced) return;
-  trace_contour(view.model.flesh, view.model.traced, view.model.lens, view.columns, view.origins,
-                view.contour);
+  trace_contour(view.rings, view.frames_of_rings, view.model.lens, view.contour);
   mark_points(view, view.contour);
+}
+
+// Takes the sums at the points of the contour to those of the segments.
+HMT_WIDE inline void lift_pixel_sums(const PoseView& view, const Sums& sums) {
+  const Contour& contour = view.contour;
+  const PixelSums& own = view.pixel_sums;
+  const Index n = view.rings.count();
+  const double *gu = own.pull(0), *gv = own.pull(1);
+  const double *uu = own.curvature(0), *uv = own.curvature(1), *vv = own.curvature(2);
+  for (Index i = 0; i < contour.count; ++i) {
+    if (uu[i] + vv[i] == 0.0) continue;
+    SegmentSums& segment = sums.segments[view.rings.segments()[i < n ? i : i - n]];
+    const double x = contour.x[i], y = contour.y[i], z = contour.z[i];
+    double wrenches[2][lanes] = {}, pushed[2][lanes];  // of the pixel's two coordinates
+    for (int k = 0; k < 2; ++k) {
+      const double a = contour.by[3 * k][i], b = contour.by[3 * k + 1][i];
+      const double c = contour.by[3 * k + 2][i];
+      const double wrench[6] = {a, b, c, y * c - z * b, z * a - x * c, x * b - y * a};
+      std::copy(wrench, wrench + 6, wrenches[k]);
+    }
+#pragma omp simd
+    for (int k = 0; k < lanes; ++k) {
+      pushed[0][k] = uu[i] * wrenches[0][k] + uv[i] * wrenches[1][k];
+      pushed[1][k] = uv[i] * wrenches[0][k] + vv[i] * wrenches[1][k];
+      segment[6][k] += gu[i] * wrenches[0][k] + gv[i] * wrenches[1][k];
+    }
+    for (int j = 0; j < 6; ++j) {
+      const double first = wrenches[0][j], second = wrenches[1][j];
+#pragma omp simd
+      for (int k = 0; k < lanes; ++k) {
+        segment[j][k] += first * pushed[0][k] + second * pushed[1][k];
+      }
+    }
+  }
 }
 
 // Standard deviation of a contour point, px, whose noise on the body is given in m.
@@ -83,19 +179,9 @@ inline constexpr Index fewest = 20;
 inline double weight_of_each(double weight, Index shared, const Contour& points) {
   Index count = shared;
   if (count == 0) {
-    for (Index i = 0; i < points.count(); ++i) count += points.valid[i] && !points.hidden[i];
+    for (Index i = 0; i < points.count; ++i) count += points.shows(i);
   }
   return weight / double(std::max(count, fewest));
-}
-
-// The derivative (3,) of a function of the pixel by the point, from those by column and row, gu and
-// gv; j (2, 3) is the projection.
-struct Gradient {
-  double x, y, z;
-};
-
-inline Gradient by_point(double gu, double gv, const double* j) {
-  return {gu * j[0] + gv * j[3], gu * j[1] + gv * j[4], gu * j[2] + gv * j[5]};
 }
 
 }  // namespace hmt

@@ -18,7 +18,7 @@ namespace py = pybind11;
 struct Name {
   const char* text = "";
   const Name* outer = nullptr;
-  std::string full() const {
+  [[gnu::noinline]] std::string full() const {
     return outer ? outer->full() + (text[0] == '[' ? "" : ".") + text : std::string(text);
   }
 };
@@ -55,7 +55,7 @@ struct TupleOf<std::tuple<T...>> : std::true_type {};
 template <class T, std::size_t N>
 struct TupleOf<std::array<T, N>> : std::true_type {};
 
-inline std::string seen(py::handle value) {
+[[gnu::noinline]] inline std::string seen(py::handle value) {
   if (!py::isinstance<py::array>(value)) return py::str(py::type::of(value).attr("__name__"));
   auto array = py::reinterpret_borrow<py::array>(value);
   std::string text = py::str(array.dtype());
@@ -66,11 +66,22 @@ inline std::string seen(py::handle value) {
   return text;
 }
 
+// Raises the error of an array of another kind than is wanted.
+[[noreturn, gnu::noinline]] inline void refuse_array(py::handle value, const Name& name, char kind,
+                                                     int bytes, int axes, bool written) {
+  std::string wanted = kind == 'b' ? "bool" : kind == 'f' ? "float" : kind == 'u' ? "uint" : "int";
+  if (kind != 'b') wanted += std::to_string(8 * bytes);
+  throw py::type_error(name.full() + ": wanted a contiguous array of " + wanted + " with " +
+                       std::to_string(axes) + (axes == 1 ? " axis" : " axes") +
+                       (written ? " that can be written" : "") + ", saw " + seen(value));
+}
+
 template <class T, int N>
-Array<T, N> load_array(py::handle value, const Name& name) {
+[[gnu::noinline]] Array<T, N> load_array(py::handle value, const Name& name) {
   using Element = std::remove_const_t<T>;
   constexpr char kind = std::is_same_v<Element, bool>       ? 'b'
                         : std::is_floating_point_v<Element> ? 'f'
+                        : std::is_unsigned_v<Element>       ? 'u'
                                                             : 'i';
   if (py::isinstance<py::array>(value)) {
     auto array = py::reinterpret_borrow<py::array>(value);
@@ -85,11 +96,7 @@ Array<T, N> load_array(py::handle value, const Name& name) {
       return result;
     }
   }
-  std::string wanted = kind == 'b' ? "bool" : kind == 'f' ? "float" : "int";
-  if (kind != 'b') wanted += std::to_string(8 * sizeof(Element));
-  throw py::type_error(name.full() + ": wanted a contiguous array of " + wanted + " with " +
-                       std::to_string(N) + (N == 1 ? " axis" : " axes") +
-                       (std::is_const_v<T> ? "" : " that can be written") + ", saw " + seen(value));
+  refuse_array(value, name, kind, int(sizeof(Element)), N, !std::is_const_v<T>);
 }
 
 template <class T, std::size_t... I>
@@ -102,8 +109,15 @@ T load_tuple(py::handle value, const Name& name, std::index_sequence<I...>) {
                                             Name{places[I].c_str(), &name})...};
 }
 
+[[gnu::noinline]] inline void expect_tuple(py::handle value, const Name& name,
+                                           std::size_t members) {
+  if (PyTuple_Check(value.ptr()) && py::len(value) == members) return;
+  throw py::type_error(name.full() + ": wanted a tuple of " + std::to_string(members) + ", saw " +
+                       seen(value));
+}
+
 template <class T>
-T load(py::handle value, const Name& name) {
+[[gnu::noinline]] T load(py::handle value, const Name& name) {
   if constexpr (ArrayOf<T>::value) {
     return load_array<typename ArrayOf<T>::Element, ArrayOf<T>::axes>(value, name);
   } else if constexpr (std::is_arithmetic_v<T>) {
@@ -126,10 +140,7 @@ T load(py::handle value, const Name& name) {
       else
         return member_count<T>();
     }();
-    if (!PyTuple_Check(value.ptr()) || py::len(value) != members) {
-      throw py::type_error(name.full() + ": wanted a tuple of " + std::to_string(members) +
-                           ", saw " + seen(value));
-    }
+    expect_tuple(value, name, members);
     if constexpr (TupleOf<T>::value) {
       return load_tuple<T>(value, name, std::make_index_sequence<members>());
     } else {

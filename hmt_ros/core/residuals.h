@@ -8,7 +8,8 @@
 // the segments that a degree of freedom moves give its row of the gradient and of the Hessian.
 #pragma once
 
-#include "arrays.h"
+#include "lanes.h"
+#include "wide.h"
 
 namespace hmt {
 
@@ -63,16 +64,21 @@ inline void add_row(const Vector& row, double pull, double curvature, const Vect
   }
 }
 
+// Of one segment: sums of k b b^T (6, 6), then of g b (6,), in rows of whole lanes.
+using SegmentSums = std::array<std::array<double, lanes>, 7>;
+
 // Sums of the residuals of one pose by segment, or a list of them; nothing: no derivatives.
 struct Sums {
   // Columns of a list: segment, point (3), derivative (3), pull, curvature.
   static constexpr int recorded = 9;
 
-  Matrix wrenches;     // (S, 6) sums of g b
-  Tensor stiffnesses;  // (S, 6, 6) sums of k b b^T, upper triangle
-  Matrix list;         // (1 + M, recorded); entry (0, 0) counts them
+  Array<SegmentSums, 1> segments;  // (S,)
+  Matrix list;                     // (1 + M, recorded); entry (0, 0) counts them
 
-  bool wanted() const { return wrenches.data != nullptr || list.data != nullptr; }
+  bool wanted() const { return segments.data != nullptr || list.data != nullptr; }
+  void clear() const {
+    if (segments.data) segments.fill({});
+  }
   // Adds a residual at the point p (3,) with derivative a (3,) to segment s.
   void add(Index s, const double* p, double a0, double a1, double a2, double pull,
            double curvature) const {
@@ -85,66 +91,55 @@ struct Sums {
       }
       return;
     }
-    if (!wrenches.data) return;
-    const double b[6] = {
+    if (!segments.data) return;
+    const double b[lanes] = {
         a0, a1, a2, p[1] * a2 - p[2] * a1, p[2] * a0 - p[0] * a2, p[0] * a1 - p[1] * a0};
-    double* wrench = wrenches.data + 6 * s;
-    double* stiffness = stiffnesses.data + 36 * s;
-    for (int i = 0; i < 6; ++i) {
-      wrench[i] += pull * b[i];
-      const double c = curvature * b[i];
-      for (int j = i; j < 6; ++j) stiffness[6 * i + j] += c * b[j];
-    }
+    SegmentSums& own = segments[s];
+    for (int i = 0; i < 6; ++i) add_scaled(curvature * b[i], b, own[i].data(), lanes);
+    add_scaled(pull, b, own[6].data(), lanes);
   }
 };
 
 // Adds the gradient (d,) and the Hessian (d, d) of one pose; overwrites the sums of the segments.
 // Axes and origins (d, 3) are those of the degrees of freedom, camera frame.
-inline void assemble_pose(const Tree& tree, const Table& axes, const Table& dof_origins,
-                          const Matrix& wrenches, const Tensor& stiffnesses, const Vector& gradient,
-                          const Matrix& hessian) {
-  const Index count = tree.segments(), d = tree.dimension();
-  for (Index s = count - 1; s > 0; --s) {
-    const Index parent = tree.parents[s];
-    if (parent < 0) continue;
-    for (int i = 0; i < 6; ++i) {
-      wrenches(parent, i) += wrenches(s, i);
-      for (int j = i; j < 6; ++j) stiffnesses(parent, i, j) += stiffnesses(s, i, j);
-    }
+HMT_WIDE inline void assemble_pose(const Tree& tree, const Table& axes, const Table& dof_origins,
+                                   const Array<SegmentSums, 1>& segments, const Vector& gradient,
+                                   const Matrix& hessian) {
+  const Index d = tree.dimension();
+  for (Index s = tree.segments() - 1; s > 0; --s) {
+    if (tree.parents[s] < 0) continue;
+    add_scaled(1.0, segments[s][0].data(), segments[tree.parents[s]][0].data(), 7 * lanes);
   }
-  for (Index s = 0; s < count; ++s) {
-    for (int i = 0; i < 6; ++i) {
-      for (int j = 0; j < i; ++j) stiffnesses(s, i, j) = stiffnesses(s, j, i);
-    }
-  }
-  Scratch<double, 2> twists(d, 6);
+  Scratch<double, 2> twists(d, lanes);
   for (Index j = 0; j < d; ++j) {
     double* twist = twists[j].data;
+    const double *o = dof_origins[j].data, *w = axes[j].data;
     if (tree.dof_is_rotation[j]) {
-      const double *o = dof_origins[j].data, *w = axes[j].data;
       twist[0] = o[1] * w[2] - o[2] * w[1];
       twist[1] = o[2] * w[0] - o[0] * w[2];
       twist[2] = o[0] * w[1] - o[1] * w[0];
       for (int i = 0; i < 3; ++i) twist[3 + i] = w[i];
     } else {
-      for (int i = 0; i < 3; ++i) twist[i] = axes(j, i);
+      for (int i = 0; i < 3; ++i) twist[i] = w[i];
     }
   }
+  const auto product = [](const double* x, const double* y) {
+    double terms[lanes];
+#pragma omp simd
+    for (int k = 0; k < lanes; ++k) terms[k] = x[k] * y[k];
+    return sum_lanes(terms);
+  };
   for (Index j = 0; j < d; ++j) {
-    const Index s = tree.dof_segments[j];
+    const SegmentSums& own = segments[tree.dof_segments[j]];
     const double* twist = twists[j].data;
-    double pushed[6];
-    for (int i = 0; i < 6; ++i) {
-      double total = 0.0;
-      for (int k = 0; k < 6; ++k) total += stiffnesses(s, i, k) * twist[k];
-      pushed[i] = total;
-      gradient[j] += wrenches(s, i) * twist[i];
-    }
+    double pushed[lanes] = {};
+    for (int k = 0; k < 6; ++k) add_scaled(twist[k], own[k].data(), pushed, lanes);
+    gradient[j] += product(own[6].data(), twist);
+    double *row = hessian[j].data, *column = hessian.data + j;
     for (Index i = j; i >= 0; i = tree.dof_parents[i]) {
-      double total = 0.0;
-      for (int k = 0; k < 6; ++k) total += twists(i, k) * pushed[k];
-      hessian(i, j) += total;
-      if (i != j) hessian(j, i) += total;
+      const double total = product(twists[i].data, pushed);
+      column[i * d] += total;
+      if (i != j) row[i] += total;
     }
   }
 }

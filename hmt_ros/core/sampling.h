@@ -23,43 +23,55 @@ struct Sample {
 // A coordinate that is no number counts as 0, so that it reads inside the map.
 inline Index pixel_before(double x) { return x > 0.0 ? static_cast<Index>(x) : 0; }
 
+// A coordinate in a window of so many pixels, with a pixel after it.
+inline double inside(double x, Index extent) { return between(x, 0.0, double(extent) - 1.001); }
+
+// The values of four pixels around a place: a, b above, p, q below.
+struct Cell {
+  double a, b, p, q;
+};
+
+inline Sample bilinear(const Cell& cell, double du, double dv) {
+  const auto [a, b, p, q] = cell;
+  const double upper = a + (b - a) * du;
+  const double lower = p + (q - p) * du;
+  return {upper + (lower - upper) * dv, (b - a) * (1.0 - dv) + (q - p) * dv, lower - upper};
+}
+
 // At a pixel of the whole image. Outside the window the nearest value is continued.
 inline Sample sample(const ImageMap& map, Index channel, double u, double v) {
   const Index h = map.values.size(1), w = map.values.size(2);
   const double x = u - double(map.left), y = v - double(map.top);
-  const double cx = between(x, 0.0, double(w) - 1.001), cy = between(y, 0.0, double(h) - 1.001);
+  const double cx = inside(x, w), cy = inside(y, h);
   const Index i = pixel_before(cy), j = pixel_before(cx);
-  const double dv = cy - double(i), du = cx - double(j);
   const float* row = map.values.data + (channel * h + i) * w + j;
-  const float a = row[0], b = row[1], p = row[w], q = row[w + 1];
-  const double upper = a + (b - a) * du;
-  const double lower = p + (q - p) * du;
-  Sample result{upper + (lower - upper) * dv, (b - a) * (1.0 - dv) + (q - p) * dv, lower - upper};
+  Sample result = bilinear({row[0], row[1], row[w], row[w + 1]}, cx - double(j), cy - double(i));
   if (x < 0.0 || x > double(w) - 1.0) result.slope_u = 0.0;
   if (y < 0.0 || y > double(h) - 1.0) result.slope_v = 0.0;
   return result;
 }
 
-// `sample` of a map of distances, continued outside its window by the way to the window.
-inline Sample sample_distance(const ImageMap& map, Index channel, double u, double v) {
-  Sample result = sample(map, channel, u, v);
-  const double h = double(map.values.size(1)), w = double(map.values.size(2));
+// How far a coordinate is before the first of so many pixels, below 0, or behind the last one.
+inline double outside(double x, double extent) {
+  return x < 0.0 ? x : x > extent - 1.0 ? x - extent + 1.0 : 0.0;
+}
+
+// The value of a map of distances at a pixel of the whole image, between four of its values.
+// Outside its window it is continued by the way to the window.
+inline Sample distance_between(const Cell& cell, const ImageMap& map, double u, double v) {
+  const Index h = map.values.size(1), w = map.values.size(2);
   const double x = u - double(map.left), y = v - double(map.top);
-  if (x < 0.0) {
-    result.value -= x;
-    result.slope_u = -1.0;
-  } else if (x > w - 1.0) {
-    result.value += x - w + 1.0;
-    result.slope_u = 1.0;
-  }
-  if (y < 0.0) {
-    result.value -= y;
-    result.slope_v = -1.0;
-  } else if (y > h - 1.0) {
-    result.value += y - h + 1.0;
-    result.slope_v = 1.0;
-  }
-  return result;
+  const double cx = inside(x, w), cy = inside(y, h);
+  const Sample found = bilinear(cell, cx - double(static_cast<std::int32_t>(cx)),
+                                cy - double(static_cast<std::int32_t>(cy)));
+  const double beside = outside(x, double(w)), above = outside(y, double(h));
+  return {found.value + std::abs(beside) + std::abs(above),
+          beside < 0.0   ? -1.0
+          : beside > 0.0 ? 1.0
+                         : found.slope_u,
+          above < 0.0   ? -1.0
+          : above > 0.0 ? 1.0
+                        : found.slope_v};
 }
 
 }  // namespace hmt

@@ -7,6 +7,7 @@
 #pragma once
 
 #include "arrays.h"
+#include "elementary.h"
 #include "wide.h"
 
 namespace hmt {
@@ -138,34 +139,85 @@ class Selection {
   Scratch<double, 1> gains_;     // of the candidates, when they were last looked at
 };
 
-// Chooses hypotheses that stand for all, by their joints (N, J, 3) and weights (N,); returns how
-// many, at most as `chosen` (K,) has place for.
+// Fills the log weights (K,) of groups of hypotheses, each with the place of its group.
+inline void sum_groups(const Numbers& log_weights, const Places& owner, const Vector& groups) {
+  Scratch<double, 1> tops(groups.size()), sums(groups.size());
+  tops.fill(-infinity);
+  for (Index i = 0; i < owner.size(); ++i) tops[owner[i]] = most(tops[owner[i]], log_weights[i]);
+  for (Index i = 0; i < owner.size(); ++i) {
+    sums[owner[i]] += elementary::exp(log_weights[i] - tops[owner[i]]);
+  }
+  for (Index k = 0; k < groups.size(); ++k) {
+    groups[k] = tops[k] > -infinity ? tops[k] + elementary::log(sums[k]) : -infinity;
+  }
+}
+
+// Chooses hypotheses that stand for all, by their joints (N, J, 3) and log weights (N,); returns
+// how many, at most as `chosen` (K,) has place for.
 //
 // `same` and `cap` are the mean distance of hypotheses that are one, and the largest that a joint
 // counts with, m. Those in `first` are kept in any case, after the heaviest. `owner` (N,) becomes
-// the place in `chosen` of the one that stands for each.
-inline Index choose_representatives(const Tables& joints, const Numbers& weights, double same,
+// the place in `chosen` of the one that stands for each, `groups` (K,) the log weights of all that
+// each stands for.
+inline Index choose_representatives(const Tables& joints, const Numbers& log_weights, double same,
                                     double cap, const Places& first, const Array<Index, 1>& chosen,
-                                    const Array<Index, 1>& owner) {
+                                    const Array<Index, 1>& owner, const Vector& groups) {
   const Index n = joints.size();
   expect_shape("joints", joints, {-1, -1, 3});
   expect(joints.size(1) > 0, "joints", "one joint at least");
-  expect_shape("weights", weights, {n});
+  expect_shape("log_weights", log_weights, {n});
   expect_range("first", first, 0, n);
   expect(chosen.size() <= n, "chosen", "no more than there are hypotheses");
   expect_shape("owner", owner, {n});
-  Selection selection(joints, weights, static_cast<float>(same), static_cast<float>(cap));
+  expect_shape("groups", groups, {chosen.size()});
   owner.fill(0);
-  for (Index kept = 0; kept < chosen.size(); ++kept) {
+  if (chosen.empty()) return 0;
+  Scratch<double, 1> weights(n);
+  const double top = log_weights[place_of_largest(log_weights)];
+  double total = 0.0;
+  for (Index i = 0; i < n; ++i) total += weights[i] = elementary::exp(log_weights[i] - top);
+  for (double& weight : weights.view()) weight /= total;
+  Selection selection(joints, weights, static_cast<float>(same), static_cast<float>(cap));
+  Index kept = 0;
+  for (; kept < chosen.size(); ++kept) {
     if (kept == 1 + first.size()) selection.weigh();
     const Index best = kept == 0              ? place_of_largest(weights)
                        : kept <= first.size() ? first[kept - 1]
                                               : selection.best();
-    if (best < 0) return kept;
+    if (best < 0) break;
     chosen[kept] = best;
     selection.keep(best, kept, owner);
   }
-  return chosen.size();
+  sum_groups(log_weights, owner, groups);
+  return kept;
+}
+
+// Fills `kept` (N,) with the hypotheses whose joints (N, J, 3) are `same` m or more from those of
+// all that were kept before, in the mean, and returns their number. They are looked at in `order`.
+inline Index keep_apart(const Tables& joints, const Places& order, double same,
+                        const Array<Index, 1>& kept) {
+  const Index n = joints.size(), count = joints.size(1);
+  expect_shape("joints", joints, {-1, -1, 3});
+  expect_shape("order", order, {n});
+  expect_range("order", order, 0, n);
+  expect_shape("kept", kept, {n});
+  Index number = 0;
+  for (Index i : order) {
+    const double* own = joints[i].data;
+    bool apart = true;
+    for (Index place = 0; place < number && apart; ++place) {
+      const double* other = joints[kept[place]].data;
+      double total = 0.0;
+      for (Index j = 0; j < 3 * count; j += 3) {
+        const double x = own[j] - other[j], y = own[j + 1] - other[j + 1];
+        const double z = own[j + 2] - other[j + 2];
+        total += std::sqrt(x * x + y * y + z * z);
+      }
+      apart = total / static_cast<double>(count) >= same;
+    }
+    if (apart) kept[number++] = i;
+  }
+  return number;
 }
 
 }  // namespace hmt

@@ -91,6 +91,38 @@ HMT_WIDE inline void solve_lower(Rows l, Index n, Index first) {
   }
 }
 
+// Inverse of a positive definite matrix, of which it reads what is not left of the diagonal, in
+// place; `room` holds as much. Makes the logarithm of the determinant of the matrix. False, with
+// nothing of use in place, if the matrix is not positive definite.
+HMT_WIDE inline bool invert_positive(Rows u, Index n, Rows room, double& log_determinant) {
+  log_determinant = 0.0;
+  for (Index a = 0; a < n; ++a) {
+    std::fill_n(room[a], u.stride, 0.0);
+    room[a][a] = 1.0;
+  }
+  // The upper factor in u, and the inverse of its transpose, a lower triangle, in the room.
+  for (Index a = 0; a < n; ++a) {
+    double *row = u[a], *own = room[a];
+    if (!(row[a] > 0.0)) return false;
+    log_determinant += elementary::log(row[a]);
+    const double root = std::sqrt(row[a]);
+    const Index filled = padded(a + 1);
+    divide(row, root, a / matrix_lanes * matrix_lanes, u.stride);
+    divide(own, root, 0, filled);
+    for (Index c = a + 1; c < n; ++c) {
+      subtract(room[c], row[c], own, 0, filled);
+      subtract(u[c], row[c], row, c / matrix_lanes * matrix_lanes, u.stride);
+    }
+  }
+  for (Index a = 0; a < n; ++a) {
+    double* row = u[a];
+    std::fill_n(row, u.stride, 0.0);
+    for (Index k = a; k < n; ++k) subtract(row, -room[k][a], room[k], 0, padded(a + 1));
+    for (Index c = 0; c < a; ++c) u[c][a] = row[c];
+  }
+  return true;
+}
+
 // Turns two rows by an angle.
 HMT_INLINE void rotate(double* p, double* q, double cosine, double sine, Index width) {
   for (Index b = 0; b < width; b += matrix_lanes) {

@@ -1,7 +1,11 @@
 // The occluding contour in the image, and its visible points; see hmt_ros/image/surface.py.
 #pragma once
 
+#include <iterator>
+
 #include "camera.h"
+#include "lanes.h"
+#include "wide.h"
 
 namespace hmt {
 
@@ -53,70 +57,103 @@ struct FleshTable {
   }
 };
 
-// Points on the surface at one pose: the contour, P = 2R.
-struct Contour {
-  Array<Index, 1> parts;
-  Matrix points;           // (P, 3) camera frame, m
-  Matrix pixels;           // (P, 2)
-  Tensor projections;      // (P, 2, 3) derivative of the pixels by the points
-  Matrix normals;          // (P, 2) out of the body, in the image
-  Array<bool, 1> valid;    // the point exists and lies before the camera
-  Array<bool, 1> covered;  // another part lies on the same ray, before or behind
-  Array<bool, 1> hidden;   // another part lies on the same ray, before
-  Vector noise;            // how far contours of people lie from the point, a deviation, m
-
-  Index count() const { return parts.size(); }
-  void check() const {
-    const Index p = count();
-    expect_shape("points", points, {p, 3});
-    expect_shape("pixels", pixels, {p, 2});
-    expect_shape("projections", projections, {p, 2, 3});
-    expect_shape("normals", normals, {p, 2});
-    expect_shape("valid", valid, {p});
-    expect_shape("covered", covered, {p});
-    expect_shape("hidden", hidden, {p});
-    expect_shape("noise", noise, {p});
+// Rings side by side, n of them with some more to whole lanes; made once for many poses.
+class RingLanes {
+ public:
+  RingLanes(const FleshTable& flesh, const Mask& wanted)
+      : flesh_(flesh),
+        count_(in_whole_lanes(flesh.rings())),
+        parts_(2 * count_),
+        segments_(count_),
+        extents_(flesh.parts()),
+        rows_(rows, count_) {
+    expect_shape("wanted", wanted, {flesh.parts()});
+    for (Index i = 0; i < count_; ++i) {
+      const Index r = std::min(i, flesh.rings() - 1), part = flesh.ring_parts[r];
+      const Ring ring = flesh.ring(r);
+      const double values[] = {ring.centre[0], ring.centre[1], ring.centre[2], ring.radii[0],
+                               ring.radii[1],  ring.slopes[0], ring.slopes[1], ring.leans[0],
+                               ring.leans[1],  ring.noise[0],  ring.noise[1]};
+      for (Index k = 0; k < std::ssize(values); ++k) rows_(k, i) = values[k];
+      rows_(traced_row, i) = i == r && wanted[part] ? 1.0 : 0.0;
+      parts_[i] = parts_[count_ + i] = part;
+      segments_[i] = flesh.part_segments[part];
+      if (i != r) continue;
+      if (ring.exponent != 1.0 || ring.slopes[0] != ring.slopes[1]) odd_.push_back(r);
+      const double* middle = flesh.part_centres[part].data;
+      double away[3];
+      for (int k = 0; k < 3; ++k) away[k] = std::abs(ring.centre[k] - middle[k]);
+      for (int k = 0; k < 2; ++k) away[k] += std::abs(ring.radii[k]);
+      extents_[part] = most(extents_[part], std::sqrt(dot(away, away)));
+    }
   }
+  const FleshTable& flesh() const { return flesh_; }
+  Index count() const { return count_; }
+  // Part (2n,) of each point.
+  const Index* parts() const { return parts_.view().data; }
+  const Index* segments() const { return segments_.view().data; }
+  // How far rings reach from the centres of their parts (B,), m.
+  const double* extents() const { return extents_.view().data; }
+  // Rings that are no ellipse, or that lean by different slopes.
+  const std::vector<Index>& odd() const { return odd_; }
+  const double* centre(int axis) const { return rows_[axis].data; }
+  const double* radius(int axis) const { return rows_[3 + axis].data; }
+  const double* slope(int axis) const { return rows_[5 + axis].data; }
+  const double* lean(int axis) const { return rows_[7 + axis].data; }
+  const double* noise(int axis) const { return rows_[9 + axis].data; }
+  const double* traced() const { return rows_[traced_row].data; }  // 1 or 0
+
+ private:
+  static constexpr Index traced_row = 11, rows = 12;
+  const FleshTable& flesh_;
+  const Index count_;
+  Scratch<Index, 1> parts_, segments_;
+  Scratch<double, 1> extents_;
+  Scratch<double, 2> rows_;
+  std::vector<Index> odd_;
+};
+
+// Points on the surface at one pose side by side: of n rings points i and n + i, P = 2n.
+struct Contour {
+  const Index* parts;         // of the points
+  Index count;                // P, whole lanes
+  double *x, *y, *z;          // camera frame, m
+  double *u, *v;              // pixels
+  std::array<double*, 6> by;  // derivative (2, 3) of the pixels by the points
+  double *nx, *ny, *nz;       // normals of the surface, of any length
+  double *nu, *nv;            // unit normals out of the body, in the image
+  double* noise;              // how far contours of people lie from the point, a deviation, m
+  double* valid;              // 1: the point exists and lies before the camera, or 0
+  double* covered;            // 1: another part lies on the same ray, before or behind, or 0
+  double* hidden;             // 1: another part lies on the same ray, before, or 0
+  double *cosine, *sine;      // of the angle on the ring
+
+  bool shows(Index i) const { return valid[i] > hidden[i]; }
+  std::array<double, 3> point(Index i) const { return {x[i], y[i], z[i]}; }
 };
 
 // Room for a contour.
 class ContourRoom {
  public:
-  explicit ContourRoom(Index p)
-      : parts_(p),
-        points_(p, 3),
-        pixels_(p, 2),
-        projections_(p, 2, 3),
-        normals_(p, 2),
-        valid_(p),
-        covered_(p),
-        hidden_(p),
-        noise_(p) {}
+  explicit ContourRoom(const RingLanes& rings)
+      : parts_(rings.parts()), rows_(22, 2 * rings.count()) {}
   Contour contour() const {
-    return {parts_.view(), points_.view(),  pixels_.view(), projections_.view(), normals_.view(),
-            valid_.view(), covered_.view(), hidden_.view(), noise_.view()};
+    const auto row = [&](Index i) { return rows_[i].data; };
+    return {parts_,  rows_.size(1), row(0),  row(1),
+            row(2),  row(3),        row(4),  {row(5), row(6), row(7), row(8), row(9), row(10)},
+            row(11), row(12),       row(13), row(14),
+            row(15), row(16),       row(17), row(18),
+            row(19), row(20),       row(21)};
   }
 
  private:
-  Scratch<Index, 1> parts_;
-  Scratch<double, 2> points_, pixels_;
-  Scratch<double, 3> projections_;
-  Scratch<double, 2> normals_;
-  Scratch<bool, 1> valid_, covered_, hidden_;
-  Scratch<double, 1> noise_;
+  const Index* parts_;
+  Scratch<double, 2> rows_;
 };
 
 // sgn(x) |x|^exponent.
 inline double signed_power(double x, double exponent) {
   return sign(x) * std::pow(std::abs(x), exponent);
-}
-
-// The centre of a ring relative to the camera, in the axes of its segment (3, 3), origin (3,).
-inline void ring_seen(const Ring& ring, const double* axes, const double* o, double* seen) {
-  for (int i = 0; i < 3; ++i) {
-    const double* axis = axes + 3 * i;
-    seen[i] = axis[0] * o[0] + axis[1] * o[1] + axis[2] * o[2] + ring.centre[i];
-  }
 }
 
 // The point (3,) of a ring whose angle has this cosine and sine, and the normal (3,) there, camera
@@ -139,12 +176,6 @@ inline void ring_point(const Ring& ring, double c, double s, const double* axes,
     point[k] = o[k] + axes[k] * px + axes[3 + k] * py + axes[6 + k] * cz;
     normal[k] = axes[k] * nx + axes[3 + k] * ny + axes[6 + k] * nz;
   }
-}
-
-// How far contours of people lie from a point of a ring, a standard deviation, m.
-inline double ring_deviation(const Ring& ring, double c, double s) {
-  const double across = c * ring.noise[0], ahead = s * ring.noise[1];
-  return std::sqrt(across * across + ahead * ahead);
 }
 
 // g(w) of hmt_ros/body/flesh.py, whose roots are the angles of the contour on a ring.
@@ -190,73 +221,165 @@ inline bool bracketed_roots(const ContourCondition& condition, double* cosines, 
   return found[0] && found[1];
 }
 
-// Cosines and sines (2,) of the angles of the contour on a ring; false: there are none.
-inline bool contour_angles(const Ring& ring, const double* seen, double* cosines, double* sines) {
-  const double kx = ring.slopes[0], ky = ring.slopes[1], uz = seen[2];
-  const double bx = (seen[0] - uz * ring.leans[0]) / ring.radii[0];
-  const double by = (seen[1] - uz * ring.leans[1]) / ring.radii[1];
-  if (ring.exponent != 1.0 || kx != ky) {
-    return bracketed_roots({bx, by, uz, kx, ky, 2.0 - ring.exponent}, cosines, sines);
-  }
-  const double length = std::sqrt(bx * bx + by * by);
-  const double cosine = -(1.0 - uz * kx) / most(length, 1e-12);
-  if (!(std::abs(cosine) < 1.0)) return false;
-  const double sine = std::sqrt(1.0 - cosine * cosine);
-  const double cm = bx / length, sm = by / length;
-  cosines[0] = cm * cosine - sm * sine;
-  sines[0] = sm * cosine + cm * sine;
-  cosines[1] = cm * cosine + sm * sine;
-  sines[1] = sm * cosine - cm * sine;
-  return true;
+// Cosines and sines (2,) of the angles of the contour on a ring that is no ellipse or leans by
+// different slopes; false: there are none.
+inline bool contour_angles(const Ring& ring, double bx, double by, double uz, double* cosines,
+                           double* sines) {
+  const ContourCondition condition{bx, by, uz, ring.slopes[0], ring.slopes[1], 2.0 - ring.exponent};
+  return bracketed_roots(condition, cosines, sines);
 }
 
-// Fills the contour of one pose: points, pixels, normals, noise. `wanted` (B,) are the parts whose
-// contour is traced; the others have no valid points.
-inline void trace_contour(const FleshTable& flesh, const Mask& wanted, const Lens& lens,
-                          const Tables& columns, const Table& origins, const Contour& contour) {
-  flesh.check_frames(columns, origins);
-  expect_shape("wanted", wanted, {flesh.parts()});
-  const Index rings = flesh.rings();
-  expect_shape("contour.parts", contour.parts, {2 * rings});
-  for (Index r = 0; r < rings; ++r) {
-    const Index part = flesh.ring_parts[r];
-    contour.parts[r] = contour.parts[r + rings] = part;
-    contour.valid[r] = contour.valid[r + rings] = false;
-    if (!wanted[part]) continue;
-    const Ring ring = flesh.ring(r);
-    const Index s = flesh.part_segments[part];
-    const double *axes = columns[s].data, *origin = origins[s].data;
-    double seen[3], cosines[2], sines[2];
-    ring_seen(ring, axes, origin, seen);
-    if (!contour_angles(ring, seen, cosines, sines)) continue;
-    for (int side = 0; side < 2; ++side) {
-      const Index i = r + side * rings;
-      const double c = cosines[side], sn = sines[side];
-      double *point = contour.points[i].data, normal[3];
-      contour.noise[i] = ring_deviation(ring, c, sn);
-      ring_point(ring, c, sn, axes, origin, point, normal);
-      if (!project(lens, point[0], point[1], point[2], contour.pixels[i].data,
-                   contour.projections[i].data)) {
-        continue;
-      }
-      const double nu = normal[0] / lens.focal[0], nv = normal[1] / lens.focal[1];
-      const double size = std::sqrt(nu * nu + nv * nv);
-      if (!(size > 0.0)) continue;
-      contour.normals(i, 0) = nu / size;
-      contour.normals(i, 1) = nv / size;
-      contour.valid[i] = true;
+// Frames (12, n) of the segments that carry rings: axes (3, 3), origin (3,).
+struct RingFrames {
+  explicit RingFrames(const RingLanes& rings) : rows(12, rings.count()) {}
+  // Takes in a pose.
+  void place(const RingLanes& rings, const Tables& columns, const Table& origins) const {
+    double* at = rows.view().data;
+    const Index n = rings.count();
+    for (Index i = 0; i < n; ++i, ++at) {
+      const Index s = rings.segments()[i];
+      const double *axes = columns.data + 9 * s, *origin = origins.data + 3 * s;
+      for (Index k = 0; k < 9; ++k) at[k * n] = axes[k];
+      for (Index k = 0; k < 3; ++k) at[(9 + k) * n] = origin[k];
     }
+  }
+  const double* axis(int i, int k) const { return rows[3 * i + k].data; }
+  const double* origin(int k) const { return rows[9 + k].data; }
+
+  Scratch<double, 2> rows;
+};
+
+// The direction (bx, by) in which a ring's normals turn to the camera, and the depth uz of the
+// camera along its axis; see ContourCondition.
+struct Turned {
+  double x, y, depth;
+};
+
+inline Turned turned_ring(const RingLanes& rings, const RingFrames& frames, Index i) {
+  double seen[3];
+  for (int k = 0; k < 3; ++k) {
+    seen[k] = frames.axis(k, 0)[i] * frames.origin(0)[i] +
+              frames.axis(k, 1)[i] * frames.origin(1)[i] +
+              frames.axis(k, 2)[i] * frames.origin(2)[i] + rings.centre(k)[i];
+  }
+  return {(seen[0] - seen[2] * rings.lean(0)[i]) / rings.radius(0)[i],
+          (seen[1] - seen[2] * rings.lean(1)[i]) / rings.radius(1)[i], seen[2]};
+}
+
+// Sets angles of the contour, and which points there are.
+inline void find_angles(const RingLanes& rings, const RingFrames& frames, const Contour& contour) {
+  const Index n = rings.count();
+#pragma omp simd
+  for (Index i = 0; i < n; ++i) {
+    const Turned b = turned_ring(rings, frames, i);
+    const double length = std::sqrt(b.x * b.x + b.y * b.y);
+    const double cosine = -(1.0 - b.depth * rings.slope(0)[i]) / most(length, 1e-12);
+    const double left = 1.0 - cosine * cosine, sine = std::sqrt(left > 0.0 ? left : 0.0);
+    const double cm = b.x / length, sm = b.y / length;
+    contour.cosine[i] = cm * cosine - sm * sine;
+    contour.sine[i] = sm * cosine + cm * sine;
+    contour.cosine[n + i] = cm * cosine + sm * sine;
+    contour.sine[n + i] = sm * cosine - cm * sine;
+    contour.valid[i] = contour.valid[n + i] = std::abs(cosine) < 1.0 ? rings.traced()[i] : 0.0;
+  }
+  for (const Index r : rings.odd()) {
+    const Turned b = turned_ring(rings, frames, r);
+    double cosines[2] = {1.0, 1.0}, sines[2] = {0.0, 0.0};
+    const bool found = contour_angles(rings.flesh().ring(r), b.x, b.y, b.depth, cosines, sines);
+    for (int side = 0; side < 2; ++side) {
+      const Index i = r + side * n;
+      contour.cosine[i] = cosines[side];
+      contour.sine[i] = sines[side];
+      contour.valid[i] = found ? rings.traced()[r] : 0.0;
+    }
+  }
+}
+
+// Sets points, their normals and their noise from angles.
+inline void place_on_rings(const RingLanes& rings, const RingFrames& frames,
+                           const Contour& contour) {
+  const Index n = rings.count();
+  for (int side = 0; side < 2; ++side) {
+    double* const points[] = {contour.x + side * n, contour.y + side * n, contour.z + side * n};
+    double* const normals[] = {contour.nx + side * n, contour.ny + side * n, contour.nz + side * n};
+    const double *cosine = contour.cosine + side * n, *sine = contour.sine + side * n;
+    double* noise = contour.noise + side * n;
+#pragma omp simd
+    for (Index i = 0; i < n; ++i) {
+      const double c = cosine[i], s = sine[i];
+      const double across = c * rings.noise(0)[i], ahead = s * rings.noise(1)[i];
+      const double rx = rings.radius(0)[i], ry = rings.radius(1)[i], cz = rings.centre(2)[i];
+      const double px = rings.centre(0)[i] + rx * c, py = rings.centre(1)[i] + ry * s;
+      const double nx = c / rx, ny = s / ry;
+      const double nz = -(rings.slope(0)[i] * c * c + rings.slope(1)[i] * s * s) -
+                        (nx * rings.lean(0)[i] + ny * rings.lean(1)[i]);
+      noise[i] = std::sqrt(across * across + ahead * ahead);
+      for (int k = 0; k < 3; ++k) {
+        const double x = frames.axis(0, k)[i], y = frames.axis(1, k)[i], z = frames.axis(2, k)[i];
+        points[k][i] = frames.origin(k)[i] + x * px + y * py + z * cz;
+        normals[k][i] = x * nx + y * ny + z * nz;
+      }
+    }
+    for (const Index r : rings.odd()) {
+      const Ring ring = rings.flesh().ring(r);
+      if (ring.exponent == 1.0) continue;
+      double axes[9], origin[3], point[3], normal[3];
+      for (int k = 0; k < 9; ++k) axes[k] = frames.rows(k, r);
+      for (int k = 0; k < 3; ++k) origin[k] = frames.rows(9 + k, r);
+      ring_point(ring, cosine[r], sine[r], axes, origin, point, normal);
+      for (int k = 0; k < 3; ++k) {
+        points[k][r] = point[k];
+        normals[k][r] = normal[k];
+      }
+    }
+  }
+}
+
+// Sets pixels and their derivatives; points without a pixel are not valid.
+template <class Bend>
+void project_points(const Lens& lens, const Bend& bend, const Contour& contour) {
+#pragma omp simd
+  for (Index i = 0; i < contour.count; ++i) {
+    const double z = contour.z[i], a = contour.x[i] / z, b = contour.y[i] / z;
+    double pixel[2], projection[6];
+    set_pixel(lens, bend(lens.coefficients, a, b), a, b, z, pixel, projection);
+    contour.u[i] = pixel[0];
+    contour.v[i] = pixel[1];
+    for (int k = 0; k < 6; ++k) contour.by[k][i] = projection[k];
+    contour.valid[i] = z > lens.near ? contour.valid[i] : 0.0;
+  }
+}
+
+inline void project_points(const Lens& lens, const Contour& contour) {
+  if (lens.model < 0) return project_points(lens, unbent, contour);
+  if (lens.model == 0) return project_points(lens, bent_by_polynomials, contour);
+  project_points(lens, bent_by_angle, contour);
+}
+
+// Sets the contour of one pose: points, pixels, normals, noise.
+HMT_WIDE inline void trace_contour(const RingLanes& rings, const RingFrames& frames,
+                                   const Lens& lens, const Contour& contour) {
+  find_angles(rings, frames, contour);
+  place_on_rings(rings, frames, contour);
+  project_points(lens, contour);
+#pragma omp simd
+  for (Index i = 0; i < contour.count; ++i) {
+    const double nu = contour.nx[i] / lens.focal[0], nv = contour.ny[i] / lens.focal[1];
+    const double size = std::sqrt(nu * nu + nv * nv);
+    contour.nu[i] = nu / size;
+    contour.nv[i] = nv / size;
+    contour.valid[i] = size > 0.0 ? contour.valid[i] : 0.0;
   }
 }
 
 // A part as others see it: |A (x - c)| = 1.
 struct Ellipsoid {
   double centre[3];  // c
-  double far;        // c.c
-  double reach;      // square of the largest radius
+  double distance;   // |c|
   double outside;    // k.k - 1
   double moved[3];   // k = A c
   double shape[3][3];
+  double largest;  // radius
 };
 
 inline Ellipsoid placed_ellipsoid(const double* centre, const double* radii, const double* axes,
@@ -266,11 +389,11 @@ inline Ellipsoid placed_ellipsoid(const double* centre, const double* radii, con
     e.centre[i] = origin[i];
     for (int j = 0; j < 3; ++j) e.centre[i] += axes[3 * j + i] * centre[j];
   }
-  double largest = 0.0;
+  e.largest = 0.0;
   e.outside = -1.0;
   for (int i = 0; i < 3; ++i) {
     const double radius = cover * radii[i];
-    largest = most(largest, radius);
+    e.largest = most(e.largest, radius);
     e.moved[i] = 0.0;
     for (int j = 0; j < 3; ++j) {
       e.shape[i][j] = axes[3 * i + j] / radius;
@@ -278,68 +401,189 @@ inline Ellipsoid placed_ellipsoid(const double* centre, const double* radii, con
     }
     e.outside += e.moved[i] * e.moved[i];
   }
-  e.reach = largest * largest;
-  e.far = square(e.centre[0]) + square(e.centre[1]) + square(e.centre[2]);
+  e.distance = std::sqrt(dot(e.centre, e.centre));
   return e;
 }
 
-// How an ellipsoid lies on the ray to a point p: it is entered at t p,
-// t = (m.k - sqrt((m.k)^2 - m.m (k.k - 1))) / m.m with m = A p.
-struct OnRay {
-  bool covers, hides;
+// The cone in which a camera sees a ball.
+struct Cone {
+  double sine, cosine;
 };
 
-inline OnRay on_ray(const Ellipsoid& e, const double* p) {
-  double mm = 0.0, mk = 0.0;
-  for (int i = 0; i < 3; ++i) {
-    const double m = e.shape[i][0] * p[0] + e.shape[i][1] * p[1] + e.shape[i][2] * p[2];
-    mm += m * m;
-    mk += m * e.moved[i];
-  }
-  const double discriminant = mk * mk - mm * e.outside;
-  if (!(discriminant > 0.0)) return {false, false};
-  return {true, mk - std::sqrt(discriminant) < (1.0 - behind) * mm};
+inline Cone cone_of(double radius, double distance) {
+  const double sine = least(radius / distance, 1.0);
+  return {sine, std::sqrt(1.0 - sine * sine)};
 }
 
-// Marks points (P, 3) with other parts on their rays, and those with parts before them.
-// `occluders` (B,) are the parts that can hide, `parts` (P,) those that a point is of, which do not
-// hide it; points that are not valid are neither covered nor hidden.
+// Points side by side and the parts that they are of, which do not hide them.
+struct Visible {
+  Index count;  // whole lanes
+  const Index* parts;
+  const double *x, *y, *z, *valid;
+  double *covered, *hidden;
+};
+
+// Room for parts that may hide points of others.
+struct Occluders {
+  explicit Occluders(Index parts) : ellipsoids(parts), near(parts) {}
+  Scratch<Ellipsoid, 1> ellipsoids;
+  Scratch<bool, 1> near;  // parts that one occluder may hide
+};
+
+// Marks points from `first` on, as many as there are lanes, that an ellipsoid of part b hides: it
+// is entered at t p, t = (m.k - sqrt((m.k)^2 - m.m (k.k - 1))) / m.m with m = A p.
+inline void mark_lanes(const Ellipsoid& e, Index b, const Visible& points, Index first) {
+  const auto& a = e.shape;
+  const double k0 = e.moved[0], k1 = e.moved[1], k2 = e.moved[2], outside = e.outside;
+  const double *px = points.x + first, *py = points.y + first, *pz = points.z + first;
+  const double* valid = points.valid + first;
+  double *covered = points.covered + first, *hidden = points.hidden + first;
+  double others[lanes];
+  for (int i = 0; i < lanes; ++i) others[i] = points.parts[first + i] == b ? 0.0 : valid[i];
+#pragma omp simd
+  for (int i = 0; i < lanes; ++i) {
+    const double x = px[i], y = py[i], z = pz[i];
+    const double m0 = a[0][0] * x + a[0][1] * y + a[0][2] * z;
+    const double m1 = a[1][0] * x + a[1][1] * y + a[1][2] * z;
+    const double m2 = a[2][0] * x + a[2][1] * y + a[2][2] * z;
+    const double mm = m0 * m0 + m1 * m1 + m2 * m2, mk = m0 * k0 + m1 * k1 + m2 * k2;
+    const double discriminant = mk * mk - mm * outside;
+    const double root = std::sqrt(discriminant > 0.0 ? discriminant : 0.0);
+    // What is behind the camera covers nothing.
+    const double hit = discriminant > 0.0 && mk + root > 0.0 ? others[i] : 0.0;
+    const double before = mk - root < (1.0 - behind) * mm ? hit : 0.0;
+    covered[i] = hit > covered[i] ? hit : covered[i];
+    hidden[i] = before > hidden[i] ? before : hidden[i];
+  }
+}
+
+// Marks points with other parts on their rays, and those with parts before them. `occluders` (B,)
+// are the parts that can hide; `extents` (B,) how far points lie from the centres of their parts,
+// m. Points that are not valid are neither covered nor hidden.
+HMT_WIDE inline void mark_hidden(const FleshTable& flesh, const Mask& occluders,
+                                 const double* extents, const Tables& columns, const Table& origins,
+                                 const Occluders& room, const Visible& points) {
+  const Index count = flesh.parts();
+  std::fill_n(points.covered, points.count, 0.0);
+  std::fill_n(points.hidden, points.count, 0.0);
+  Ellipsoid* all = room.ellipsoids.view().data;
+  bool* near = room.near.view().data;
+  for (Index b = 0; b < count; ++b) {
+    const Index s = flesh.part_segments[b];
+    all[b] = placed_ellipsoid(flesh.part_centres[b].data, flesh.part_radii[b].data,
+                              columns.data + 9 * s, origins.data + 3 * s);
+  }
+  for (Index b = 0; b < count; ++b) {
+    if (!occluders[b]) continue;
+    const Ellipsoid& e = all[b];
+    // Balls whose cones do not touch, by a hair for rounding, hide nothing of each other.
+    const Cone own = cone_of(e.largest, e.distance);
+    for (Index a = 0; a < count; ++a) {
+      const Cone other = cone_of(extents[a], all[a].distance);
+      const double limit = own.cosine * other.cosine - own.sine * other.sine - 1e-9;
+      const bool apart = dot(all[a].centre, e.centre) < all[a].distance * e.distance * limit;
+      near[a] = a != b && !(apart && own.sine < 1.0);
+    }
+    for (Index first = 0; first < points.count; first += lanes) {
+      bool any = false;
+      for (Index i = first; i < first + lanes; ++i) any |= near[points.parts[i]];
+      if (any) mark_lanes(e, b, points, first);
+    }
+  }
+}
+
+// The contour of one pose for Python, point by point, P = 2R.
+struct ContourTable {
+  Array<Index, 1> parts;
+  Matrix points;           // (P, 3) camera frame, m
+  Matrix pixels;           // (P, 2)
+  Tensor projections;      // (P, 2, 3) derivative of the pixels by the points
+  Matrix normals;          // (P, 2) out of the body, in the image
+  Array<bool, 1> valid;    // the point exists and lies before the camera
+  Array<bool, 1> covered;  // another part lies on the same ray, before or behind
+  Array<bool, 1> hidden;   // another part lies on the same ray, before
+  Vector noise;            // how far contours of people lie from the point, a deviation, m
+
+  Index count() const { return parts.size(); }
+  void check() const {
+    const Index p = count();
+    expect_shape("points", points, {p, 3});
+    expect_shape("pixels", pixels, {p, 2});
+    expect_shape("projections", projections, {p, 2, 3});
+    expect_shape("normals", normals, {p, 2});
+    expect_shape("valid", valid, {p});
+    expect_shape("covered", covered, {p});
+    expect_shape("hidden", hidden, {p});
+    expect_shape("noise", noise, {p});
+  }
+};
+
+// For Python: fills the contour of one pose, but for what hides it. `wanted` (B,) are the parts
+// whose contour is traced; the others have no valid points.
+inline void fill_contour(const FleshTable& flesh, const Mask& wanted, const Lens& lens,
+                         const Tables& columns, const Table& origins, const ContourTable& result) {
+  flesh.check_frames(columns, origins);
+  const Index rings = flesh.rings();
+  expect_shape("contour.parts", result.parts, {2 * rings});
+  const RingLanes side_by_side(flesh, wanted);
+  const RingFrames frames(side_by_side);
+  const ContourRoom room(side_by_side);
+  const Contour contour = room.contour();
+  frames.place(side_by_side, columns, origins);
+  trace_contour(side_by_side, frames, lens, contour);
+  for (Index m = 0; m < 2 * rings; ++m) {
+    const Index i = m < rings ? m : m - rings + side_by_side.count();
+    result.parts[m] = contour.parts[i];
+    result.points[m].copy_from({contour.point(i).data(), {3}});
+    result.pixels(m, 0) = contour.u[i];
+    result.pixels(m, 1) = contour.v[i];
+    for (int k = 0; k < 6; ++k) result.projections[m].data[k] = contour.by[k][i];
+    result.normals(m, 0) = contour.nu[i];
+    result.normals(m, 1) = contour.nv[i];
+    result.valid[m] = contour.valid[i] > 0.0;
+    result.noise[m] = contour.noise[i];
+  }
+}
+
+// Marks points (P, 3) with other parts on their rays, and those with parts before them. `occluders`
+// (B,) are the parts that can hide, `parts` (P,) those that a point is of, which do not hide it;
+// points that are not valid are neither covered nor hidden.
 inline void mark_visibility(const FleshTable& flesh, const Mask& occluders, const Tables& columns,
                             const Table& origins, const Places& parts, const Table& points,
                             const Mask& valid, const Array<bool, 1>& covered,
                             const Array<bool, 1>& hidden) {
   flesh.check_frames(columns, origins);
-  const Index count = flesh.parts(), p = points.size();
+  const Index count = flesh.parts(), p = points.size(), whole = in_whole_lanes(p);
   expect_shape("occluders", occluders, {count});
   expect_shape("points", points, {p, 3});
   expect_shape("parts", parts, {p});
+  expect_range("parts", parts, 0, count);
   expect_shape("valid", valid, {p});
   expect_shape("covered", covered, {p});
   expect_shape("hidden", hidden, {p});
-  Scratch<Ellipsoid, 1> ellipsoids(count);
-  for (Index b = 0; b < count; ++b) {
-    const Index s = flesh.part_segments[b];
-    ellipsoids[b] = placed_ellipsoid(flesh.part_centres[b].data, flesh.part_radii[b].data,
-                                     columns[s].data, origins[s].data);
-  }
-  const Ellipsoid* all = ellipsoids.view().data;
-  for (Index n = 0; n < p; ++n) {
-    covered[n] = hidden[n] = false;
-    if (!valid[n]) continue;
-    const double x[3] = {points(n, 0), points(n, 1), points(n, 2)};
-    const double inverse = 1.0 / (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]);
-    const Index own = parts[n];
-    for (Index b = 0; b < count; ++b) {
-      const Ellipsoid& e = all[b];
-      const double along = e.centre[0] * x[0] + e.centre[1] * x[1] + e.centre[2] * x[2];
-      if (e.far - along * along * inverse > e.reach || b == own || !occluders[b]) continue;
-      const OnRay seen = on_ray(e, x);
-      if (seen.covers) covered[n] = true;
-      if (seen.hides) {
-        hidden[n] = true;
-        break;
-      }
+  if (p == 0) return;
+  const Scratch<double, 2> rows(6, whole);
+  const Scratch<double, 1> extents(count);
+  const Scratch<Index, 1> parts_of(whole);
+  for (Index i = 0; i < whole; ++i) {
+    const Index n = std::min(i, p - 1), part = parts[n], s = flesh.part_segments[part];
+    const double *axes = columns[s].data, *middle = flesh.part_centres[part].data;
+    double away[3];
+    for (int k = 0; k < 3; ++k) {
+      rows(k, i) = points(n, k);
+      away[k] = points(n, k) - (origins(s, k) + axes[k] * middle[0] + axes[3 + k] * middle[1] +
+                                axes[6 + k] * middle[2]);
     }
+    rows(3, i) = valid[n];
+    parts_of[i] = part;
+    extents[part] = most(extents[part], std::sqrt(dot(away, away)));
+  }
+  const auto row = [&](int k) { return rows[k].data; };
+  mark_hidden(flesh, occluders, extents.view().data, columns, origins, Occluders(count),
+              {whole, parts_of.view().data, row(0), row(1), row(2), row(3), row(4), row(5)});
+  for (Index n = 0; n < p; ++n) {
+    covered[n] = rows(4, n) > 0.0;
+    hidden[n] = rows(5, n) > 0.0;
   }
 }
 

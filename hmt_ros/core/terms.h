@@ -36,29 +36,14 @@ inline void run_terms(const PoseView& view, const TermInputs& inputs, const Vect
     ++energy;
   };
   std::apply([&](const auto&... own) { (one(own), ...); }, inputs);
+  if (sums.segments.data) lift_pixel_sums(view, sums);
 }
 
 // Lists the residuals (N, M, Sums::recorded) of N poses with frames (N, S, 3, 3), (N, S, 3),
 // instead of summing them. Entries (n, 0, 0) must be 0 and become the number of residuals of pose
 // n.
-inline void record_residuals(const Model& model, const TermInputs& inputs,
-                             const Array<const double, 4>& columns, const Tables& origins,
-                             const Tensor& residuals) {
-  const Index n = columns.size(), segments = model.tree.segments();
-  expect_shape("columns", columns, {n, segments, 3, 3});
-  expect_shape("origins", origins, {n, segments, 3});
-  expect_shape("residuals", residuals, {n, -1, Sums::recorded});
-  expect(residuals.size(1) > 0, "residuals", "a row that counts the residuals");
-  for (Index i = 0; i < n; ++i) expect(residuals(i, 0, 0) == 0.0, "residuals", "counts of 0");
-  check_poses(inputs, n);
-  PoseView view(model);
-  Scratch<double, 1> energies(term_count);
-  for (Index i = 0; i < n; ++i) {
-    view.columns.view().copy_from(columns[i]);
-    view.origins.view().copy_from(origins[i]);
-    look(view, i, true);
-    run_terms(view, inputs, energies, Sums{{}, {}, residuals[i]});
-  }
-}
+void record_residuals(const Model& model, const TermInputs& inputs,
+                      const Array<const double, 4>& columns, const Tables& origins,
+                      const Tensor& residuals);
 
 }  // namespace hmt

@@ -21,11 +21,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.core import elementary
 from hmt_ros.detectors import blazepose_models
 from hmt_ros.detectors.detector import DetectorKind
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.linear_algebra import product
 
 if TYPE_CHECKING:
     from ai_edge_litert.interpreter import Interpreter
@@ -148,10 +150,10 @@ class BlazePose:
         rows = flat.astype(np.float64).reshape(-1, 5)
         points = _refined(rows[:, :2] / _LANDMARK_SIZE, heat)[: LANDMARKS + 2]
         positions = world.astype(np.float64).reshape(-1, 3)[:LANDMARKS]
-        positions[:, :2] = positions[:, :2] @ square.axes
+        positions[:, :2] = product(positions[:, :2], square.axes)
         return _Found(
             square,
-            square.corner + square.side * points @ square.axes,
+            square.corner + product(square.side * points, square.axes),
             _sigmoid(rows[:LANDMARKS, 3]),
             positions,
             mask[..., 0],
@@ -176,12 +178,12 @@ class _Square:
         """The square about a circle, with the circle's point above the centre."""
         centre, (along, down) = circle[0], circle[1] - circle[0]
         side = 2 * _MARGIN * math.hypot(along, down)
-        return cls((centre[0], centre[1]), side, math.atan2(along, -down))
+        return cls((centre[0], centre[1]), side, float(elementary.arctan2(along, -down)))
 
     @property
     def axes(self) -> Array:
         """(2, 2) directions to the right and down in the square."""
-        c, s = math.cos(self.angle), math.sin(self.angle)
+        c, s = float(elementary.cos(self.angle)), float(elementary.sin(self.angle))
         return np.array([[c, s], [-s, c]])
 
     @property
@@ -200,7 +202,7 @@ class _Square:
     def spread(self, values: _Tensor, size: tuple[int, int]) -> _Tensor:
         """An image of `size`, (H, W), with the values (n, n) of the square in its place."""
         to_square = self.axes * (len(values) / self.side)
-        matrix = np.column_stack([to_square, -to_square @ self.corner])
+        matrix = np.column_stack([to_square, product(-to_square, self.corner)])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return np.asarray(cv2.warpAffine(values, matrix, size[::-1], flags=flags), np.float32)
 
@@ -327,5 +329,5 @@ def _weight(cutoff: Array | float, interval: float) -> Array | float:
 
 def _sigmoid(x: NDArray[_Float]) -> NDArray[_Float]:
     # Logits are clipped where exp would overflow.
-    result: NDArray[_Float] = 1 / (1 + np.exp(-x.clip(-80, 80)))
+    result: NDArray[_Float] = 1 / (1 + elementary.exp(-x.clip(-80, 80)))
     return result

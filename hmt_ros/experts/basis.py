@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.learned_file import Arrays, check_positive
+from hmt_ros.core import elementary
 from hmt_ros.experts.training_pairs import Standardisation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import squared_distances
+from hmt_ros.inference.linear_algebra import product
 
 BASES = ('linear', 'rbf')
 
@@ -66,7 +68,7 @@ class RadialBasis:
         result = np.empty((len(inputs), len(self)))
         result[:, 0] = 1.0
         squares = squared_distances(self.standardisation.apply(inputs), self.centres)
-        np.exp(squares * (-0.5 / self.width**2), out=result[:, 1:])
+        elementary.exp(squares * (-0.5 / self.width**2), out=result[:, 1:])
         return result
 
     def jacobians(self, inputs: Array, weights: Array) -> Array:
@@ -76,8 +78,8 @@ class RadialBasis:
         """
         z = self.standardisation.apply(inputs)
         kernels = self.evaluate(inputs)[:, 1:]
-        total = kernels @ weights[1:]
-        pull = np.einsum('nk,kd,kp->ndp', kernels, weights[1:], self.centres, optimize=True)
+        total = product(kernels, weights[1:])
+        pull = product(kernels[:, None] * weights[1:].T, self.centres)
         return np.asarray(
             (pull - total[:, :, None] * z[:, None]) / (self.width**2 * self.standardisation.scale)
         )

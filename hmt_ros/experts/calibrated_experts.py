@@ -21,6 +21,7 @@ from hmt_ros.body.learned_file import LARGEST, Arrays, nested, parameters_of, pa
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity, stored_model
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import symmetric_eigenvalues
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -49,7 +50,7 @@ class Calibration:
     def __post_init__(self) -> None:
         size = len(self.added)
         require(self.added.shape == (size, size), 'added must be (D, D)')
-        least, largest = np.linalg.eigvalsh(self.added)[[0, -1]]
+        least, largest = symmetric_eigenvalues(self.added)[[0, -1]]
         same = np.allclose(self.added, self.added.T)
         require(same and least >= -1e-9 * largest, 'added must be positive semidefinite')
         for name in ('temperature', 'factor'):

@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_triangular
-from scipy.special import logsumexp
 
 from hmt_ros.body.learned_file import (
     MOST_NUMBERS,
@@ -33,9 +31,11 @@ from hmt_ros.body.learned_file import (
     require,
     write_model,
 )
+from hmt_ros.core import elementary
 from hmt_ros.experts.training_pairs import finite_matrix
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import cholesky, log_sum_exp, solve_triangular
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -64,18 +64,16 @@ class Components:
     def log_density(self, targets: Array) -> Array:
         """log p(x | r), (n,), of one target per input, (n, D)."""
         return np.asarray(
-            logsumexp(self.log_weights + self.component_log_densities(targets), axis=1)
+            log_sum_exp(self.log_weights + self.component_log_densities(targets), axis=1)
         )
 
     def component_log_densities(self, targets: Array) -> Array:
         """log N(x; f_i(r), c_i(r) O_i), (n, M)."""
         result = np.empty_like(self.log_weights)
-        for i, factor in enumerate(np.linalg.cholesky(self.noise)):
-            z = solve_triangular(
-                factor, (targets - self.means[:, i]).T, lower=True, check_finite=False
-            )
-            log_det = 2.0 * np.log(np.diagonal(factor)).sum()
-            size = len(factor) * np.log(2.0 * np.pi * self.inflation[:, i])
+        for i, factor in enumerate(cholesky(self.noise)):
+            z = solve_triangular(factor, (targets - self.means[:, i]).T)
+            log_det = 2.0 * elementary.log(np.diagonal(factor)).sum()
+            size = len(factor) * elementary.log(2.0 * np.pi * self.inflation[:, i])
             result[:, i] = -0.5 * ((z * z).sum(0) / self.inflation[:, i] + size + log_det)
         return result
 
@@ -143,7 +141,7 @@ class ConditionalDensity(ABC):
         """
         found = self.components(inputs)
         covariances = found.inflation[:, :, None, None] * found.noise
-        return np.exp(found.log_weights), found.means, covariances
+        return elementary.exp(found.log_weights), found.means, covariances
 
     def predict(self, inputs: ArrayLike) -> list[GaussianMixture]:
         """A mixture for each of the inputs (n, p); the order of components is kept."""

@@ -22,11 +22,18 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import logsumexp
 
+from hmt_ros.core import elementary
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import (
+    inverse,
+    log_determinant,
+    log_sum_exp,
+    product,
+    symmetric_eigenvalues,
+)
 from hmt_ros.inference.reduction import reduced
 
 # Minimum of `ConditionalDensity.support`: below it no kernel fires, the experts have seen nothing
@@ -138,9 +145,9 @@ def linearised_products(
     inputs = _inputs(model, previous, observation)
     found = model.components(inputs)
     slopes = model.jacobians(inputs)[..., : previous.dimension]
-    spread = slopes @ previous.covariances[:, None] @ np.swapaxes(slopes, -1, -2)
+    spread = product(product(slopes, previous.covariances[:, None]), np.swapaxes(slopes, -1, -2))
     covariances = spread + found.inflation[:, :, None, None] * found.noise
-    weights = np.exp(found.log_weights) * previous.weights[:, None]
+    weights = elementary.exp(found.log_weights) * previous.weights[:, None]
     d = model.n_outputs_
     return GaussianMixture(
         weights.reshape(-1), found.means.reshape(-1, d), covariances.reshape(-1, d, d)
@@ -166,29 +173,29 @@ def divided_product(
         precision_d, shift_d, constant_d = (share * x for x in _canonical(divisor))
         less = precision - precision_d
         # A divisor that is nearly as narrow as the product leaves no proper Gaussian.
-        exact = np.linalg.eigvalsh(less)[:, 0] > 1e-3 * np.linalg.eigvalsh(precision)[:, 0]
+        exact = symmetric_eigenvalues(less)[:, 0] > 1e-3 * symmetric_eigenvalues(precision)[:, 0]
         precision = np.where(exact[:, None, None], less, precision)
         shift = np.where(exact[:, None], shift - shift_d, shift)
         constant = np.where(exact, constant - constant_d, constant)
-    inverse: Array = np.linalg.inv(precision).astype(np.float64)
-    covariances: Array = 0.5 * (inverse + np.swapaxes(inverse, -1, -2))
+    spread: Array = inverse(precision).astype(np.float64)
+    covariances: Array = 0.5 * (spread + np.swapaxes(spread, -1, -2))
     means = np.einsum('nij,nj->ni', covariances, shift)
-    log_det = np.linalg.slogdet(covariances)[1]
+    log_det = log_determinant(covariances)
     log = constant + 0.5 * ((shift * means).sum(1) + log_det)
     # Without exact division, one factor (2 pi)^(d/2) more is in the denominator.
-    at_mean = 0.5 * d * np.log(2.0 * np.pi) + divisor.log_density(means)
+    at_mean = 0.5 * d * elementary.log(2.0 * np.pi) + divisor.log_density(means)
     log = np.where(exact, log, log - share * at_mean)
-    return GaussianMixture(np.exp(log - logsumexp(log)), means, covariances)
+    return GaussianMixture(elementary.exp(log - log_sum_exp(log)), means, covariances)
 
 
 def _canonical(mixture: GaussianMixture) -> tuple[Array, Array, Array]:
     """Precisions P, shifts P m, and the logarithms of w N at x = 0."""
-    precision: Array = np.linalg.inv(mixture.covariances).astype(np.float64)
+    precision: Array = inverse(mixture.covariances).astype(np.float64)
     shift = np.einsum('kij,kj->ki', precision, mixture.means)
     square = (shift * mixture.means).sum(1)
-    log_det = np.linalg.slogdet(mixture.covariances)[1]
+    log_det = log_determinant(mixture.covariances)
     with np.errstate(divide='ignore'):
-        constant = np.log(mixture.weights)
+        constant = elementary.log(mixture.weights)
     return precision, shift, constant - 0.5 * (square + log_det)
 
 

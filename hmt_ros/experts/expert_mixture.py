@@ -26,6 +26,7 @@ from hmt_ros.body.learned_file import (
     part,
     require,
 )
+from hmt_ros.core import elementary
 from hmt_ros.experts.basis import (
     BASES,
     Basis,
@@ -46,6 +47,7 @@ from hmt_ros.experts.sparse_bayes import (
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs, checked_pairs
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import k_means, spread_points, squared_distances
+from hmt_ros.inference.linear_algebra import product
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -148,7 +150,9 @@ class ExpertMixture(ConditionalDensity):
         features = self.basis_.evaluate(points)
         scores = self.gates_.log_scores(self.gates_.features(points))
         log_weights = log_softmax(scores)
-        means = (features @ self._stacked).reshape(len(points), self.n_experts_, self.n_outputs_)
+        means = product(features, self._stacked).reshape(
+            len(points), self.n_experts_, self.n_outputs_
+        )
         means = means * self._target_scaling.scale + self._target_scaling.centre
         inflation = np.stack([1.0 + one.spread(features) for one in self.experts_], axis=1)
         return Components(log_weights, means, inflation, self._noise)
@@ -167,7 +171,7 @@ class ExpertMixture(ConditionalDensity):
             squares = squared_distances(points, self._candidates).min(1) / self.basis_.width**2
         else:
             squares = (points**2).mean(1)
-        return np.asarray(np.exp(-0.5 * squares))
+        return np.asarray(elementary.exp(-0.5 * squares))
 
     # Learning.
 

@@ -33,9 +33,12 @@ from hmt_ros.body.learned_file import (
     nested,
     part,
 )
+from hmt_ros.core import elementary
 from hmt_ros.experts.basis import Basis, LinearBasis, RadialBasis, basis_of
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs
+from hmt_ros.inference import linear_algebra
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import inverse_triangular, product
 
 # Gamma hyperprior of precisions: shape and rate (BME 2.2.2).
 SHAPE, RATE = 1e-2, 1e-4
@@ -84,7 +87,7 @@ class SoftmaxGates:
 
     def log_scores(self, features: Array) -> Array:
         """log g, (n, M)."""
-        return log_softmax(features @ self.weights.T)
+        return log_softmax(product(features, self.weights.T))
 
     def learned(
         self, features: Array, responsibilities: Array, sample_weights: Array
@@ -263,9 +266,9 @@ class GaussianGates:
     @cached_property
     def _whitening(self) -> tuple[Array, Array]:
         """Inverse Cholesky factors (M, p, p) of the covariances, and log |C| (M,)."""
-        factors = np.linalg.cholesky(self.covariances)
-        inverse = [solve_triangular(f, np.eye(len(f)), lower=True) for f in factors]
-        return np.array(inverse), 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
+        factors = linear_algebra.cholesky(self.covariances)
+        log_dets = 2.0 * elementary.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
+        return inverse_triangular(factors), log_dets
 
     @classmethod
     def first(
@@ -297,9 +300,9 @@ class GaussianGates:
         whiteners, log_dets = self._whitening
         result = np.empty((len(features), len(self.means)))
         for i, mean in enumerate(self.means):
-            z = (features - mean) @ whiteners[i].T
+            z = product(features - mean, whiteners[i].T)
             result[:, i] = (z * z).sum(1)
-        size = features.shape[1] * np.log(2.0 * np.pi)
+        size = features.shape[1] * elementary.log(2.0 * np.pi)
         return np.asarray(self.log_shares - 0.5 * (result + log_dets + size))
 
     def learned(
@@ -368,5 +371,5 @@ Gates = SoftmaxGates | GaussianGates
 def log_softmax(scores: Array) -> Array:
     """Scores (n, M) minus the logarithm of the sum of their exponentials."""
     result: Array = scores - scores.max(axis=1, keepdims=True)
-    result -= np.log(np.exp(result).sum(axis=1, keepdims=True))
+    result -= elementary.log(elementary.exp(result).sum(axis=1, keepdims=True))
     return result

@@ -23,6 +23,7 @@ from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.body.limb_angles import limb_angles
 from hmt_ros.body.mirror import relevelled
 from hmt_ros.body.pose_prior import LEARNED, pose_prior, prior_energies
+from hmt_ros.core import elementary
 from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_offsets, landmark_rays
 from hmt_ros.image.keypoint_schemes import AUTO, noise_of
 from hmt_ros.image.lifted_poses import HIPS, WHOLE, LiftedPoses
@@ -30,6 +31,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.inference.energy import Energy, EnergyFunction, add_energies
+from hmt_ros.inference.linear_algebra import inverse, product, solve
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Where the hips are until they are placed, m before the camera.
@@ -136,7 +138,9 @@ def poses_of(
     covariances[:, :3, :3] = shifts + size
     return [
         GaussianMixture(
-            np.exp(one.log_weights), poses[i * k : (i + 1) * k], covariances[i * k : (i + 1) * k]
+            elementary.exp(one.log_weights),
+            poses[i * k : (i + 1) * k],
+            covariances[i * k : (i + 1) * k],
         ).sorted()
         for i, one in enumerate(lifted)
     ]
@@ -145,7 +149,7 @@ def poses_of(
 def _postures(body: Body, lifted: Sequence[LiftedPoses]) -> Array:
     """Poses (N K, d) near the means, with the hips `AWAY`, in closed form."""
     skeleton, joints = body.skeleton, lifted[0].joints
-    means = np.concatenate([one.sized(skeleton) @ one.axes for one in lifted]) + AWAY
+    means = np.concatenate([product(one.sized(skeleton), one.axes) for one in lifted]) + AWAY
     place = {name: means[:, j] for j, name in enumerate(joints)}
     # So few frames a second that none has neighbours.
     return limb_angles(skeleton, place, 1e-3)
@@ -158,7 +162,9 @@ def _fitted(
     skeleton, joints = body.skeleton, lifted[0].joints
     which = skeleton.joint_index(joints)
     hips = body.joint_positions(poses)[:, skeleton.joint_index(HIPS)].mean(1)
-    means = np.concatenate([one.sized(skeleton) @ one.axes for one in lifted]) + hips[:, None]
+    means = (
+        np.concatenate([product(one.sized(skeleton), one.axes) for one in lifted]) + hips[:, None]
+    )
     axes = np.repeat([one.axes for one in lifted], len(lifted[0].log_weights), axis=0)
     deviations = np.concatenate([one.deviations for one in lifted]) * (ACROSS, ACROSS, 1.0)
     whiten = (axes[:, None] / deviations[..., None]).transpose(1, 2, 3, 0)
@@ -200,7 +206,7 @@ def _fitted(
         max_iterations=ITERATIONS,
         tolerance=TOLERANCE,
     )
-    covariances = np.linalg.inv(found.hessian + 1e-6 * np.eye(skeleton.dimension))
+    covariances = inverse(found.hessian + 1e-6 * np.eye(skeleton.dimension))
     return found.x, np.asarray(0.5 * (covariances + covariances.transpose(0, 2, 1)))
 
 
@@ -215,13 +221,13 @@ def _placed(body: Body, poses: Array, rays: Array, confidences: Array) -> tuple[
     wanted = np.stack([a, b], axis=2) * places[..., 2:] - places[..., :2]
     rows, wanted = rows * weight[..., None, None], wanted * weight[..., None]
     rows, wanted = rows.reshape(len(poses), -1, 3), wanted.reshape(len(poses), -1)
-    normal = rows.transpose(0, 2, 1) @ rows + 1e-9 * np.eye(3)
-    roots = np.linalg.solve(normal, np.einsum('mri,mr->mi', rows, wanted)[..., None])[..., 0]
+    normal = product(rows.transpose(0, 2, 1), rows) + 1e-9 * np.eye(3)
+    roots = solve(normal, np.einsum('mri,mr->mi', rows, wanted)[..., None])[..., 0]
     near = np.maximum(roots[:, 2], max(NEAREST, 1.05 * float(body.lower[2])))
     roots *= (near / np.maximum(roots[:, 2], 1e-3))[:, None]
     result = poses.copy()
     result[:, :3] = np.clip(roots, body.lower[:3], body.upper[:3])
-    return result, np.asarray(SEEN**2 * np.linalg.inv(normal))
+    return result, np.asarray(SEEN**2 * inverse(normal))
 
 
 def _marks(body: Body) -> tuple[Index, Array]:

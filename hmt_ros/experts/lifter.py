@@ -40,6 +40,7 @@ from hmt_ros.body.learned_file import (
     require,
     write_model,
 )
+from hmt_ros.core import fill_window_inputs, window_middles
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.network_experts import Floats, Layers
 from hmt_ros.experts.pose_encoding import ray_rotations
@@ -47,6 +48,7 @@ from hmt_ros.image.keypoint_schemes import AUTO, landmarks, landmarks_of, positi
 from hmt_ros.image.lifted_poses import WHOLE, LiftedPoses, bone_lengths, from_positions
 from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Times of a window relative to now, s, and how far an image may be from each.
@@ -73,9 +75,11 @@ INSTEAD = {
     'centre_of_pelvis': 'mid_hip',
     'centre_of_neck': 'neck_base',
 }
-CORE = tuple(
-    LANDMARKS.index(name)
-    for name in ('left_shoulder', 'right_shoulder', 'left_hip', 'right_hip', 'mid_hip')
+TRUNK = np.array(
+    [
+        LANDMARKS.index(name)
+        for name in ('left_shoulder', 'right_shoulder', 'left_hip', 'right_hip', 'mid_hip')
+    ]
 )
 # Joints of our bodies that may name a keypoint without a scheme.
 OF_JOINTS = {'pelvis': 'mid_hip', 'neck': 'neck_base', 'head': 'centre_of_head'}
@@ -97,7 +101,8 @@ PROPORTIONED = (
 SHORTEST = 0.3
 # A keypoint of less confidence is not looked at; fewer landmarks are no person.
 LEAST_CONFIDENCE, FEWEST = 0.02, 5
-FURTHEST = 6.0  # from the middle of the trunk, in extents
+# Length of the inputs of a window.
+INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,54 +201,26 @@ def window_inputs(
         ups: (N, 3) unit vectors against gravity, camera frame; 0: unknown.
         persons: (N, len(PROPORTIONED)) proportions of the persons; 0: unknown.
     """
-    n, s, count = confidences.shape
-    f32 = np.float32
-    sure = np.where(confidences >= LEAST_CONFIDENCE, confidences, 0.0).astype(f32)
-    places = np.where(sure[..., None] > 0, rays, 0.0).astype(f32)
-    now = sure[:, 0]
-    core = np.zeros(count, dtype=f32)
-    core[list(CORE)] = 1.0
-    weight = now * core
-    weight = np.where((weight > 0).sum(1, keepdims=True) >= 2, weight, now) + f32(1e-9)
-    middle = (places[:, 0] * weight[..., None]).sum(1) / weight.sum(1)[:, None]
-    ahead = np.concatenate([middle, np.ones((n, 1), dtype=f32)], axis=1).astype(np.float64)
-    level = roll(ups)
-    upright = ray_rotations(np.einsum('nj,nji->ni', ahead, level)).transpose(0, 2, 1)
-    axes = upright @ level.transpose(0, 2, 1)
-    turn = axes.astype(f32)
-    homogeneous = np.concatenate([places, np.ones((n, s, count, 1), dtype=f32)], axis=3)
-    seen = homogeneous.reshape(n, -1, 3) @ turn.transpose(0, 2, 1)
-    q = (seen[..., :2] / np.maximum(seen[..., 2:], f32(0.1))).reshape(n, s, count, 2)
-    q = np.where(sure[..., None] > 0, q, f32(0.0))
-    square = (now[..., None] * q[:, 0] ** 2).sum((1, 2)) / np.maximum(now.sum(1), f32(0.1))
-    extent = np.sqrt(square) + f32(1e-6)
-    q = np.clip(q / extent[:, None, None, None], f32(-FURTHEST), f32(FURTHEST))
-    there = (sure.max(2) > 0).astype(f32)
-    late = (times - TIMES).astype(f32) * there * f32(20.0)
-    up = np.einsum('nij,nj->ni', turn, ups.astype(f32))
-    values = np.concatenate(
-        [
-            q.reshape(n, -1),
-            sure.reshape(n, -1),
-            there,
-            late,
-            np.log(extent)[:, None] + f32(2.0),
-            up,
-            (np.abs(up).sum(1) > 0)[:, None],
-            f32(5.0) * persons.astype(f32),
-            (np.abs(persons).sum(1) > 0)[:, None],
-        ],
-        axis=1,
+    rays, confidences, times, ups, persons = (
+        np.ascontiguousarray(x, dtype=np.float64) for x in (rays, confidences, times, ups, persons)
     )
-    return WindowInputs(values.astype(f32), axes, (now > 0).sum(1) >= FEWEST)
+    middles = np.empty((len(rays), 3))
+    window_middles(rays, confidences, TRUNK, LEAST_CONFIDENCE, middles)
+    level = roll(ups)
+    upright = ray_rotations(product(middles[:, None], level)[:, 0]).transpose(0, 2, 1)
+    axes = product(upright, level.transpose(0, 2, 1))
+    values = np.empty((len(rays), INPUTS), dtype=np.float32)
+    fill_window_inputs(
+        rays, confidences, times, TIMES, ups, persons, axes, LEAST_CONFIDENCE, values
+    )
+    seen = (confidences[:, 0] >= LEAST_CONFIDENCE).sum(1)
+    return WindowInputs(values, axes, seen >= FEWEST)
 
 
 FOLDER = Path(__file__).resolve().parent / 'models'
 SHIPPED = 'keypoints'
 KIND = 'lifter'
 
-# Length of the inputs of a window.
-INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
 # Earliest time of a window, s. Least z of a ray: one from beside the camera says little.
 EARLIEST, BEFORE = float((TIMES - NEAR).min()), 0.1
 # Standard deviation with which a keypoint is not looked at, m at the person.

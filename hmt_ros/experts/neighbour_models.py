@@ -25,9 +25,11 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from hmt_ros.body.learned_file import Arrays, check_positive, require
+from hmt_ros.core import elementary
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs, checked_pairs
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -89,8 +91,8 @@ class _NeighbourModel(ConditionalDensity):
         distances, rows = np.empty((len(points), count)), np.empty((len(points), count), np.intp)
         for i in range(0, len(points), BATCH):
             some = points[i : i + BATCH]
-            squared = self._norms - 2.0 * some @ self._scaled.T
-            index = np.argpartition(squared, count - 1, axis=1)[:, :count]
+            squared = self._norms - product(self._scaled, 2.0 * some.T).T
+            index = np.sort(np.argpartition(squared, count - 1, axis=1)[:, :count], axis=1)
             squared = np.take_along_axis(squared, index, axis=1) + (some * some).sum(1)[:, None]
             order = np.argsort(squared, axis=1, kind='stable')
             squared = np.take_along_axis(squared, order, axis=1)
@@ -176,7 +178,7 @@ class NearestNeighbours(_NeighbourModel):
         distances, index = self._neighbours(inputs, self.n_neighbours)
         shares = self._shares(distances, index)
         noise = np.broadcast_to(self.noise_, (self.n_neighbours, *self.noise_.shape))
-        return Components(np.log(shares), self.targets_[index], np.ones_like(shares), noise)
+        return Components(elementary.log(shares), self.targets_[index], np.ones_like(shares), noise)
 
     def jacobians(self, inputs: ArrayLike) -> Array:
         """Zeros (n, K, D, p): the neighbours' targets do not move with the input."""
@@ -186,7 +188,7 @@ class NearestNeighbours(_NeighbourModel):
     def support(self, inputs: ArrayLike) -> Array:
         """exp(-(d / s)^2 / 2), (n,): d is the distance to the nearest sample, s the spacing."""
         distances, _ = self._neighbours(inputs, 1)
-        return np.exp(-0.5 * (distances[:, 0] / self.spacing_) ** 2)
+        return np.asarray(elementary.exp(-0.5 * (distances[:, 0] / self.spacing_) ** 2))
 
     def _shares(self, distances: Array, index: Index) -> Array:
         closeness = 1.0 / np.maximum(distances, CLOSEST * self.spacing_)
@@ -252,14 +254,14 @@ class LocalExperts(_NeighbourModel):
         squared = np.where(weights > FAINT, (residuals**2).sum(2), np.inf)
         nearest = residuals[np.arange(len(residuals)), squared.argmin(1)]
         share = pairs.weights[left_out] / pairs.weights[left_out].sum()
-        self.noise_ = ridge + (share * nearest.T) @ nearest
+        self.noise_ = ridge + product(share * nearest.T, nearest)
         return self
 
     def components(self, inputs: ArrayLike) -> Components:
         """The mixtures at inputs (n, p), heaviest expert first."""
         weights, means = self._modes(*self._neighbours(inputs, self.n_neighbours))[:2]
         noise = np.broadcast_to(self.noise_, (self.n_experts, *self.noise_.shape))
-        return Components(np.log(weights), means, np.ones_like(weights), noise)
+        return Components(elementary.log(weights), means, np.ones_like(weights), noise)
 
     def jacobians(self, inputs: ArrayLike) -> Array:
         """Derivatives (n, M, D, p) of the means, with neighbours, clusters and width held fixed."""
@@ -268,13 +270,13 @@ class LocalExperts(_NeighbourModel):
         _, means, shares, width = self._modes(distances, index)
         away = (self._scaled[index] - points[:, None]) / width[:, None, None] ** 2  # (n, K, p)
         residuals = self.targets_[index][:, None] - means[:, :, None]  # (n, M, K, D)
-        result: Array = np.einsum('nmk,nmkd,nkp->nmdp', shares, residuals, away, optimize=True)
+        result: Array = product((shares[..., None] * residuals).swapaxes(2, 3), away[:, None])
         return result / self._standardisation.scale
 
     def support(self, inputs: ArrayLike) -> Array:
         """exp(-(d / 3 s)^2 / 2), (n,): d is the distance to the nearest sample, s the spacing."""
         distances, _ = self._neighbours(inputs, 1)
-        return np.exp(-0.5 * (distances[:, 0] / (3.0 * self.spacing_)) ** 2)
+        return np.asarray(elementary.exp(-0.5 * (distances[:, 0] / (3.0 * self.spacing_)) ** 2))
 
     def _modes(self, distances: Array, index: Index) -> tuple[Array, Array, Array, Array]:
         """Clusters of the neighbours (n, K) of n inputs.
@@ -287,11 +289,15 @@ class LocalExperts(_NeighbourModel):
         """
         n, count = distances.shape
         width = np.maximum(distances[:, self.width_neighbour - 1], 1e-9)
-        kernel = np.exp(-0.5 * (distances / width[:, None]) ** 2) * self.sample_weight_[index]
+        kernel = (
+            elementary.exp(-0.5 * (distances / width[:, None]) ** 2) * self.sample_weight_[index]
+        )
         kernel = np.maximum(kernel / kernel.sum(1, keepdims=True), 1e-9)
         targets = self.targets_[index]
         squared = (targets * targets).sum(2)
-        between = squared[:, :, None] + squared[:, None] - 2.0 * targets @ targets.swapaxes(1, 2)
+        between = (
+            squared[:, :, None] + squared[:, None] - product(2.0 * targets, targets.swapaxes(1, 2))
+        )
         # Seeds: the nearest neighbour, then each time the one that is heaviest and furthest away.
         rows = np.arange(n)
         nearest = between[rows, 0]
@@ -305,8 +311,10 @@ class LocalExperts(_NeighbourModel):
         for _ in range(SWEEPS):
             member = (owner[:, None] == experts) * kernel[:, None]
             total = member.sum(2)
-            means = (member @ targets) / np.maximum(total, 1e-300)[..., None]
-            apart = (means * means).sum(2)[:, :, None] - 2.0 * means @ targets.swapaxes(1, 2)
+            means = product(member, targets) / np.maximum(total, 1e-300)[..., None]
+            apart = (means * means).sum(2)[:, :, None] - product(
+                2.0 * means, targets.swapaxes(1, 2)
+            )
             new = np.where(total[..., None] > 0, apart, np.inf).argmin(1)
             if (new == owner).all():
                 break
@@ -322,4 +330,4 @@ class LocalExperts(_NeighbourModel):
         order = np.argsort(-weights, axis=1, kind='stable')
         weights = np.take_along_axis(weights, order, axis=1)
         shares = np.take_along_axis(shares, order[..., None], axis=1)
-        return weights / weights.sum(1, keepdims=True), shares @ targets, shares, width
+        return weights / weights.sum(1, keepdims=True), product(shares, targets), shares, width

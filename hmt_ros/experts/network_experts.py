@@ -25,6 +25,7 @@ from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.training_pairs import Standardisation
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import squared_distances
+from hmt_ros.inference.linear_algebra import product
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -57,21 +58,21 @@ class Layers:
 
     def outputs(self, inputs: Floats) -> Floats:
         """The numbers (N, O) at inputs (N, p) that are whitened."""
-        units = _leaky(inputs @ self.first + self.first_bias)
+        units = _leaky(product(inputs, self.first) + self.first_bias)
         for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
-            units = units + _leaky(units @ weights + bias)
-        return units @ self.last + self.last_bias
+            units = units + _leaky(product(units, weights) + bias)
+        return np.asarray(product(units, self.last) + self.last_bias)
 
     def jacobians(self, inputs: Floats, which: slice | Index) -> Floats:
         """Derivatives (N, o, p) of some of the numbers by inputs (N, p) that are whitened."""
-        before = inputs @ self.first + self.first_bias
+        before = product(inputs, self.first) + self.first_bias
         units = _leaky(before)
         slopes = _slopes(before)[:, :, None] * self.first.T
         for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
-            before = units @ weights + bias
+            before = product(units, weights) + bias
             units = units + _leaky(before)
-            slopes = slopes + _slopes(before)[:, :, None] * (weights.T @ slopes)
-        return self.last[:, which].T @ slopes
+            slopes = slopes + _slopes(before)[:, :, None] * product(weights.T, slopes)
+        return np.asarray(product(self.last[:, which].T, slopes))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays for a file: in half precision, except single rows."""

@@ -19,7 +19,9 @@ from numpy.typing import ArrayLike
 from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_angles, root_rotations
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import product, pseudo_inverse
 
 AXES = 6
 ROOT = ('root_tx', 'root_ty', 'root_tz')
@@ -66,7 +68,7 @@ class PoseEncoding:
         """
         poses = np.asarray(poses, dtype=np.float64)
         turned = root_rotations(self.body, poses)
-        seen = self._from_view(poses[:, :3]).transpose(0, 2, 1) @ turned
+        seen = product(self._from_view(poses[:, :3]).transpose(0, 2, 1), turned)
         axes = seen[:, :, 1:].transpose(0, 2, 1).reshape(-1, AXES)
         return np.concatenate([axes, poses[:, AXES:]], axis=1)
 
@@ -79,7 +81,7 @@ class PoseEncoding:
         targets, roots = self._checked(targets, roots)
         poses = np.empty((len(targets), self.body.dimension))
         poses[:, :3] = roots
-        turned = self._from_view(roots) @ _orthogonal(targets[:, :AXES])
+        turned = product(self._from_view(roots), _orthogonal(targets[:, :AXES]))
         poses[:, 3:AXES] = root_angles(self.body, turned)
         lower, upper = self.body.lower[AXES:], self.body.upper[AXES:]
         poses[:, AXES:] = np.clip(targets[:, AXES:], lower, upper)
@@ -95,15 +97,15 @@ class PoseEncoding:
         poses = self.decode(targets, roots)
         # Root angles from a small rotation: the inverse of the axes of the angles.
         axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
-        from_rotation = np.linalg.pinv(axes, rcond=np.cos(STEEPEST) / 2)
+        from_rotation = pseudo_inverse(axes, float(elementary.cos(STEEPEST)) / 2)
         by_target, by_root = np.zeros((n, d, d)), np.zeros((n, d, 3))
         to_camera = self._from_view(roots)
-        by_target[:, 3:AXES, :AXES] = (
-            from_rotation @ to_camera @ _rotation_by_axes(targets[:, :AXES])
+        by_target[:, 3:AXES, :AXES] = product(
+            product(from_rotation, to_camera), _rotation_by_axes(targets[:, :AXES])
         )
         by_target[:, AXES:, AXES:] = np.eye(d - AXES)
         by_root[:, :3] = np.eye(3)
-        by_root[:, 3:AXES] = from_rotation @ self._view_by_root(roots)
+        by_root[:, 3:AXES] = product(from_rotation, self._view_by_root(roots))
         return by_target, by_root
 
     def encoding_jacobians(self, poses: ArrayLike) -> Array:
@@ -118,19 +120,21 @@ class PoseEncoding:
         turns = np.concatenate([-self._view_by_root(poses[:, :3]), axes], axis=2)
         for k in range(2):  # front and up
             moved = np.cross(turns, turned[:, :, k + 1, None], axis=1)
-            result[:, 3 * k : 3 * k + 3, :AXES] = to_ray @ moved
+            result[:, 3 * k : 3 * k + 3, :AXES] = product(to_ray, moved)
         result[:, AXES:, AXES:] = np.eye(d - AXES)
         return result
 
     def _from_view(self, points: Array) -> Array:
         """Rotations (N, 3, 3) from a camera that looks at points (N, 3), upright by the level."""
         level = self.body.level
-        return level @ ray_rotations(points @ level)
+        return np.asarray(product(level, ray_rotations(product(points, level))))
 
     def _view_by_root(self, points: Array) -> Array:
         """Derivatives (N, 3, 3) of that rotation by the points, camera frame."""
         level = self.body.level
-        return level @ _rotation_by_root(points @ level) @ level.T
+        return np.asarray(
+            product(product(level, _rotation_by_root(product(points, level))), level.T)
+        )
 
     def _checked(self, targets: ArrayLike, roots: ArrayLike) -> tuple[Array, Array]:
         targets = np.asarray(targets, dtype=np.float64)
@@ -175,7 +179,7 @@ def _rotation_by_root(points: Array) -> Array:
         [zero, zero, one],
     ]
     change = np.array([by_a, by_b, by_c]).transpose(3, 0, 1, 2)  # (N, component, 3, 3)
-    skew = change @ ray_rotations(points)[:, None].transpose(0, 1, 3, 2)
+    skew = product(change, ray_rotations(points)[:, None].transpose(0, 1, 3, 2))
     # A direction keeps its length: only changes across it count.
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     across /= distance[:, None, None]
@@ -205,18 +209,18 @@ def _rotation_by_axes(axes: Array) -> Array:
     along = (up * y).sum(1)[:, None, None]
     rest = np.linalg.norm(up - along[:, :, 0] * y, axis=1)
     # d(up - (up y) y): by the front through y, and by the up axis itself.
-    by_front = -(y[:, :, None] * (up[:, None, :] @ dy)) - along * dy
+    by_front = -(y[:, :, None] * product(up[:, None, :], dy)) - along * dy
     flat = eye - z[:, :, None] * z[:, None, :]
     flat /= np.maximum(rest, SHORTEST)[:, None, None]
-    dz = [flat @ by_front, flat @ across]
+    dz = [product(flat, by_front), product(flat, across)]
     dys = [dy, np.zeros_like(dy)]
     x = frame[:, :, 0]
     for k in range(2):
         # dy = w x y and dz = w x z give w = x (dy z) + y (dz x) + z (dx y), with dx y = -x dy.
         result[:, :, 3 * k : 3 * k + 3] = (
-            x[:, :, None] * (z[:, None] @ dys[k])
-            + y[:, :, None] * (x[:, None] @ dz[k])
-            - z[:, :, None] * (x[:, None] @ dys[k])
+            x[:, :, None] * product(z[:, None], dys[k])
+            + y[:, :, None] * product(x[:, None], dz[k])
+            - z[:, :, None] * product(x[:, None], dys[k])
         )
     return result
 

@@ -10,7 +10,6 @@ rule (1), with a model of p(x_t | x_t-1, r_t) that has learned for one step.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -34,6 +33,7 @@ from hmt_ros.body.learned_file import (
     write_model,
 )
 from hmt_ros.body.motion_prior import motion_prior
+from hmt_ros.core import elementary
 from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
 from hmt_ros.experts.density_propagation import joined, propagate, propagate_by_dynamics
 from hmt_ros.experts.descriptor.contour import PersonBlob, centred_view, person_blob
@@ -56,6 +56,7 @@ from hmt_ros.experts.root_placement import (
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.inference.linear_algebra import inverse, product, singular_values
 from hmt_ros.inference.reduction import reduced
 
 FOLDER = Path(__file__).resolve().parent / 'models'
@@ -138,8 +139,9 @@ class PosePredictor:
         )
         right = (len(equilibrium), equilibrium.dimension) == (1, size)
         require(right, f'equilibrium must be one component over {size} numbers')
-        require(np.linalg.cond(target_basis) <= WORST_CONDITION, 'target_basis is singular')
-        self._from_basis = np.asarray(np.linalg.inv(target_basis), dtype=np.float64)
+        sizes = singular_values(target_basis)[1]
+        require(sizes[0] <= WORST_CONDITION * sizes[-1], 'target_basis is singular')
+        self._from_basis = np.asarray(inverse(target_basis), dtype=np.float64)
 
     @property
     def body(self) -> Body:
@@ -247,7 +249,7 @@ class PosePredictor:
         found = _heaviest(self.model.predict(row[None])[0], max_components)
         if previous is None or propagation == ALONE:
             return _transformed(found, self._from_basis)
-        forgotten = -math.expm1(-FORGETTING * interval)
+        forgotten = -float(elementary.expm1(-FORGETTING * interval))
         if propagation == BY_DYNAMICS:
             return self._by_dynamics(
                 _transformed(found, self._from_basis),
@@ -264,8 +266,8 @@ class PosePredictor:
         before = self._to_targets(self._expected(previous, max(interval - STEP, 0.0)))
         # Where experts are steep, uncertainty would grow from step to step without end: it is kept
         # below that of p(x).
-        known = np.linalg.inv(before.covariances) + np.linalg.inv(self.equilibrium.covariances)
-        before = GaussianMixture(before.weights, before.means, np.linalg.inv(known))
+        known = inverse(before.covariances) + inverse(self.equilibrium.covariances)
+        before = GaussianMixture(before.weights, before.means, inverse(known))
         after = propagate(
             self.dynamics,
             _transformed(before, self.target_basis),
@@ -315,7 +317,7 @@ class PosePredictor:
     def _to_targets(self, poses: GaussianMixture) -> GaussianMixture:
         """The mixture over targets of a mixture over poses."""
         slopes = self.encoding.encoding_jacobians(poses.means)
-        covariances = slopes @ poses.covariances @ slopes.transpose(0, 2, 1)
+        covariances = product(product(slopes, poses.covariances), slopes.transpose(0, 2, 1))
         # Axes of unit length have no spread along themselves.
         covariances += JITTER * np.eye(self.encoding.size)
         return GaussianMixture(poses.weights, self.encoding.encode(poses.means), covariances)
@@ -448,6 +450,6 @@ def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:
 
 def _transformed(mixture: GaussianMixture, basis: Array) -> GaussianMixture:
     """The mixture over B' x of a mixture over x."""
-    covariances = basis.T @ mixture.covariances @ basis
+    covariances = product(product(basis.T, mixture.covariances), basis)
     covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
-    return GaussianMixture(mixture.weights, mixture.means @ basis, covariances)
+    return GaussianMixture(mixture.weights, product(mixture.means, basis), covariances)

@@ -23,11 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera
+from hmt_ros.body.camera import tangent
 from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.core import elementary
 from hmt_ros.experts.descriptor.contour import PersonBlob
 from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import inverse, product, solve
 
 STACKS, SLICES = 9, 12  # of the mesh; its box is exact to 1 % of the radius of a part
 SIZE_SPREAD = 0.06  # relative standard deviation of the size of persons
@@ -96,14 +99,16 @@ def place_roots(
         residual, by_root, by_target = _box_error(
             encoding, mesh, camera, targets, roots, slopes, sides, cut
         )
-        spread = by_target @ covariances @ by_target.transpose(0, 2, 1) + noise * np.eye(4)
-        return residual, by_root, by_target, np.linalg.solve(spread, by_root).transpose(0, 2, 1)
+        spread = product(
+            product(by_target, covariances), by_target.transpose(0, 2, 1)
+        ) + noise * np.eye(4)
+        return residual, by_root, by_target, solve(spread, by_root).transpose(0, 2, 1)
 
     slopes = encoding.jacobians(targets, roots)
     for _ in range(STEPS):
         residual, by_root, _, weighted = linearised(slopes)
-        pull = weighted @ residual[..., None] + prior @ (roots - start)[..., None]
-        step = -np.linalg.solve(weighted @ by_root + prior, pull)[..., 0]
+        pull = product(weighted, residual[..., None]) + product(prior, (roots - start)[..., None])
+        step = -solve(product(weighted, by_root) + prior, pull)[..., 0]
         depth = roots[:, 2]
         share = np.linalg.norm(step, axis=1) / depth
         step *= np.minimum(1.0, LONGEST_STEP / np.maximum(share, 1e-12))[:, None]
@@ -115,13 +120,13 @@ def place_roots(
             slopes = encoding.jacobians(targets, roots)
     slopes = encoding.jacobians(targets, roots)
     _, by_root, by_target, weighted = linearised(slopes)
-    gain = np.linalg.solve(weighted @ by_root + prior, weighted)  # (M, 3, 4)
-    left = np.eye(3) - gain @ by_root
-    own = noise * gain @ gain.transpose(0, 2, 1)
-    own += left @ np.linalg.inv(prior) @ left.transpose(0, 2, 1)
+    gain = solve(product(weighted, by_root) + prior, weighted)  # (M, 3, 4)
+    left = np.eye(3) - product(gain, by_root)
+    own = product(noise * gain, gain.transpose(0, 2, 1))
+    own += product(product(left, inverse(prior)), left.transpose(0, 2, 1))
     relative = size_spread**2 + (CUT_SPREAD**2 if cut.any() else 0.0)
     own += relative * roots[:, :, None] * roots[:, None, :]
-    return RootPlacement(roots, own, -gain @ by_target, slopes)
+    return RootPlacement(roots, own, product(-gain, by_target), slopes)
 
 
 def placed_gaussians(
@@ -135,9 +140,9 @@ def placed_gaussians(
         targets, covariances: (M, D), (M, D, D) of the postures.
     """
     by_target, by_root = placement.jacobians
-    whole = by_target + by_root @ placement.by_targets
-    result = whole @ covariances @ whole.transpose(0, 2, 1)
-    result += by_root @ placement.covariances @ by_root.transpose(0, 2, 1)
+    whole = by_target + product(by_root, placement.by_targets)
+    result = product(product(whole, covariances), whole.transpose(0, 2, 1))
+    result += product(product(by_root, placement.covariances), by_root.transpose(0, 2, 1))
     means = encoding.decode(targets, placement.roots)
     return means, 0.5 * (result + result.transpose(0, 2, 1))
 
@@ -152,11 +157,11 @@ def _first_roots(encoding: PoseEncoding, camera: Camera, sides: Array, targets: 
     left, top, right, bottom = sides
     middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
     ray, first, second = camera.rays(np.array([middle, [left, top], [right, bottom]]))
-    angle = np.arccos(np.clip(first @ second, -1.0, 1.0))
+    angle = elementary.arccos(np.clip(product(first, second), -1.0, 1.0))
     away = np.tile([[0.0, 0.0, 10.0]], (len(targets), 1))
     joints = encoding.body.joint_positions(encoding.decode(targets, away))[..., :2]
     extent = np.linalg.norm(joints.max(1) - joints.min(1), axis=1) + 0.2 * encoding.body.scale
-    depth = 0.5 * extent / np.tan(0.5 * max(float(angle), 1e-3))
+    depth = 0.5 * extent / tangent(0.5 * max(float(angle), 1e-3))
     depth = np.clip(depth, 2.0 * encoding.body.lower[2], 0.9 * encoding.body.upper[2])
     return np.asarray(depth[:, None] * ray / max(float(ray[2]), 0.1))
 
@@ -166,7 +171,8 @@ def _prior(roots: Array) -> Array:
     distance = np.linalg.norm(roots, axis=1)
     along = roots / distance[:, None]
     outer = along[:, :, None] * along[:, None, :]
-    weights = (np.array([DEPTH_SPREAD, ACROSS_SPREAD])[:, None] * distance) ** -2.0
+    spread = np.array([DEPTH_SPREAD, ACROSS_SPREAD])[:, None] * distance
+    weights = 1.0 / (spread * spread)
     result: Array = weights[0][:, None, None] * outer
     result += weights[1][:, None, None] * (np.eye(3) - outer)
     return result
@@ -210,7 +216,7 @@ def _box_error(
     unknown = cut & (residual * outwards >= 0)
     residual[unknown] = 0.0
     by_pose[unknown] = 0.0
-    return residual, by_pose @ by_root, by_pose @ by_target
+    return residual, product(by_pose, by_root), product(by_pose, by_target)
 
 
 def _by_pose(frames: Frames, mesh: Mesh, vertices: Index, points: Array) -> Array:

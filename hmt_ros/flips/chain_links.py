@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 
 
@@ -104,5 +105,5 @@ def chain_links(skeleton: Skeleton, name: str) -> ChainLinks:
 def _signs(lower: float, upper: float, sine: bool) -> list[bool]:
     """Whether angles within the limits give the sine, or the cosine, a sign: first +, then -."""
     samples = np.linspace(lower, min(upper, lower + 2.0 * np.pi), 721)
-    values = np.sin(samples) if sine else np.cos(samples)
+    values = elementary.sin(samples) if sine else elementary.cos(samples)
     return [bool(np.any(values > 1e-6)), bool(np.any(values < -1e-6))]

@@ -27,6 +27,7 @@ from hmt_ros.core import combine, fill_configurations, place_alone
 from hmt_ros.flips.chain_links import chain_links
 from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import log_sum_exp
 
 
 class Limbs(NamedTuple):
@@ -265,7 +266,7 @@ class LimbProducts:
             found,
             np.ascontiguousarray(energies, dtype=np.float64),
             np.ascontiguousarray(log_weights, dtype=np.float64),
-            np.logaddexp.reduce(log_weights) - prices,
+            log_sum_exp(log_weights) - prices,
             float(share),
             int(count),
             poses,

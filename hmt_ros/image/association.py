@@ -14,13 +14,13 @@ unknown; for the nearer one only those that the farther one covers beside it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from hmt_ros.core import elementary
 from hmt_ros.image.person_shape import fill_hull, resized
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
@@ -103,7 +103,7 @@ class ImageTrack:
         # At first the mean over all sightings, later that over the last moments.
         gain = min(dt / min(self._known_for, VELOCITY_TIME), 1.0)
         self.velocity += gain * (moved / dt - self.velocity)
-        self.size = max(sighting.size, self.size * math.exp(-dt / EXPECTED_TIME))
+        self.size = max(sighting.size, self.size * float(elementary.exp(-dt / EXPECTED_TIME)))
         self.sighting, self.stamp = sighting, stamp
 
     def shift(self, stamp: int) -> Array:

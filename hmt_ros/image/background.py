@@ -25,6 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.core import gradient_lengths
 from hmt_ros.image.pixel_backgrounds import (
     FOREGROUND,
     SHADOW,
@@ -32,7 +33,7 @@ from hmt_ros.image.pixel_backgrounds import (
     mixture_background,
     neighbour_background,
 )
-from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.arrays import Image, Mask
 
 Box = tuple[int, int, int, int]
 
@@ -223,7 +224,7 @@ class BackgroundModel:
             pixels = np.ascontiguousarray(raw[_part(region)] == SHADOW).view(np.uint8)
             unsure[_part(region)] = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, square) > 0
         found = self._larger(one_person(mask, self.settings, region))
-        return Silhouette(found, self._larger(unsure) & ~found)
+        return Silhouette(found, self._larger(unsure) > found)
 
     def _subtracted(self, image: Image) -> Image:
         """`FOREGROUND`, `SHADOW` or 0 (h, w), of an image made smaller."""
@@ -281,7 +282,7 @@ class BackgroundModel:
         if self._factor == 1:
             return mask
         pixels = cv2.resize(255 * mask.view(np.uint8), self._shape[1::-1])
-        return np.asarray(pixels > 127)
+        return cv2.threshold(pixels, 127, 1, cv2.THRESH_BINARY)[1].view(np.bool_)
 
     def _smaller_box(self, box: Box | None) -> Box | None:
         """A region in the pixels of images made smaller, rounded outwards."""
@@ -403,7 +404,7 @@ class SceneWatch:
         self.shift = 0.0
         self._count = self._signs = 0
         self._seen: tuple[BackgroundModel | None, int] = None, 0
-        self._edges: Array | None = None
+        self._edges: NDArray[np.float32] | None = None
         self._usual = 0.0
 
     def look(self, image: Image, background: BackgroundModel) -> None:
@@ -424,17 +425,20 @@ class SceneWatch:
         self.shift = shift * image.shape[1] / WIDTH if elsewhere else np.nan if another else 0.0
 
 
-def edges_of(image: Image) -> Array:
+def edges_of(image: Image) -> NDArray[np.float32]:
     """Lengths (h, w) of the gradients of an image (H, W, 3), at `WIDTH`."""
     height = max(round(image.shape[0] * WIDTH / image.shape[1]), 2 * REACH + 8)
     small = cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), SMOOTHING)
-    lengths = np.hypot(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1))
-    strongest: Array = np.minimum(lengths.max(axis=2), STRONGEST)
-    return strongest
+    slopes = cv2.Sobel(small, cv2.CV_16S, 1, 0), cv2.Sobel(small, cv2.CV_16S, 0, 1)
+    result = np.empty(small.shape[:2], np.float32)
+    gradient_lengths(*slopes, STRONGEST, result)
+    return result
 
 
-def _correlation(background: Array, image: Array) -> tuple[float, float, float]:
+def _correlation(
+    background: NDArray[np.float32], image: NDArray[np.float32]
+) -> tuple[float, float, float]:
     """The shift with the best correlation, px; that correlation; and that of no shift."""
     inner = background[REACH:-REACH, REACH:-REACH]
     found = np.nan_to_num(cv2.matchTemplate(image, inner, cv2.TM_CCOEFF_NORMED))

@@ -20,7 +20,9 @@ import math
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from hmt_ros.core import elementary
 from hmt_ros.image.background import WIDTH, BackgroundModel, edges_of
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.error_model import seconds, share_of_time
@@ -65,7 +67,7 @@ class EmptyScene:
         self._recent: Array | None = None
         self._learned = 0
         self._judged: int | None = None
-        self._edges: Array | None = None
+        self._edges: NDArray[np.float32] | None = None
 
     @property
     def known(self) -> bool:
@@ -137,6 +139,6 @@ class EmptyScene:
         changed = (np.abs(small - before).max(axis=2) > CHANGED).view(np.uint8)
         _, _, pieces, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
         moved = pieces[1:, cv2.CC_STAT_AREA].max(initial=0) > PIECE * changed.size
-        gain = 1.0 if moved else -math.expm1(-dt / MEMORY)
+        gain = 1.0 if moved else -float(elementary.expm1(-dt / MEMORY))
         self._recent = before + gain * (small - before)
         return bool(moved)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.plain_yaml import read_plain_yaml
 
@@ -195,4 +196,5 @@ def exchange_rates() -> Array:
 @cache
 def usual_exchanges() -> Array:
     """(1, E) log probability of each exchange, without knowledge of the images before."""
-    return np.log(np.array(_table()['exchanges']['at_first'], dtype=np.float64))[None]
+    at_first = np.array(_table()['exchanges']['at_first'], dtype=np.float64)
+    return np.asarray(elementary.log(at_first)[None])

@@ -20,7 +20,9 @@ import numpy as np
 
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, other_side
+from hmt_ros.core import resize_bones
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 
 WHOLE = {
     'pelvis',
@@ -96,19 +98,17 @@ class LiftedPoses:
         return self._with_lengths(bone_lengths(skeleton, self.joints))
 
     def _with_lengths(self, own: Array) -> Array:
+        result = np.empty(self.means.shape)
         factors = own / np.maximum(self.lengths, 1e-6)
-        result = np.empty_like(self.means)
-        for j, carrier in ordered(self.joints):
-            bone = self.means[:, j] if carrier < 0 else self.means[:, j] - self.means[:, carrier]
-            start = 0.0 if carrier < 0 else result[:, carrier]
-            result[:, j] = start + factors[j] * bone
+        resize_bones(ordered(self.joints), factors, np.ascontiguousarray(self.means), result)
         return result
 
     def resized(self, other: LiftedPoses) -> Array:
         """The means (C, J, 3) with the lengths of another mixture, where it has a joint."""
-        lengths = dict(zip(other.joints, other.lengths.tolist(), strict=True))
-        own = [lengths.get(name, length) for name, length in zip(self.joints, self.lengths)]
-        return self._with_lengths(np.array(own))
+        own = self.lengths.copy()
+        rows, others = shared(self.joints, other.joints)
+        own[rows] = other.lengths[others]
+        return self._with_lengths(own)
 
     def exchanged(self) -> LiftedPoses:
         """The mixture with exchanged sides: left for right, and away for towards."""
@@ -140,11 +140,9 @@ def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
     for one in opinions:
         rows = slice(row, row + len(one.log_weights))
         row = rows.stop
-        sized = one.resized(first)
-        for j, name in enumerate(first.joints):
-            if name in one.joints:
-                i = one.joints.index(name)
-                means[rows, j], deviations[rows, j] = sized[:, i], one.deviations[:, i]
+        own, theirs = shared(first.joints, one.joints)
+        means[rows, own] = one.resized(first)[:, theirs]
+        deviations[rows, own] = one.deviations[:, theirs]
     weights = np.concatenate([one.log_weights for one in opinions]) - np.log(len(opinions))
     return LiftedPoses(first.joints, weights, means, deviations, first.axes, first.lengths)
 
@@ -161,24 +159,21 @@ def from_positions(
         axes: (3, 3) of the person's view, in rows, camera frame.
         deviations: of the depths of joints, by their kind, m.
     """
-    known: dict[str, Array] = {}
-    for name, position in zip(joints, positions, strict=True):
-        if np.isfinite(position).all() and name.rpartition('_')[2] in deviations:
-            known.setdefault(name, position)
+    known: dict[str, int] = {}
+    for i in np.flatnonzero(np.isfinite(positions).all(1)).tolist():
+        if joints[i].rpartition('_')[2] in deviations:
+            known.setdefault(joints[i], i)
     names = tuple(name for name in known if other_side(name) in known)
     if not {*names} >= {*HIPS} or len(names) <= len(HIPS):
         return None
-    middle = np.mean([known[name] for name in HIPS], axis=0)
-    places = np.array([known[name] - middle for name in names])
-    lengths = np.empty(len(names))
-    for j, carrier in ordered(names):
-        start = 0.0 if carrier < 0 else places[carrier]
-        lengths[j] = np.linalg.norm(places[j] - start)
+    middle = positions[[known[name] for name in HIPS]].mean(0)
+    places = positions[[known[name] for name in names]] - middle
+    lengths = np.linalg.norm(bones(names, places, np.zeros(3)), axis=1)
     spread = np.array([deviations[name.rpartition('_')[2]] for name in names])
     return LiftedPoses(
         names,
         np.zeros(1),
-        (places @ axes.T)[None],
+        product(places, axes.T)[None],
         np.repeat(spread[None, :, None], 3, axis=2),
         axes,
         lengths,
@@ -186,8 +181,16 @@ def from_positions(
 
 
 @lru_cache(maxsize=64)
-def ordered(joints: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
-    """Rows of joints and of those that they hang on (-1: the middle of the hips), these first."""
+def shared(joints: tuple[str, ...], others: tuple[str, ...]) -> tuple[Index, Index]:
+    """Rows of the joints that are in both, in each."""
+    rows = [(i, others.index(name)) for i, name in enumerate(joints) if name in others]
+    own, theirs = np.array(rows, dtype=np.intp).reshape(-1, 2).T
+    return own, theirs
+
+
+@lru_cache(maxsize=64)
+def ordered(joints: tuple[str, ...]) -> Index:
+    """(J, 2) rows of joints and of those that they hang on (-1: the middle of the hips), first."""
     places = {name: i for i, name in enumerate(joints)}
     result: list[tuple[int, int]] = []
     done: set[str] = set()
@@ -203,7 +206,7 @@ def ordered(joints: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
 
     for name in joints:
         visit(name)
-    return tuple(result)
+    return np.array(result, dtype=np.intp).reshape(-1, 2)
 
 
 def carrier_of(name: str, joints: Sequence[str]) -> str:
@@ -224,10 +227,14 @@ def bone_lengths(skeleton: Skeleton, joints: tuple[str, ...]) -> Array:
     places = forward(skeleton, np.zeros((1, skeleton.dimension))).joints()[..., 0]
     chosen: Index = skeleton.joint_index(joints)
     middle = places[skeleton.joint_index(HIPS)].mean(0)
-    result = np.empty(len(joints))
-    for j, carrier in ordered(joints):
-        start = middle if carrier < 0 else places[chosen[carrier]]
-        result[j] = np.linalg.norm(places[chosen[j]] - start)
+    return np.asarray(np.linalg.norm(bones(joints, places[chosen], middle), axis=1))
+
+
+def bones(joints: tuple[str, ...], places: Array, origin: Array) -> Array:
+    """Bones (J, 3) that joints at places (J, 3) hang on; the origin: of those that hang on none."""
+    rows, carriers = ordered(joints).T
+    result = np.empty_like(places)
+    result[rows] = places[rows] - np.where(carriers[:, None] < 0, origin, places[carriers])
     return result
 
 

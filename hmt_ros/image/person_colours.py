@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.core import bin_colours, count_colours
 from hmt_ros.image.person_shape import counted
 from hmt_ros.inference.arrays import Array, Image, Mask
 
@@ -122,9 +123,8 @@ class Colours:
     def _changed(self, image: Image) -> Mask:
         """Pixels (h, w) that differ from the image that was learned last."""
         assert self._image is not None
-        return np.asarray(
-            cv2.absdiff(cv2.blur(image, (3, 3)), self._image).max(axis=2) > CHANGED_LEVELS
-        )
+        change = cv2.absdiff(cv2.blur(image, (3, 3)), self._image)
+        return np.asarray(cv2.inRange(change, (0, 0, 0), (CHANGED_LEVELS,) * 3) == 0)
 
     def learn(self, image: Image, model: Mask, dt: float) -> None:
         """Takes in an image (h, w, 3) with the person on the pixels (h, w) of the model.
@@ -133,15 +133,14 @@ class Colours:
             image, model: on the raster.
             dt: time since the last image that was learned, s.
         """
-        around = surroundings(model)
+        outside = beyond(model)
+        around = surroundings(model, outside)
         if not model.any() or not around.any():
             return
         bins = binned(image)
         # One pass counts the pixels on the model, around it, and all others.
-        counts = np.bincount(
-            (bins + BINS**3 * (model + 2 * around.view(np.uint8)).astype(np.uint16)).ravel(),
-            minlength=3 * BINS**3,
-        ).reshape(3, -1)
+        counts = np.empty((3, BINS**3), np.int64)
+        count_colours(bins, model + 2 * around.view(np.uint8), counts)
         on, off = (x / max(x.sum(), 1) for x in counts[1:])
         scene = counts.sum(0) / bins.size
         first = self._inside is None
@@ -152,7 +151,7 @@ class Colours:
         x, y, width, height = cv2.boundingRect(model.view(np.uint8))
         self.size = width, height
         self._image, self._model = np.asarray(cv2.blur(image, (3, 3)), np.uint8), model
-        self._beyond = beyond(model)
+        self._beyond = outside
         means = self._means(bins)
         row, column = y + height // 2, x + width // 2
         here = float(means[row, column])
@@ -182,25 +181,30 @@ def _moved(usual: float, value: float, gain: float) -> float:
 
 def binned(image: Image) -> NDArray[np.uint16]:
     """The bin of the colour of each pixel (h, w) of an image (h, w, 3)."""
-    width = 256 // BINS
-    parts = (image // np.uint8(width)).astype(np.uint16)
-    result: NDArray[np.uint16] = (parts[..., 0] * BINS + parts[..., 1]) * BINS + parts[..., 2]
+    result = np.empty(image.shape[:2], np.uint16)
+    bin_colours(np.ascontiguousarray(image), BINS, result)
     return result
 
 
 def shares(bins: NDArray[np.uint16]) -> Array:
     """Share (BINS^3,) of each colour among pixels."""
-    return np.bincount(bins.ravel(), minlength=BINS**3) / bins.size
+    counts = np.empty((1, BINS**3), np.int64)
+    count_colours(bins, np.zeros(bins.shape, np.uint8), counts)
+    return np.asarray(counts[0] / bins.size)
 
 
-def surroundings(model: Mask) -> Mask:
-    """Pixels (H, W) around those that the model covers, up to half its size away."""
+def surroundings(model: Mask, outside: Mask) -> Mask:
+    """Pixels (H, W) around those that the model covers, up to half its size away.
+
+    Args:
+        model, outside: pixels of the model, and those beyond it, see `beyond`.
+    """
     x, y, width, height = cv2.boundingRect(model.view(np.uint8))
     margin = max(width, height) // 2
     rows = slice(max(y - margin, 0), y + height + margin)
     columns = slice(max(x - margin, 0), x + width + margin)
     result = np.zeros(model.shape, dtype=np.bool_)
-    result[rows, columns] = beyond(model)[rows, columns]
+    result[rows, columns] = outside[rows, columns]
     return result
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.kinematics import forward
+from hmt_ros.body.kinematics import point_positions
 from hmt_ros.image.background import BackgroundSettings, one_person
 from hmt_ros.image.surface_points import coarse_mesh
 from hmt_ros.inference.arrays import Array, Mask
@@ -93,26 +93,26 @@ def covered(body: Body, camera: Camera, pose: Array, step: int = 1) -> Mask:
 
     Each part of the flesh counts as the convex hull of its projected points.
     """
-    mesh = coarse_mesh(body)
-    points = forward(body.skeleton, pose[None]).points(mesh.segments, mesh.vertices)[:, :, 0]
-    shape = -(-camera.height // step), -(-camera.width // step)
-    pixels = camera.project(points) / step
-    usable: Mask = np.all(np.isfinite(pixels), axis=1)
-    mask = np.zeros(shape, dtype=np.uint8)
-    for part in range(len(body.flesh.parts)):
-        here = mesh.parts == part
-        # A part that is partly behind the camera has no hull.
-        if usable[here].all():
-            fill_hull(mask, pixels[here])
+    mesh, parts = coarse_mesh(body), len(body.flesh.parts)
+    places = point_positions(body.skeleton, pose[None], mesh.segments, mesh.vertices)
+    corners = len(mesh.vertices) // max(parts, 1)
+    pixels = camera.project(places.reshape(parts, corners, 3)) / step
+    mask = np.zeros((-(-camera.height // step), -(-camera.width // step)), dtype=np.uint8)
+    # A part that is partly behind the camera has no hull.
+    for hull in map(cv2.convexHull, _corners(mask, pixels[np.isfinite(pixels).all((1, 2))])):
+        cv2.fillConvexPoly(mask, hull, 1)
     return mask.view(np.bool_)
 
 
 def fill_hull(mask: NDArray[np.uint8], pixels: Array) -> None:
     """Sets the pixels of a mask (H, W) in the convex hull of points (N, 2), px, to 1."""
-    # Far outside of the image a hull is cut, not wrapped.
+    cv2.fillConvexPoly(mask, cv2.convexHull(_corners(mask, pixels)), 1)
+
+
+def _corners(mask: NDArray[np.uint8], pixels: Array) -> NDArray[np.int32]:
+    """Points (..., 2) as OpenCV takes them; far outside of the image they are cut, not wrapped."""
     limit = 4.0 * max(mask.shape)
-    points = np.clip(pixels, -limit, limit).round().astype(np.int32)
-    cv2.fillConvexPoly(mask, cv2.convexHull(points), 1)
+    return np.rint(np.clip(pixels, -limit, limit)).astype(np.int32)
 
 
 def counted(mask: Mask) -> int:

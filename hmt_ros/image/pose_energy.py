@@ -11,7 +11,7 @@ that is not in the core is added by its own `energy`; then the minima are found 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -136,6 +136,7 @@ class PoseEnergy:
         point: (d,) values of all variables; None: all are free.
         free: (f,) variables that may move, where there is a point.
         counted: called with the number of poses that were evaluated; None: not called.
+        _known: terms with a kernel here, by the name of their inputs.
 
     Raises:
         ValueError: two terms of one kind that has a kernel.
@@ -147,12 +148,18 @@ class PoseEnergy:
     point: Array | None = None
     free: Index | None = None
     counted: Callable[[int], None] | None = None
+    _known: dict[str, Any] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for kind in KINDS.values():
-            found = [type(term).__name__ for term in self.terms if isinstance(term, kind)]
-            if len(found) > 1:
-                raise ValueError(f'a sum has one term of a kind at most, saw {" and ".join(found)}')
+        known: dict[str, Any] = {}
+        for term in self.terms:
+            name = KINDS.get(type(term), '')
+            if name in known:
+                found = f'{type(known[name]).__name__} and {type(term).__name__}'
+                raise ValueError(f'a sum has one term of a kind at most, saw {found}')
+            if name:
+                known[name] = term
+        object.__setattr__(self, '_known', known)
 
     def energy(
         self,
@@ -224,10 +231,12 @@ class PoseEnergy:
         Raises:
             ValueError: x has not f columns, or is not finite.
         """
-        body = self.likelihood.body
+        limits = _limits(self.likelihood.body)
+        if self.point is not None:
+            limits = limits.take(self._free, axis=1)
+        lower, upper = limits
         if step_scale is None:
-            step_scale = scale_of(body)[self._free]
-        lower, upper = body.lower[self._free], body.upper[self._free]
+            step_scale = scale_of(self.likelihood.body)[self._free]
         if self._strange:
             return minimise(
                 self,
@@ -239,18 +248,16 @@ class PoseEnergy:
                 max_iterations=max_iterations,
                 tolerance=tolerance,
             )
-        x = np.clip(self._checked(x), lower, upper)
-        n, f = x.shape
-        metric = np.broadcast_to(np.asarray(step_scale, dtype=np.float64) ** -2.0, (f,)).copy()
+        inside: Array = np.minimum(np.maximum(self._checked(x), lower), upper)
+        n, f = inside.shape
+        metric = np.full(f, np.asarray(step_scale, dtype=np.float64) ** -2.0)
         descent = Descent(max_iterations, float(damping), float(tolerance), metric)
-        energy, _, _, status, iterations = self._solved(
-            x, np.arange(n), np.stack([lower, upper]), descent, 2
-        )
+        energy, _, _, status, iterations = self._solved(inside, np.arange(n), limits, descent, 2)
         if self.counted is not None:
             self.counted(n + int(iterations.sum()))
         gradient, hessian = energy.derivatives()
-        free = ~resting(x, gradient, lower, upper)
-        return Minimum(x, energy.value, gradient, hessian, free, status, iterations)
+        free = ~resting(inside, gradient, lower, upper)
+        return Minimum(inside, energy.value, gradient, hessian, free, status, iterations)
 
     def _solved(
         self,
@@ -299,16 +306,14 @@ class PoseEnergy:
         in_threads(work, n, together, self.likelihood.threads)
         return Energy(*energy), parts, compiled, status, iterations
 
-    @cached_property
+    @property
     def _point(self) -> Array:
-        if self.point is None:
-            return np.zeros(self.likelihood.body.dimension)
-        return np.array(self.point, dtype=np.float64)
+        return _origin(self.likelihood.body) if self.point is None else self.point
 
-    @cached_property
+    @property
     def _free(self) -> Index:
         if self.point is None:
-            return np.arange(self.likelihood.body.dimension)
+            return _every_variable(self.likelihood.body)
         assert self.free is not None
         return np.asarray(self.free, dtype=np.intp)
 
@@ -321,9 +326,11 @@ class PoseEnergy:
             raise ValueError('poses must be finite')
         return result
 
-    @cached_property
+    @property
     def _strange(self) -> tuple[FrameTerm, ...]:
         """Terms without a kernel here."""
+        if len(self._known) == len(self.terms):
+            return ()
         return tuple(x for x in self.terms if not isinstance(x, CompiledTerm))
 
     def _others(self, x: Array, rows: Index, derivatives: Derivatives) -> list[Energy]:
@@ -347,81 +354,92 @@ class PoseEnergy:
         """The terms as compiled code reads them, for so many poses."""
         image = self._known.get('image') or ObservedImage(self.likelihood, NOTHING_SEEN)
         inputs = image.likelihood.inputs(image.observation, count, image.explained)
-        running = [bool(one.term.weight > 0) for one in inputs]
-        contour = any(on and term.needs_contour for on, term in zip(running, TERMS, strict=True))
-        model = image.likelihood.model
-        return Compiled(
-            inputs=inputs, image=any(running), contour=contour, model=model, **self._rest
+        running = [term for term, one in zip(TERMS, inputs, strict=True) if one.term.weight > 0]
+        return self._rest._replace(
+            model=image.likelihood.model,
+            inputs=inputs,
+            image=bool(running),
+            contour=any(term.needs_contour for term in running),
         )
 
     @cached_property
-    def _rest(self) -> dict[str, Any]:
+    def _rest(self) -> Compiled:
         """Inputs of compiled code besides the terms of the image."""
-        body = self.likelihood.body
-        own = {name: term.compiled for name, term in self._known.items() if name != 'image'}
-        centres, precisions, tails = self._expected
-        return {
-            **_absent(body, self.likelihood.camera),
-            **own,
-            'placing': placing_of(body.skeleton),
-            'centres': centres,
-            'precisions': precisions,
-            'tails': tails,
-        }
-
-    @cached_property
-    def _known(self) -> dict[str, Any]:
-        """Terms with a kernel here, by the name of their inputs."""
-        return {
-            name: term
-            for name, kind in KINDS.items()
-            for term in self.terms
-            if isinstance(term, kind)
-        }
-
-    @cached_property
-    def _expected(self) -> tuple[Array, Array, float]:
-        """Centres, precisions and degrees of freedom of the motion."""
-        f = len(self._free)
-        if self.motion is None:
-            return np.zeros((0, f)), np.zeros((0, f, f)), 0.0
-        centres, precisions = np.atleast_2d(self.motion.centres), self.motion.precisions
-        if precisions.ndim == 1:
-            precisions = np.diag(precisions)
-        if precisions.ndim == 2:
-            precisions = precisions[None]
-        rows = max(len(centres), len(precisions))
-        tails = self.motion.degrees_of_freedom if isinstance(self.motion, Student) else 0.0
-        return (
-            np.array(np.broadcast_to(centres, (rows, f)), dtype=np.float64),
-            np.array(np.broadcast_to(precisions, (rows, f, f)), dtype=np.float64),
-            float(tails),
-        )
+        found = {name: term.compiled for name, term in self._known.items() if name != 'image'}
+        if self.motion is not None:
+            found |= zip(('centres', 'precisions', 'tails'), _expected(self.motion), strict=True)
+        elif self.point is not None:
+            f = len(self._free)
+            found |= {'centres': np.zeros((0, f)), 'precisions': np.zeros((0, f, f))}
+        return _absent(self.likelihood.body)._replace(**found)
 
 
-# Kinds of terms with a kernel here, by the names of their inputs in `Compiled`.
-KINDS: dict[str, Any] = {
-    'image': ObservedImage,
-    'keypoints': KeypointTerm,
-    'prior': (MixturePrior, AnglePrior),
-    'overlaps': SelfIntersection,
-    'ground': GroundTerm,
-    'flow': FlowTerm,
+def _expected(motion: Quadratic | Student) -> tuple[Array, Array, float]:
+    """Centres, precisions and degrees of freedom of a motion."""
+    centres, precisions = np.atleast_2d(motion.centres), motion.precisions
+    if precisions.ndim == 1:
+        precisions = np.diag(precisions)
+    if precisions.ndim == 2:
+        precisions = precisions[None]
+    rows, f = max(len(centres), len(precisions)), centres.shape[1]
+    tails = motion.degrees_of_freedom if isinstance(motion, Student) else 0.0
+    return (
+        np.ascontiguousarray(np.broadcast_to(centres, (rows, f)), dtype=np.float64),
+        np.ascontiguousarray(np.broadcast_to(precisions, (rows, f, f)), dtype=np.float64),
+        float(tails),
+    )
+
+
+# Names in `Compiled` of the inputs of terms with a kernel here.
+KINDS: dict[type, str] = {
+    ObservedImage: 'image',
+    KeypointTerm: 'keypoints',
+    MixturePrior: 'prior',
+    AnglePrior: 'prior',
+    SelfIntersection: 'overlaps',
+    GroundTerm: 'ground',
+    FlowTerm: 'flow',
 }
 NOTHING_SEEN = Observation()
 
 
 @lru_cache(maxsize=16)
-def _absent(body: Body, camera: Camera) -> dict[str, Any]:
-    """What compiled code reads where a term is not there."""
+def _limits(body: Body) -> Array:
+    """Lower and upper limits (2, d)."""
+    return np.stack([body.lower, body.upper])
+
+
+@lru_cache(maxsize=16)
+def _origin(body: Body) -> Array:
+    return np.zeros(body.dimension)
+
+
+@lru_cache(maxsize=16)
+def _every_variable(body: Body) -> Index:
+    return np.arange(body.dimension)
+
+
+@lru_cache(maxsize=16)
+def _absent(body: Body) -> Compiled:
+    """What compiled code reads where no term is there."""
+    camera = Camera(1.0, 1.0, 0.0, 0.0, 1, 1)
     none, nothing = np.zeros(0, np.int64), np.zeros((0, 0, 3))
     no_keypoints = Keypoints((), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
     no_floor = FloorPlane(np.zeros(3), 0.0, None, np.inf)
     no_points = SurfacePoints(none, np.zeros((0, 0), np.int64), nothing, nothing[..., :2].copy())
-    return {
-        'keypoints': KeypointTerm(body.skeleton, camera, no_keypoints).compiled,
-        'prior': AnglePrior(body, 0.0).compiled,
-        'overlaps': SelfIntersection(body, np.inf).compiled,
-        'ground': GroundTerm(body, GroundSettings(0.0, 0.0), no_floor).compiled,
-        'flow': FlowTerm(no_points, NO_MAP, 0.0),
-    }
+    d = body.dimension
+    return Compiled(
+        placing=placing_of(body.skeleton),
+        model=ImageLikelihood(body, camera).model,
+        inputs=(),
+        image=False,
+        contour=False,
+        keypoints=KeypointTerm(body.skeleton, camera, no_keypoints).compiled,
+        prior=AnglePrior(body, 0.0).compiled,
+        overlaps=SelfIntersection(body, np.inf).compiled,
+        ground=GroundTerm(body, GroundSettings(0.0, 0.0), no_floor).compiled,
+        flow=FlowTerm(no_points, NO_MAP, 0.0),
+        centres=np.zeros((0, d)),
+        precisions=np.zeros((0, d, d)),
+        tails=0.0,
+    )

@@ -82,6 +82,7 @@ class Contour(NamedTuple):
     noise: Array
 
 
+@lru_cache(maxsize=16)
 def lens_of(camera: Camera) -> Lens:
     """The compiled code's view of a camera."""
     k1, k2, k3, k4, k5, k6, k7, k8, *_ = (*map(float, camera.distortion), *(0.0,) * 8)
@@ -94,13 +95,14 @@ def lens_of(camera: Camera) -> Lens:
     )
 
 
+@lru_cache(maxsize=16)
 def flesh_table_of(body: Body) -> FleshTable:
     """The compiled code's view of a body's flesh."""
     flesh, ring = body.flesh, body.flesh.rings
     return FleshTable(
         np.array([p.segment for p in flesh.parts], dtype=np.int64),
-        np.array([p.centre for p in flesh.parts]).reshape(-1, 3),
-        np.array([p.radii for p in flesh.parts]).reshape(-1, 3),
+        flesh.table.centres,
+        flesh.table.radii,
         flesh.ring_parts.astype(np.int64),
         ring.centre,
         ring.radius,

@@ -6,7 +6,6 @@ in the image, edges and flow may show it.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -74,26 +73,32 @@ def _told(body: Body, hidden: tuple[bool, ...]) -> Body:
         own = list(chain[1:])
         away[own] = np.cumsum((skeleton.offsets[own] ** 2).sum(1))
     more = ALONG_LIMB**2 * (away * hidden)[skeleton.joint_segments]
-    return replace(body, joint_errors=np.sqrt(body.joint_errors**2 + more))
+    return body.with_beliefs(joint_errors=np.sqrt(body.joint_errors**2 + more))
 
 
 def shown_segments(body: Body, camera: Camera, observation: Observation, pose: Array) -> Mask:
     """Segments (S,) that an image shows at a pose (d,), see `UnseenLimbs.times`."""
-    skeleton, size = body.skeleton, np.array([camera.width, camera.height])
-    pixels = camera.project(forward(skeleton, pose[None]).origins[..., 0])
-    shown = np.asarray(((pixels >= -0.5) & (pixels < size - 0.5)).all(1))
-    keypoints = observation.keypoints
-    if keypoints is not None:
-        inside = ((keypoints.pixels >= -0.5) & (keypoints.pixels < size - 0.5)).all(1)
-        found = np.flatnonzero(inside & (keypoints.confidences >= GUESSED))
-        joints = skeleton.joint_index([keypoints.names[i] for i in found])
-        shown = np.isin(np.arange(len(shown)), skeleton.joint_segments[joints])
+    skeleton, keypoints = body.skeleton, observation.keypoints
+    if keypoints is None:
+        origins = forward(skeleton, pose[None]).segments[1][0]
+        shown = _inside(camera, camera.project(origins))
+    else:
+        found = _inside(camera, keypoints.pixels) & (keypoints.confidences >= GUESSED)
+        joints = skeleton.joint_index(tuple(keypoints.names[i] for i in np.flatnonzero(found)))
+        shown = np.zeros(len(skeleton.parents), dtype=np.bool_)
+        shown[skeleton.joint_segments[joints]] = True
     result = np.ones_like(shown)
     for left_or_right in body.chain_pairs:
         for chain in left_or_right:
-            own = list(body.chains[chain])
-            result[own] = np.logical_or.accumulate(shown[own][::-1])[::-1]
+            outwards = list(body.chains[chain])
+            result[outwards] = np.logical_or.accumulate(shown[outwards][::-1])[::-1]
     # The pelvis is shown by a leg.
     hung = [own[0] for own in body.chains.values() if skeleton.parents[own[0]] == 0]
     result[0] = not hung or result[hung].any()
     return result
+
+
+def _inside(camera: Camera, pixels: Array) -> Mask:
+    """Which pixels (N, 2) lie in an image."""
+    ends = camera.width - 0.5, camera.height - 0.5
+    return np.asarray(((pixels >= -0.5) & (pixels < ends)).all(1))

@@ -21,10 +21,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.special import expit, logsumexp
 
 from hmt_ros.body.camera import Camera
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array, Image, Index
+from hmt_ros.inference.linear_algebra import inverse, length, log_sum_exp, product, solve
+from hmt_ros.inference.logistic import probability_of
 
 # The level of an upright camera.
 UPRIGHT = np.eye(3)
@@ -82,8 +84,8 @@ class Vertical:
     def agreement(self, up: Array, sigma: float) -> float:
         """Density of this vertical where another (3,) with a deviation is right, over any alone."""
         variance = sigma**2 + self.sigma**2
-        square = 2.0 - 2.0 * float(up @ self.up)
-        near = np.exp(-0.5 * square / variance) / (2.0 * np.pi * variance)
+        square = 2.0 - 2.0 * float(product(up, self.up))
+        near = elementary.exp(-0.5 * square / variance) / (2.0 * np.pi * variance)
         return float(RIGHT * near / ANYWHERE + 1.0 - RIGHT)
 
     def refined(self, up: Array, sigma: float) -> Vertical:
@@ -93,9 +95,9 @@ class Vertical:
         """
         right = 1.0 - (1.0 - RIGHT) / self.agreement(up, sigma)
         share = max(right, 0.0) * sigma**2 / (sigma**2 + self.sigma**2)
-        share = min(share, sigma / max(float(np.linalg.norm(self.up - up)), 1e-9))
+        share = min(share, sigma / max(length(self.up - up), 1e-9))
         mean = (1.0 - share) * up + share * self.up
-        return Vertical(mean / np.linalg.norm(mean), sigma * float(np.sqrt(1.0 - share)))
+        return Vertical(mean / length(mean), sigma * float(np.sqrt(1.0 - share)))
 
 
 def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Vertical | None:
@@ -107,9 +109,11 @@ def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Verti
         level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
     """
     lines = straight_lines(image, camera)
-    upright = lines._replace(normals=lines.normals @ level, middles=lines.middles @ level)
+    upright = lines._replace(
+        normals=product(lines.normals, level), middles=product(lines.middles, level)
+    )
     found = vertical_of(upright) if len(lines.normals) else None
-    return None if found is None else Vertical(level @ found.up, found.sigma)
+    return None if found is None else Vertical(product(level, found.up), found.sigma)
 
 
 def straight_lines(image: Image, camera: Camera) -> Lines:
@@ -146,12 +150,12 @@ def vertical_of(lines: Lines) -> Vertical | None:
     ratios = _ratios(raster.directions, lines, COARSE)
     vertical = SHARE / 3.0 * ratios[raster.vertical] + (1.0 - SHARE)
     levels = [ratios[a] + ratios[b] for a, b in zip(raster.first.T, raster.second.T, strict=True)]
-    value = np.array([np.log(vertical + SHARE / 3.0 * level).sum(1) for level in levels])
-    posterior = logsumexp(value, axis=0) - np.log(len(value)) + raster.log_prior
-    evidence = float(logsumexp(posterior))
+    value = np.array([elementary.log(vertical + SHARE / 3.0 * level).sum(1) for level in levels])
+    posterior = log_sum_exp(value, axis=0) - elementary.log(len(value)) + raster.log_prior
+    evidence = float(log_sum_exp(posterior))
     found = _refined(raster.ups[posterior.argmax()], lines)
-    near = raster.ups @ found.up > np.cos(SURROUNDINGS)
-    believed = expit(evidence) * np.exp(posterior[near] - evidence).sum()
+    near = product(raster.ups, found.up) > elementary.cos(SURROUNDINGS)
+    believed = probability_of(evidence) * elementary.exp(posterior[near] - evidence).sum()
     return found if believed > BELIEVED else None
 
 
@@ -163,31 +167,35 @@ def _refined(start: Array, lines: Lines) -> Vertical:
         ratios = _ratios(up[None], lines, sigma)[0]
         agree = SHARE / 3.0 * ratios
         weight = agree / (agree + 1.0 - SHARE / 3.0) / (sigma**2 + lines.errors**2)
-        foreshortening = 1.0 / np.sqrt(np.maximum(1.0 - (lines.middles @ up) ** 2, 1e-4))
+        foreshortening = 1.0 / np.sqrt(np.maximum(1.0 - product(lines.middles, up) ** 2, 1e-4))
         slopes = foreshortening[:, None] * np.cross(up, lines.normals)
-        information = (slopes * weight[:, None]).T @ slopes + np.eye(3) / RASTER_SIGMA**2
-        pull = -(weight * foreshortening * (lines.normals @ up)) @ slopes
+        information = product((slopes * weight[:, None]).T, slopes) + np.eye(3) / RASTER_SIGMA**2
+        pull = product(-(weight * foreshortening * product(lines.normals, up)), slopes)
         pull = pull + np.cross(up, start) / RASTER_SIGMA**2
-        turn = np.linalg.solve(information, pull)
+        turn = solve(information, pull)
         up = up + np.cross(turn, up)
-        up = up / np.linalg.norm(up)
+        up = up / length(up)
     across = np.cross(np.eye(3), up)
-    covariance = across @ np.linalg.inv(information) @ across.T
+    covariance = product(product(across, inverse(information)), across.T)
     return Vertical(up, float(np.sqrt(covariance.trace() / 2.0 + LEAST_SIGMA**2)))
 
 
 def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
     """Densities (D, N) of the angles of lines if they ran along directions (D, 3), over uniform."""
-    across = np.sqrt(np.maximum(1.0 - (directions @ lines.middles.T) ** 2, 1e-4))
-    angle = np.arcsin(np.minimum(np.abs(directions @ lines.normals.T) / across, 1.0))
+    across = np.sqrt(np.maximum(1.0 - product(directions, lines.middles.T) ** 2, 1e-4))
+    angle = elementary.arcsin(
+        np.minimum(np.abs(product(directions, lines.normals.T)) / across, 1.0)
+    )
     deviation = np.sqrt(sigma**2 + lines.errors**2)
-    result: Array = np.sqrt(np.pi / 2.0) / deviation * np.exp(-0.5 * (angle / deviation) ** 2)
+    result: Array = (
+        np.sqrt(np.pi / 2.0) / deviation * elementary.exp(-0.5 * (angle / deviation) ** 2)
+    )
     return result
 
 
 def _distinct(normals: Array) -> Index:
     """Indices of unit normals (N, 3) that differ from all that were kept before them."""
-    same = np.abs(normals @ normals.T) > np.cos(SAME_LINE)
+    same = np.abs(product(normals, normals.T)) > elementary.cos(SAME_LINE)
     free = np.ones(len(normals), dtype=np.bool_)
     kept = []
     for i in range(len(normals)):
@@ -227,17 +235,24 @@ def _raster() -> _Raster:
         )
     )
     ups = np.stack(
-        [np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch), -np.sin(pitch)], axis=1
+        [
+            elementary.sin(roll) * elementary.cos(pitch),
+            -elementary.cos(roll) * elementary.cos(pitch),
+            -elementary.sin(pitch),
+        ],
+        axis=1,
     )
     deviation = np.where(pitch < PITCH, *PITCH_SIGMA)
     log_prior = (
-        -0.5 * ((pitch - PITCH) / deviation) ** 2 - 0.5 * (roll / ROLL) ** 2 + np.log(np.cos(pitch))
+        -0.5 * ((pitch - PITCH) / deviation) ** 2
+        - 0.5 * (roll / ROLL) ** 2
+        + elementary.log(elementary.cos(pitch))
     )
     turns = np.arange(0.0, np.pi / 2.0 - 1e-9, STEP)
     across = np.cross(ups, [0.0, 0.0, 1.0])
     across = across / np.linalg.norm(across, axis=1, keepdims=True)
     ahead = np.cross(ups, across)
-    cosine, sine = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
+    cosine, sine = elementary.cos(turns)[None, :, None], elementary.sin(turns)[None, :, None]
     first = cosine * across[:, None] + sine * ahead[:, None]
     second = cosine * ahead[:, None] - sine * across[:, None]
     # Directions are rounded to a half of the step.
@@ -249,7 +264,7 @@ def _raster() -> _Raster:
     count, pairs = len(ups), first.shape[0] * first.shape[1]
     return _Raster(
         ups,
-        log_prior - logsumexp(log_prior),
+        log_prior - log_sum_exp(log_prior),
         every[places],
         which[:count],
         which[count : count + pairs].reshape(first.shape[:2]),

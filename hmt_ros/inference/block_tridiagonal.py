@@ -14,15 +14,25 @@ follows from the coupling; where E_t is diagonal it is half of that for full blo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri
 
-from hmt_ros.core import add_diagonal, fill_lower
+from hmt_ros.core import (
+    add_band_product,
+    add_diagonal,
+    elementary,
+    factorise_band,
+    fill_lower,
+    multiply_band_transposed,
+    solve_band_lower,
+    solve_band_transposed,
+)
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import inverse_triangular, product
 
 
 class NotPositiveDefiniteError(ValueError):
@@ -59,12 +69,10 @@ class BlockTridiagonal:
 
     def product(self, x: Array) -> Array:
         """P x of trajectories x (..., T, n)."""
-        lower = np.tril(self.diagonal)
-        symmetric = lower + np.tril(self.diagonal, -1).swapaxes(1, 2)
-        result: Array = (symmetric @ x[..., None])[..., 0]
-        result[..., 1:, :] += (self.lower @ x[..., :-1, :, None])[..., 0]
-        result[..., :-1, :] += (self.lower.swapaxes(1, 2) @ x[..., 1:, :, None])[..., 0]
-        return result
+        flat = np.ascontiguousarray(x.reshape(-1, self.diagonal.shape[0] * self.diagonal.shape[1]))
+        result = np.zeros_like(flat)
+        add_band_product(self.band(), flat, result)
+        return result.reshape(x.shape)
 
     def cholesky(self) -> BlockCholesky:
         """The factor L.
@@ -73,7 +81,7 @@ class BlockTridiagonal:
             NotPositiveDefiniteError: the matrix is not positive definite.
         """
         t, n = self.diagonal.shape[:2]
-        return factorise_band(self.band().T, t, n)
+        return factorise(self.band(), t, n)
 
     def band(self) -> Array:
         """The columns (T n, width + 1) of LAPACK's band storage: [j, i - j] = P[i, j]."""
@@ -89,45 +97,39 @@ class BlockCholesky:
     """The Cholesky factor of a block-tridiagonal matrix, P = L L'.
 
     Attributes:
-        band: (width + 1, T n) L in LAPACK's band storage: band[i - j, j] = L[i, j].
+        columns: (T n, width + 1) of L in LAPACK's band storage: [j, i - j] = L[i, j].
         times, size: T and n.
     """
 
-    band: Array
+    columns: Array
     times: int
     size: int
 
     @property
     def width(self) -> int:
         """Number of diagonals below the main one."""
-        return len(self.band) - 1
+        return int(self.columns.shape[1]) - 1
 
     @cached_property
     def log_determinant(self) -> float:
         """log |P|."""
-        return float(2.0 * np.log(self.band[0]).sum())
+        return float(2.0 * elementary.log(self.columns[:, 0]).sum())
 
     def solve(self, right: Array) -> Array:
         """P^-1 b of right sides b (..., T, n)."""
-        solution, _ = dpbtrs(self.band, self._columns(right), lower=1, overwrite_b=1)
-        return self._rows(solution, right)
+        return self._applied(right, solve_band_lower, solve_band_transposed)
 
     def solve_lower(self, right: Array) -> Array:
         """L^-1 b of right sides b (..., T, n)."""
-        solution, _ = dtbtrs(self.band, self._columns(right), uplo='L', trans='N', overwrite_b=1)
-        return self._rows(solution, right)
+        return self._applied(right, solve_band_lower)
 
     def solve_transposed(self, right: Array) -> Array:
         """L'^-1 b of right sides b (..., T, n): white noise becomes noise of covariance P^-1."""
-        solution, _ = dtbtrs(self.band, self._columns(right), uplo='L', trans='T', overwrite_b=1)
-        return self._rows(solution, right)
+        return self._applied(right, solve_band_transposed)
 
     def whiten(self, x: Array) -> Array:
         """L' x of trajectories x (..., T, n), so that x' P x = |L' x|^2."""
-        own, coupling = self.blocks
-        result: Array = (own.swapaxes(1, 2) @ x[..., None])[..., 0]
-        result[..., :-1, :] += (coupling.swapaxes(1, 2) @ x[..., 1:, :, None])[..., 0]
-        return result
+        return self._applied(x, multiply_band_transposed)
 
     @cached_property
     def blocks(self) -> tuple[Array, Array]:
@@ -146,14 +148,11 @@ class BlockCholesky:
             C_T = (L_T L_T')^-1,    C_t = (L_t L_t')^-1 + G_t' C_{t+1} G_t
         """
         own, below = self.blocks
-        t, n = self.times, self.size
-        inverse = np.empty((t, n, n))
-        for i in range(t):
-            inverse[i] = dtrtri(own[i], lower=1)[0]
-        gain = below @ inverse[:-1]
-        covariances = inverse.swapaxes(1, 2) @ inverse
-        for i in range(t - 2, -1, -1):
-            covariances[i] += gain[i].T @ (covariances[i + 1] @ gain[i])
+        inverse = inverse_triangular(own)
+        gain = product(below, inverse[:-1])
+        covariances: Array = product(inverse.swapaxes(1, 2), inverse)
+        for i in range(self.times - 2, -1, -1):
+            covariances[i] += product(gain[i].T, product(covariances[i + 1], gain[i]))
         covariances += covariances.swapaxes(1, 2).copy()
         covariances *= 0.5
         return covariances
@@ -161,18 +160,17 @@ class BlockCholesky:
     def matrix(self) -> BlockTridiagonal:
         """P."""
         own, below = self.blocks
-        diagonal = own @ own.swapaxes(1, 2)
-        diagonal[1:] += below @ below.swapaxes(1, 2)
-        return BlockTridiagonal(diagonal, below @ own[:-1].swapaxes(1, 2))
+        diagonal = product(own, own.swapaxes(1, 2))
+        diagonal[1:] += product(below, below.swapaxes(1, 2))
+        return BlockTridiagonal(diagonal, product(below, own[:-1].swapaxes(1, 2)))
 
     def _windows(self, offset: int, count: int) -> Array:
         """Blocks L[t n + offset + a, t n + b] for t < count, with rubbish outside the band.
 
-        In the column-major band L[i, j] lies at i + j * width.
+        L[i, j] lies at i + j * width.
         """
         n, width = self.size, self.width
-        flat = self.band.reshape(-1, order='F')
-        padded = np.concatenate([flat, np.zeros(n + offset)])
+        padded = np.concatenate([self.columns.reshape(-1), np.zeros(n + offset)])
         step = padded.itemsize
         return as_strided(
             padded[offset:],
@@ -181,11 +179,12 @@ class BlockCholesky:
             writeable=False,
         )
 
-    def _columns(self, right: Array) -> Array:
-        return np.array(right.reshape(-1, self.times * self.size)).T
-
-    def _rows(self, solution: Array, like: Array) -> Array:
-        return np.ascontiguousarray(solution.T).reshape(like.shape)
+    def _applied(self, vectors: Array, *functions: Callable[[Array, Array], None]) -> Array:
+        """The results of functions that overwrite vectors (..., T, n), one after the other."""
+        result = np.array(vectors.reshape(-1, self.times * self.size), order='C')
+        for function in functions:
+            function(self.columns, result)
+        return result.reshape(vectors.shape)
 
 
 def bandwidth(lower: Array, n: int) -> int:
@@ -194,17 +193,16 @@ def bandwidth(lower: Array, n: int) -> int:
     return max(n - 1, n + int((row - column).max(initial=-n)))
 
 
-def factorise_band(band: Array, times: int, size: int) -> BlockCholesky:
-    """Factorises a matrix in band storage (width + 1, T n), which is overwritten.
+def factorise(columns: Array, times: int, size: int) -> BlockCholesky:
+    """Factorises a matrix in band storage (T n, width + 1), which is overwritten.
 
     Raises:
         NotPositiveDefiniteError: the matrix is not positive definite, or not finite.
     """
-    factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
-    # LAPACK lets NaN pass where it is not on the diagonal of a pivot.
-    if info != 0 or not np.isfinite(factor[0, -1]):
+    done = factorise_band(columns)
+    if done < len(columns):
         raise NotPositiveDefiniteError(
-            f'a matrix of {times} x {times} blocks is not positive definite: pivot {info} of '
+            f'a matrix of {times} x {times} blocks is not positive definite: pivot {done + 1} of '
             f'{times * size}'
         )
-    return BlockCholesky(factor, times, size)
+    return BlockCholesky(columns, times, size)

@@ -17,7 +17,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import cholesky, inverse, product
 from hmt_ros.inference.mixture import GaussianMixture
 
 
@@ -41,7 +43,7 @@ def stratified_samples(mixture: GaussianMixture, count: int, rng: np.random.Gene
     factors = mixture.cholesky()
     for k in range(len(mixture)):
         mine = owners == k
-        result[mine] = result[mine] @ factors[k].T + mixture.means[k]
+        result[mine] = product(result[mine], factors[k].T) + mixture.means[k]
     return result
 
 
@@ -59,21 +61,21 @@ def marginal_log_densities(mixture: GaussianMixture, points: ArrayLike, size: in
     k = len(mixture)
     blocks = mixture.covariances.reshape(k, groups, size, groups, size)
     own = np.arange(groups)
-    factors = np.linalg.cholesky(blocks[:, own, :, own, :].transpose(1, 0, 2, 3))  # (K, G, s, s)
-    whiteners = np.linalg.inv(factors)
+    factors = cholesky(blocks[:, own, :, own, :].transpose(1, 0, 2, 3))  # (K, G, s, s)
+    whiteners = inverse(factors)
     offsets = x.reshape(1, -1, groups, size) - mixture.means.reshape(k, 1, groups, size)
-    white = offsets.transpose(0, 2, 1, 3) @ whiteners.transpose(0, 1, 3, 2)  # (K, G, N, s)
-    log_scale = np.log(np.diagonal(whiteners, axis1=2, axis2=3)).sum(2)
+    white = product(offsets.transpose(0, 2, 1, 3), whiteners.transpose(0, 1, 3, 2))  # (K, G, N, s)
+    log_scale = elementary.log(np.diagonal(whiteners, axis1=2, axis2=3)).sum(2)
     with np.errstate(divide='ignore'):
-        log_weights = np.log(mixture.weights)
+        log_weights = elementary.log(mixture.weights)
     each = np.einsum('kgns,kgns->kgn', white, white)
     each *= -0.5
-    each += (log_scale - 0.5 * size * np.log(2 * np.pi) + log_weights[:, None])[:, :, None]
+    each += (log_scale - 0.5 * size * elementary.log(2 * np.pi) + log_weights[:, None])[:, :, None]
     # scipy's logsumexp, without its overhead for axes and signs.
     top = each.max(0)
     each -= top
-    np.exp(each, out=each)
-    return np.asarray((np.log(each.sum(0)) + top).T)
+    elementary.exp(each, out=each)
+    return np.asarray((elementary.log(each.sum(0)) + top).T)
 
 
 def coverage(levels: ArrayLike, probability: float) -> float:

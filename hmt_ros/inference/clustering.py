@@ -11,6 +11,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 
 
 def k_means(
@@ -53,5 +54,5 @@ def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
 
 def squared_distances(a: Array, b: Array) -> Array:
     """Squared distances (N, M) between points (N, p) and (M, p)."""
-    result: Array = (a * a).sum(1)[:, None] - 2.0 * a @ b.T + (b * b).sum(1)
+    result: Array = (a * a).sum(1)[:, None] - product(b, 2.0 * a.T).T + (b * b).sum(1)
     return np.maximum(result, 0.0, out=result)

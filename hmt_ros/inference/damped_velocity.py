@@ -20,7 +20,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmt_ros.core import elementary, predict_damped
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import cholesky, inverse, product
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 
 # Nodes of the quadrature; it is exact to rounding while G t stays below the limit.
@@ -61,7 +63,7 @@ class DampedVelocity(LinearGaussianDynamics):
                 raise ValueError(f'dynamics: {name} must be positive, saw {value.min()}')
         stationary = driven / (rates[:, None] + rates)
         try:
-            np.linalg.cholesky(stationary)
+            cholesky(stationary)
         except np.linalg.LinAlgError:
             raise ValueError(
                 'dynamics: the diffusion of the velocity is not positive definite'
@@ -70,8 +72,8 @@ class DampedVelocity(LinearGaussianDynamics):
         drift[:d, d:] = np.eye(d)
         drift[d:, d:] = -np.diag(rates)
         noise[:d, :d], noise[d:, d:] = np.diag(own), driven
-        inverse = np.linalg.inv(stationary)
-        precision[d:, d:] = 0.5 * (inverse + inverse.T)
+        known = inverse(stationary)
+        precision[d:, d:] = 0.5 * (known + known.T)
         return cls(drift, noise, d, np.zeros(2 * d), precision, step)
 
     @cached_property
@@ -94,7 +96,7 @@ class DampedVelocity(LinearGaussianDynamics):
 
     def _decay(self, interval: float) -> tuple[Array, Array]:
         """a and b (d,): shift of the pose per velocity, and share of the velocity that lasts."""
-        lost: Array = -np.expm1(-self.damping * interval)
+        lost: Array = -elementary.expm1(-self.damping * interval)
         return lost / self.damping, 1.0 - lost
 
     def _integrals(self, interval: float) -> tuple[Array, Array, Array]:
@@ -103,12 +105,12 @@ class DampedVelocity(LinearGaussianDynamics):
         if g.max() * interval < _LONGEST:
             times = 0.5 * interval * (_NODES + 1.0)
             root = np.sqrt(0.5 * interval * _WEIGHTS)[:, None]
-            lost = -np.expm1(-times[:, None] * g)
+            lost = -elementary.expm1(-times[:, None] * g)
             a, b = root * lost / g, root * (1.0 - lost)
-            return a.T @ a, a.T @ b, b.T @ b
+            return product(a.T, a), product(a.T, b), product(b.T, b)
         a, _ = self._decay(interval)
         total = g[:, None] + g
-        both = -np.expm1(-total * interval) / total
+        both = -elementary.expm1(-total * interval) / total
         return (
             (interval - a[:, None] - a + both) / np.outer(g, g),
             (a[None, :] - both) / g[:, None],
@@ -117,21 +119,7 @@ class DampedVelocity(LinearGaussianDynamics):
 
     def predict(self, means: Array, covariances: Array, interval: float) -> tuple[Array, Array]:
         """Means (K, n) and covariances (K, n, n) of states after an interval in seconds."""
-        d = self.dimension
-        a, b = self._decay(interval)
         _, noise = self.transition(interval)
-        moved = np.concatenate([means[:, :d] + a * means[:, d:], b * means[:, d:]], axis=1)
-        own, cross, velocity = (
-            covariances[:, :d, :d],
-            covariances[:, :d, d:],
-            covariances[:, d:, d:],
-        )
-        result = np.empty_like(covariances)
-        carried = cross + a[:, None] * velocity
-        half = cross * a
-        result[:, :d, :d] = own + half + (carried * a).swapaxes(1, 2)
-        result[:, :d, d:] = carried * b
-        result[:, d:, :d] = result[:, :d, d:].swapaxes(1, 2)
-        result[:, d:, d:] = np.outer(b, b) * velocity
-        result += noise
+        moved, result = np.empty_like(means), np.empty_like(covariances)
+        predict_damped(*self._decay(interval), noise, means, covariances, moved, result)
         return moved, result

@@ -20,6 +20,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+from hmt_ros.core import elementary
+
 
 def seconds(nanoseconds: int) -> float:
     """A difference of stamps, in s."""
@@ -38,7 +40,7 @@ def share_of_time(dt: float, tau: float) -> float:
     """
     if not (dt >= 0.0 and tau >= 0.0):
         raise ValueError(f'wanted times that are not negative, saw dt {dt} and tau {tau} s')
-    return 1.0 if tau == 0.0 else math.tanh(0.5 * dt / tau)
+    return 1.0 if tau == 0.0 else float(elementary.tanh(0.5 * dt / tau))
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class CueErrors:
 
         A lasting error has not changed: s / (1 - rho^2), by the variance of its new part.
         """
-        new = -math.expm1(-2.0 * dt / self.time) if self.time > 0.0 else 1.0
+        new = -float(elementary.expm1(-2.0 * dt / self.time)) if self.time > 0.0 else 1.0
         return self.independent / new
 
     def lasting(self, dt: float) -> float:

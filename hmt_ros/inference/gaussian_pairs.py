@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.core import whiten_pairs
+from hmt_ros.core import elementary, whiten_pairs
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.threads import in_threads
 
@@ -25,7 +25,7 @@ def pair_log_densities(
     squares, log_determinants = _of_pairs(
         pairs, np.ones((len(pairs), 2)), means_a, covariances_a, means_b, covariances_b
     )
-    constant = means_a.shape[1] * np.log(2 * np.pi)
+    constant = means_a.shape[1] * elementary.log(2 * np.pi)
     return np.asarray(-0.5 * (squares + log_determinants + constant))
 
 
@@ -44,7 +44,7 @@ def pair_mixture_log_determinants(
     """
     shares = weights[pairs] / weights[pairs].sum(1, keepdims=True)
     squares, log_determinants = _of_pairs(pairs, shares, means, covariances, means, covariances)
-    return np.asarray(log_determinants + np.log1p(shares[:, 0] * shares[:, 1] * squares))
+    return np.asarray(log_determinants + elementary.log1p(shares[:, 0] * shares[:, 1] * squares))
 
 
 def _of_pairs(pairs: Index, scales: Array, *sets: Array) -> tuple[Array, Array]:

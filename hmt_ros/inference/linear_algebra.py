@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 # The matrix product, as `numpy.matmul`; of float32 where both are, else of float64.
 product: Callable[..., Any] = matrices.product
 
+# log sum exp(x) along the last axis, or along `axis`, as `numpy.logaddexp.reduce`.
+log_sum_exp: Callable[..., Any] = matrices.log_sum_exp
+
 
 def _checked(what: str) -> np.errstate:
     def fail(_kind: str, _flag: int) -> NoReturn:
@@ -30,6 +33,12 @@ def _checked(what: str) -> np.errstate:
 _NOT_POSITIVE = 'matrix is not positive definite'
 _SINGULAR = 'singular matrix'
 _NOT_CONVERGED = 'no convergence, or a matrix that is not finite'
+
+
+def length(vector: ArrayLike) -> float:
+    """Euclidean length of a vector, or root of the sum of squares of any array."""
+    vector = np.asarray(vector)
+    return float(np.sqrt((vector * vector).sum()))
 
 
 def cholesky(matrix: ArrayLike) -> Array:
@@ -68,6 +77,13 @@ def inverse(matrix: ArrayLike) -> Array:
 def inverse_triangular(factor: ArrayLike) -> Array:
     """Inverse of a lower triangle (..., n, n)."""
     return solve_triangular(factor, np.eye(np.shape(factor)[-1]))
+
+
+def exponential(matrix: ArrayLike) -> Array:
+    """Exponential of a matrix (..., n, n)."""
+    with _checked(_SINGULAR):
+        result: Array = matrices.exponential(matrix)
+    return result
 
 
 def determinant(matrix: ArrayLike) -> Array:

@@ -16,10 +16,18 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import expm
 
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
+from hmt_ros.inference.linear_algebra import (
+    cholesky,
+    exponential,
+    inverse,
+    inverse_triangular,
+    product,
+    symmetric_eigenvalues,
+)
 
 # Number of intervals whose transitions are kept.
 MOST_INTERVALS = 64
@@ -43,9 +51,9 @@ class TrajectoryPrior:
 
     def energy(self, states: Array) -> tuple[Array, Array]:
         """-log p (N,) and its gradient (N, T, n) at trajectories (N, T, n)."""
-        product = self.precision.product(states)
-        value = np.einsum('...ti,...ti->...', states, 0.5 * product - self.information)
-        return value + self.constant, product - self.information
+        moved = self.precision.product(states)
+        value = (states * (0.5 * moved - self.information)).sum((-2, -1))
+        return value + self.constant, moved - self.information
 
     def between(self, first: int, last: int, states: Array) -> TrajectoryPrior:
         """The density of the states first <= t < last given the others, of one trajectory (T, n).
@@ -54,9 +62,9 @@ class TrajectoryPrior:
         """
         information = self.information[first:last].copy()
         if first > 0:
-            information[0] -= self.precision.lower[first - 1] @ states[first - 1]
+            information[0] -= product(self.precision.lower[first - 1], states[first - 1])
         if last < len(states):
-            information[-1] -= self.precision.lower[last - 1].T @ states[last]
+            information[-1] -= product(self.precision.lower[last - 1].T, states[last])
         precision = BlockTridiagonal(
             self.precision.diagonal[first:last], self.precision.lower[first : last - 1]
         )
@@ -111,7 +119,7 @@ class LinearGaussianDynamics:
             raise ValueError(f'dynamics: step must be positive, saw {self.step}')
         for name in ('diffusion', 'initial_precision'):
             value = getattr(self, name)
-            smallest = float(np.linalg.eigvalsh(value)[0])
+            smallest = float(symmetric_eigenvalues(value)[0])
             if smallest < -1e-9 * np.abs(value).max() or not np.allclose(value, value.T):
                 raise ValueError(
                     f'dynamics: {name} is not symmetric and positive semi-definite: its smallest '
@@ -178,15 +186,15 @@ class LinearGaussianDynamics:
 
     def _coupling(self, interval: float) -> tuple[Array, Array, Array, float]:
         a, q = self.transition(interval)
-        inverse, log_det = _precision_of(q)
-        forth = inverse @ a
-        return a.T @ forth, inverse, forth, log_det
+        precision, log_det = _precision_of(q)
+        forth = product(precision, a)
+        return product(a.T, forth), precision, forth, log_det
 
     @cached_property
     def unknown_velocity(self) -> Array:
         """Covariance (n - d, n - d) of the first velocity."""
         d = self.dimension
-        result = np.linalg.inv(self.initial_precision[d:, d:])
+        result = inverse(self.initial_precision[d:, d:])
         return np.asarray(0.5 * (result + result.T), dtype=np.float64)
 
     def states(self, covariances: Array) -> Array:
@@ -224,9 +232,9 @@ class LinearGaussianDynamics:
         block[:n, :n] = -self.drift
         block[:n, n:] = self.diffusion
         block[n:, n:] = self.drift.T
-        both = expm(block * interval)
+        both = exponential(block * interval)
         a = both[n:, n:].T
-        q = a @ both[:n, n:]
+        q = product(a, both[:n, n:])
         return a, 0.5 * (q + q.T)
 
     def predict(self, means: Array, covariances: Array, interval: float) -> tuple[Array, Array]:
@@ -234,7 +242,7 @@ class LinearGaussianDynamics:
         a, q = self.transition(interval)
         if not self.drift.any():
             return means, covariances + q
-        return means @ a.T, a @ covariances @ a.T + q
+        return product(means, a.T), product(product(a, covariances), a.T) + q
 
     def prior(
         self, intervals: Array, *, initial: bool = True, noise: ArrayLike = 1.0
@@ -257,13 +265,13 @@ class LinearGaussianDynamics:
         information = np.zeros((times, n))
         start = self.initial_precision if initial else np.zeros((n, n))
         diagonal[0] = start
-        information[0] = start @ self.initial_mean
-        known = np.linalg.eigvalsh(start)
+        information[0] = product(start, self.initial_mean)
+        known = symmetric_eigenvalues(start)
         known = known[known > 1e-12 * max(float(known[-1]), 1e-300)]
         constant = 0.5 * (
-            len(known) * np.log(2 * np.pi)
-            - np.log(known).sum()
-            + self.initial_mean @ information[0]
+            len(known) * elementary.log(2 * np.pi)
+            - elementary.log(known).sum()
+            + product(self.initial_mean, information[0])
         )
         different, which = np.unique(intervals, return_inverse=True)
         for i, interval in enumerate(different):
@@ -273,8 +281,8 @@ class LinearGaussianDynamics:
             diagonal[at] += share * before
             diagonal[at + 1] += share * after
             lower[at] = -share * forth
-            constant += 0.5 * len(at) * (n * np.log(2 * np.pi) + log_det)
-        constant += 0.5 * n * float(np.log(factors).sum())
+            constant += 0.5 * len(at) * (n * elementary.log(2 * np.pi) + log_det)
+        constant += 0.5 * n * float(elementary.log(factors).sum())
         precision = BlockTridiagonal(diagonal, lower)
         return TrajectoryPrior(precision, information, float(constant), self.dimension)
 
@@ -283,23 +291,23 @@ def _precision_of(covariance: Array) -> tuple[Array, float]:
     """Inverse and log determinant; a diagonal covariance has an exactly diagonal inverse."""
     diagonal = np.diagonal(covariance)
     if not (covariance - np.diag(diagonal)).any() and (diagonal > 0).all():
-        return np.diag(1.0 / diagonal), float(np.log(diagonal).sum())
+        return np.diag(1.0 / diagonal), float(elementary.log(diagonal).sum())
     try:
-        factor = np.linalg.cholesky(covariance)
+        factor = cholesky(covariance)
     except np.linalg.LinAlgError:
         raise ValueError(
             'dynamics: the noise over an interval is not positive definite; every variable needs '
             'a positive rate'
         ) from None
-    inverse = np.linalg.inv(factor)
+    root = inverse_triangular(factor)
     # Exact zeros keep the band narrow.
-    precision = inverse.T @ inverse
+    precision = product(root.T, root)
     precision[covariance == 0] = np.where(
         np.abs(precision[covariance == 0]) < 1e-14 * np.abs(precision).max(),
         0.0,
         precision[covariance == 0],
     )
-    return precision, float(2.0 * np.log(np.diagonal(factor)).sum())
+    return precision, float(2.0 * elementary.log(np.diagonal(factor)).sum())
 
 
 def _matrix(rates: ArrayLike) -> Array:

@@ -9,15 +9,15 @@ q_10). Time can be divided at will, so that no result counts images.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import expm, null_space
 
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import exponential, log_sum_exp, product, solve
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,27 +44,32 @@ class MarkovChain:
     @cached_property
     def usual(self) -> Array:
         """Probabilities (n,) after a long time in which nothing was observed."""
-        two = len(self.rates) == 2
-        found = self.rates[[1, 0], [0, 1]] if two else null_space(self.generator.T)[:, 0]
-        found = found / found.sum()
+        # p Q = 0, one equation of which follows from the others, and sum p = 1.
+        equations = self.generator.T.copy()
+        equations[-1] = 1.0
+        found = solve(equations, np.eye(len(equations))[-1])
         found.flags.writeable = False
-        return np.asarray(found)
+        return found
+
+    @cached_property
+    def _rate(self) -> float:
+        """Rate at which two states forget which one it was, 1/s."""
+        return float(self.rates[0, 1] + self.rates[1, 0])
 
     def transition(self, dt: float) -> Array:
         """Probabilities (n, n) of state j a time dt, s, after state i."""
         if len(self.rates) == 2:
-            share = -math.expm1(np.trace(self.generator) * dt)
+            share = -elementary.expm1(-self._rate * dt)
             return np.asarray((1.0 - share) * np.eye(2) + share * self.usual)
-        return np.asarray(expm(self.generator * dt))
+        return exponential(self.generator * dt)
 
     def predict(self, p: ArrayLike, dt: float) -> Array:
         """Probabilities (..., n) a time dt, s, after p (..., n)."""
-        return np.asarray(np.asarray(p) @ self.transition(dt))
+        return np.asarray(product(p, self.transition(dt)))
 
-    def closed(self, p: Array, dt: float) -> Array:
+    def closed(self, p: ArrayLike, dt: float) -> Array:
         """The same for two states, by the closed form: probabilities (...) of the second one."""
-        usual = self.usual[1]
-        return np.asarray(usual + (p - usual) * np.exp(np.trace(self.generator) * dt))
+        return np.asarray(p + (p - self.usual[1]) * elementary.expm1(-self._rate * dt))
 
 
 def update(p: ArrayLike, log_likelihoods: ArrayLike) -> Array:
@@ -74,11 +79,11 @@ def update(p: ArrayLike, log_likelihoods: ArrayLike) -> Array:
         log_likelihoods: (..., n) of the observation in each state, nats, up to a constant.
     """
     with np.errstate(divide='ignore'):
-        log_p = np.log(p) + log_likelihoods
-    return np.asarray(np.exp(log_p - np.logaddexp.reduce(log_p, axis=-1, keepdims=True)))
+        log_p = elementary.log(p) + log_likelihoods
+    return np.asarray(elementary.exp(log_p - log_sum_exp(log_p)[..., None]))
 
 
 def of_log_odds(log_odds: ArrayLike) -> Array:
     """Probabilities (..., 2) of a chain of two states, by the log odds of the second one, nats."""
-    is_so = 0.5 * (1.0 + np.tanh(0.5 * np.asarray(log_odds, dtype=np.float64)))
+    is_so = 0.5 * (1.0 + elementary.tanh(0.5 * np.asarray(log_odds, dtype=np.float64)))
     return np.stack([1.0 - is_so, is_so], axis=-1)

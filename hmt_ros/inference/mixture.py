@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
+from hmt_ros.core import elementary
+from hmt_ros.inference import linear_algebra
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import product
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,7 @@ class GaussianMixture:
     @cached_property
     def log_determinants(self) -> Array:
         """log |S_k|, (K,)."""
-        return np.asarray(np.linalg.slogdet(self.covariances)[1], dtype=np.float64)
+        return linear_algebra.log_determinant(self.covariances)
 
     def cholesky(self) -> Array:
         """Lower triangular factors (K, d, d) of the covariances.
@@ -86,9 +88,9 @@ class GaussianMixture:
             ValueError: a covariance is not positive definite.
         """
         try:
-            return np.asarray(np.linalg.cholesky(self.covariances), dtype=np.float64)
+            return linear_algebra.cholesky(self.covariances)
         except np.linalg.LinAlgError:
-            smallest = np.linalg.eigvalsh(self.covariances)[:, 0]
+            smallest = linear_algebra.symmetric_eigenvalues(self.covariances)[:, 0]
             worst = int(np.argmin(smallest))
             raise ValueError(
                 f'covariance of component {worst} is not positive definite: its smallest '
@@ -102,33 +104,36 @@ class GaussianMixture:
             raise ValueError(f'points have shape {points.shape}, wanted (N, {self.dimension})')
         result = np.empty((len(points), len(self)))
         for k, factor in enumerate(self.cholesky()):
-            offsets = (points - self.means[k]).T
-            z = solve_triangular(factor, offsets, lower=True, check_finite=False)
-            log_det = 2.0 * np.log(np.diagonal(factor)).sum()
-            result[:, k] = -0.5 * ((z * z).sum(0) + log_det + self.dimension * np.log(2 * np.pi))
+            z = linear_algebra.solve_triangular(factor, (points - self.means[k]).T)
+            log_det = 2.0 * elementary.log(np.diagonal(factor)).sum()
+            result[:, k] = -0.5 * (
+                (z * z).sum(0) + log_det + self.dimension * elementary.log(2 * np.pi)
+            )
         return result
 
     def log_density(self, x: ArrayLike) -> Array:
         """log p(x), shape (N,), of points x (N, d)."""
         with np.errstate(divide='ignore'):
-            log_weights = np.log(self.weights)
+            log_weights = elementary.log(self.weights)
         return np.asarray(logsumexp(self.component_log_densities(x) + log_weights, axis=1))
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws n points, (n, d)."""
         k = rng.choice(len(self), size=n, p=self.normalised().weights)
         noise = rng.standard_normal((n, self.dimension))
-        return np.asarray(self.means[k] + np.einsum('nij,nj->ni', self.cholesky()[k], noise))
+        offsets = product(self.cholesky()[k], noise[..., None])[..., 0]
+        return np.asarray(self.means[k] + offsets)
 
     def mean(self) -> Array:
         """Mean of the normalised mixture, (d,)."""
-        return self.normalised().weights @ self.means
+        return np.asarray(product(self.normalised().weights, self.means))
 
     def covariance(self) -> Array:
         """Covariance of the normalised mixture, (d, d)."""
         w = self.normalised().weights
         offsets = self.means - self.mean()
-        return np.asarray(np.einsum('k,kij->ij', w, self.covariances) + (w * offsets.T) @ offsets)
+        within = product(w, self.covariances.reshape(len(w), -1))
+        return np.asarray(within.reshape(offsets.shape[1:] * 2) + product(w * offsets.T, offsets))
 
     def normalised(self) -> GaussianMixture:
         """The same mixture with weights that sum to 1.

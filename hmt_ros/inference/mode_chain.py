@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 
 
 class Link(NamedTuple):
@@ -37,7 +38,7 @@ def backward_weights(links: Sequence[Link]) -> list[Array]:
     """Probabilities (K_t,) of the modes at each time given all images, equations (1) and (2)."""
     result = [links[-1].weights]
     for link in reversed(links[1:]):
-        result.append(result[-1] @ link.origins)
+        result.append(product(result[-1], link.origins))
     return result[::-1]
 
 

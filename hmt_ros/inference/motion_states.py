@@ -13,9 +13,11 @@ random walk at the rates of the body; jumps are searched within that range, too.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from hmt_ros.core import correct_states, fuse, widen_precisions
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 
@@ -65,10 +67,8 @@ class PredictedStates:
 
     def precisions_of(self, ancestors: Index, jumped: Mask, precisions: Array) -> Array:
         """Inverses (N, d, d) of `covariances_of`, given those of the modes (K, d, d)."""
-        result = precisions[ancestors]
-        rows = np.flatnonzero(jumped.any(1))
-        if self.wandered.any() and len(rows):
-            result[rows] = np.linalg.inv(self.covariances_of(ancestors[rows], jumped[rows]))
+        result = np.empty((len(ancestors), *precisions.shape[1:]))
+        widen_precisions(precisions, ancestors, jumped, self.wandered, result)
         return result
 
     def given(
@@ -82,33 +82,34 @@ class PredictedStates:
             poses: (N, d) where the poses are.
             found: (N, d, d) their covariances.
         """
-        d, n = self.dynamics.dimension, self.dynamics.state_dimension
+        (count, d), n = poses.shape, self.dynamics.state_dimension
         if n == d:
             return np.zeros_like(poses), found
-        predicted = self.covariances[ancestors]
-        known = predicted[:, :d, :d].copy()
-        diagonal = np.arange(d)
-        known[:, diagonal, diagonal] += np.where(jumped, UNKNOWN_VARIANCE, 0.0)
-        cross = predicted[:, :d, d:]
-        gain = np.linalg.solve(known, cross).swapaxes(1, 2)
-        offset = poses - self.means[ancestors, :d]
-        velocities = self.means[ancestors, d:] + np.einsum('nij,nj->ni', gain, offset)
-        together = gain @ found
-        own = predicted[:, d:, d:] - gain @ cross + together @ gain.swapaxes(1, 2)
-        own = 0.5 * (own + own.swapaxes(1, 2))
-        # An unknown velocity is correlated with no other.
-        both = ~(jumped[:, :, None] | jumped[:, None, :])
-        fresh = jumped[:, :, None] & jumped[:, None, :]
-        own = np.where(both, own, np.where(fresh, self.dynamics.unknown_velocity, 0.0))
-        together = np.where(jumped[:, :, None], 0.0, together)
-        covariances = np.empty((len(poses), n, n))
-        covariances[:, :d, :d], covariances[:, d:, d:] = found, own
-        covariances[:, d:, :d] = together
-        covariances[:, :d, d:] = together.swapaxes(1, 2)
-        return np.where(jumped, 0.0, velocities), covariances
+        velocities, covariances = np.empty((count, d)), np.empty((count, n, n))
+        predicted = Predicted(
+            self.means, self.covariances, UNKNOWN_VARIANCE, self.dynamics.unknown_velocity
+        )
+        correct_states(predicted, ancestors, jumped, poses, found, velocities, covariances)
+        return velocities, covariances
+
+
+class Predicted(NamedTuple):
+    """States of modes with velocities, for the core.
+
+    Attributes:
+        means, covariances: (K, 2 d), (K, 2 d, 2 d).
+        unknown_variance: `UNKNOWN_VARIANCE`.
+        unknown_velocity: (d, d) covariance of the velocity of what jumped.
+    """
+
+    means: Array
+    covariances: Array
+    unknown_variance: float
+    unknown_velocity: Array
 
 
 def fused(a: Array, b: Array) -> Array:
     """Covariances (N, d, d) of products of Gaussians of covariances (N, d, d) both."""
-    result = a - a @ np.linalg.solve(a + b, a)
-    return 0.5 * (result + result.swapaxes(1, 2))
+    result = np.empty(a.shape)
+    fuse(np.ascontiguousarray(a), np.ascontiguousarray(b), result)
+    return result

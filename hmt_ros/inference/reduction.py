@@ -12,19 +12,25 @@ so that the mean and the covariance of the whole mixture stay. The choice of com
       B(i, j) = 1/2 ((w_i + w_j) log|S_ij| - w_i log|S_i| - w_j log|S_j|);
 
 - `merged_if_close`: the closest pair, until none is closer than a distance;
-- `led`: components near a heavier one, which stays as it is and gets their weight;
 - `reduced`: clusters of means, which then descend a bound on the divergence from the large mixture
   to the small one [Goldberger and Roweis, NIPS 2004].
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.gaussian_pairs import pair_distances, pair_mixture_log_determinants
+from hmt_ros.inference.linear_algebra import (
+    cholesky,
+    inverse,
+    log_determinant,
+    product,
+    solve_triangular,
+)
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Components with a smaller share than this of the weight are dropped by `reduced`.
@@ -42,13 +48,13 @@ def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
     total = mass.sum(0)
     mass, total = mass[:, total > 0], total[total > 0]
     mass = mass / total
-    means = mass.T @ mixture.means
+    means = product(mass.T, mixture.means)
     offsets = mixture.means[:, None] - means
-    covariances = (mass.T @ mixture.covariances.reshape(len(mixture), -1)).reshape(
+    covariances = product(mass.T, mixture.covariances.reshape(len(mixture), -1)).reshape(
         -1, mixture.dimension, mixture.dimension
     )
     offsets = np.swapaxes(offsets, 0, 1)
-    covariances += np.swapaxes(offsets * mass.T[:, :, None], 1, 2) @ offsets
+    covariances += product(np.swapaxes(offsets * mass.T[:, :, None], 1, 2), offsets)
     return GaussianMixture(total, means, 0.5 * (covariances + np.swapaxes(covariances, 1, 2)))
 
 
@@ -70,57 +76,6 @@ def merged_if_close(mixture: GaussianMixture, distance: float) -> GaussianMixtur
         distance: between means, in standard deviations of the average of two covariances.
     """
     return _merged_pairs(mixture, _squared_distances, lambda _, cost: cost < distance**2)
-
-
-def leaders(
-    log_weights: Array,
-    distances: Callable[[int], Array],
-    least: float,
-    count: int | None = None,
-    kept: Sequence[int] = (),
-) -> Index:
-    """Indices of those that are apart from all heavier ones that were chosen, heaviest first.
-
-    Args:
-        log_weights: (N,).
-        distances: (N,) of all from the one of an index.
-        least: distance from which on two are apart.
-        count: how many are wanted at most; None: all.
-        kept: indices that are chosen already, and come first.
-    """
-    nearest, result = np.full(len(log_weights), np.inf), list(kept)
-    for i in result:
-        nearest = np.minimum(nearest, distances(i))
-        nearest[i] = -np.inf
-    for i in np.argsort(-log_weights, kind='stable'):
-        if count is not None and len(result) >= count:
-            break
-        if nearest[i] >= least:
-            result.append(int(i))
-            nearest = np.minimum(nearest, distances(int(i)))
-            nearest[i] = -np.inf
-    return np.array(result, dtype=np.intp)
-
-
-def led(weights: Array, points: Array, least: float, count: int) -> tuple[Array, Index]:
-    """Indices of components that are apart, and their weights with those of their neighbours.
-
-    Nothing is averaged: a mean over motions trembles as their weights do.
-
-    Args:
-        weights: (N,).
-        points: (N, P, 3) of which one has to be apart, m.
-    """
-
-    def distances(i: int) -> Array:
-        return np.asarray(np.linalg.norm(points - points[i], axis=2).max(1))
-
-    with np.errstate(divide='ignore'):
-        chosen = leaders(np.log(weights), distances, least, count)
-    owner = np.argmin([distances(int(i)) for i in chosen], axis=0)
-    together = np.zeros(len(chosen))
-    np.add.at(together, owner, weights)
-    return together, chosen
 
 
 # cost(weights, means, covariances, log determinants, pairs (P, 2)) of merging each pair, (P,)
@@ -145,7 +100,7 @@ def _merged_pairs(
         if not go_on(left, float(costs[i, j])):
             break
         w[i], m[i], s[i] = _pair_moments(w, m, s, i, j)
-        log_det[i] = np.linalg.slogdet(s[i])[1]
+        log_det[i] = log_determinant(s[i])
         active[j] = False
         costs[j, :] = costs[:, j] = np.inf
         others = np.flatnonzero(active & (np.arange(count) != i))
@@ -203,8 +158,9 @@ def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> Gauss
 
 def clustered(mixture: GaussianMixture, count: int, iterations: int = 20) -> GaussianMixture:
     """Components merged by clusters of their means, in the metric of the mean covariance."""
-    average = np.einsum('k,kij->ij', mixture.weights / mixture.weights.sum(), mixture.covariances)
-    points = np.linalg.solve(np.linalg.cholesky(average), mixture.means.T).T
+    shares, d = mixture.weights / mixture.weights.sum(), mixture.dimension
+    average = product(shares, mixture.covariances.reshape(len(mixture), -1)).reshape(d, d)
+    points = solve_triangular(cholesky(average), mixture.means.T).T
     chosen = [int(np.argmax(mixture.weights))]
     for _ in range(count - 1):
         distance = ((points[:, None] - points[chosen]) ** 2).sum(2).min(1)
@@ -219,7 +175,7 @@ def clustered(mixture: GaussianMixture, count: int, iterations: int = 20) -> Gau
         member = (labels[:, None] == np.arange(len(centres))) * mixture.weights[:, None]
         total = member.sum(0)
         full = total > 0
-        centres[full] = (member.T @ points)[full] / total[full, None]
+        centres[full] = product(member.T, points)[full] / total[full, None]
     share = (labels[:, None] == np.arange(len(centres))).astype(np.float64)
     return merged(mixture, share)
 
@@ -234,14 +190,14 @@ def assignment(large: GaussianMixture, small: GaussianMixture) -> tuple[float, A
     divergences = gaussian_divergences(large, small)
     share = np.zeros_like(divergences)
     share[np.arange(len(large)), np.argmin(divergences, axis=1)] = 1.0
-    return float(large.weights @ divergences.min(axis=1)), share
+    return float(product(large.weights, divergences.min(axis=1))), share
 
 
 def gaussian_divergences(a: GaussianMixture, b: GaussianMixture) -> Array:
     """KL(a_i || b_j), (A, B), between components."""
-    inverse = np.linalg.inv(b.covariances)
-    trace = a.covariances.reshape(len(a), -1) @ inverse.reshape(len(b), -1).T
+    inverses = inverse(b.covariances)
+    trace = product(a.covariances.reshape(len(a), -1), inverses.reshape(len(b), -1).T)
     offsets = a.means - b.means[:, None]
-    square = ((offsets @ inverse) * offsets).sum(2).T
+    square = (product(offsets, inverses) * offsets).sum(2).T
     log_det = b.log_determinants - a.log_determinants[:, None]
     return np.asarray(0.5 * (trace + square + log_det - a.dimension))

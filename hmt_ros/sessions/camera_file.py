@@ -17,6 +17,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 from hmt_ros.body import Camera
+from hmt_ros.body.camera import tangent
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 from msg_tools.files.plain_json import load_plain_json
@@ -83,7 +84,7 @@ def camera_of_view(
     width, height = size
     side, angle = (width, horizontal) if horizontal is not None else (height, vertical)
     assert angle is not None
-    focal = 0.5 * side / math.tan(math.radians(angle) / 2)
+    focal = 0.5 * side / tangent(math.radians(angle) / 2)
     fx, fy = (focal, focal * aspect) if horizontal is not None else (focal / aspect, focal)
     return Camera(fx, fy, (width - 1) / 2, (height - 1) / 2, width, height)
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import length
 from hmt_ros.sessions.transform_buffer import Transform, TransformBuffer, TransformError
 from hmt_ros.tracking.ground import KnownGround
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
@@ -109,7 +110,7 @@ class CameraFrames:
             return [('no transform', text)]
         up = found.rotation[:, 2]
         height = float(found.inverse().translation[2])
-        self._gravity, self.newest = (up / np.linalg.norm(up), height), True
+        self._gravity, self.newest = (up / length(up), height), True
         if height > 0 or not self._floor:
             return []
         text = (
@@ -140,7 +141,7 @@ def unit_vector(vector: Sequence[float], name: str) -> Array:
         ValueError: not three finite numbers, or a vector without length.
     """
     v = np.asarray(vector, dtype=np.float64)
-    length = float(np.linalg.norm(v)) if v.shape == (3,) else math.nan
-    if not _SHORTEST < length < math.inf:
+    size = length(v) if v.shape == (3,) else math.nan
+    if not _SHORTEST < size < math.inf:
         raise ValueError(f'{name} must be three finite numbers, not all zero, saw {v.tolist()}')
-    return v / length
+    return v / size

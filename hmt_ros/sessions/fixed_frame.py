@@ -16,6 +16,7 @@ from hmt_ros.body import Body
 from hmt_ros.body.mirror import propagated, root_rotation_dofs
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import length, product
 from hmt_ros.sessions.transform_buffer import Transform
 from hmt_ros.tracking.camera_motion import CameraMotion
 
@@ -49,7 +50,9 @@ class FixedFrame:
     def motion(self) -> CameraMotion:
         """From the frame of the camera to that frame."""
         back = FROM_OPTICAL.T
-        return CameraMotion(back @ self.camera.rotation, back @ self.camera.translation)
+        return CameraMotion(
+            product(back, self.camera.rotation), product(back, self.camera.translation)
+        )
 
     def placed(
         self, body: Body, mixture: GaussianMixture, velocities: Array | None = None
@@ -85,9 +88,9 @@ def upright(up: Array) -> Array:
         up: (3,) unit vector against gravity, camera frame.
     """
     forward = np.array([0.0, 0.0, 1.0])
-    forward = forward - (forward @ up) * up
-    if np.linalg.norm(forward) < _VERTICAL:
+    forward = forward - product(forward, up) * up
+    if length(forward) < _VERTICAL:
         forward = np.array([0.0, -1.0, 0.0])
-        forward = forward - (forward @ up) * up
-    forward = forward / np.linalg.norm(forward)
+        forward = forward - product(forward, up) * up
+    forward = forward / length(forward)
     return np.stack([forward, np.cross(up, forward), up], axis=1)

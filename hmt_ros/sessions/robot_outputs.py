@@ -18,6 +18,7 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.body.keep_out import Capsules, keep_out_capsules, reach_after
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.linear_algebra import product
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.focal_length import with_depth_error
 from hmt_ros.tracking.prediction import Forecaster
@@ -62,7 +63,9 @@ class LastSeen:
             return held
         rotation, translation = self.fixed.camera
         return Capsules(
-            held.starts @ rotation.T + translation, held.ends @ rotation.T + translation, held.radii
+            product(held.starts, rotation.T) + translation,
+            product(held.ends, rotation.T) + translation,
+            held.radii,
         )
 
 

@@ -19,8 +19,8 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import entr
 
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.declared_parameters import NodeParameters
 from hmt_ros.sessions.handled import Handled, HandlingLog, Output
@@ -371,4 +371,5 @@ def frame_id_of(message: Any) -> str:
 
 def entropy(weights: NDArray[np.float64]) -> float:
     """Entropy of the weights of a mixture, nats; NaN where there are none."""
-    return float(entr(weights).sum()) if len(weights) else math.nan
+    some = weights[weights > 0.0]
+    return float(-(some * elementary.log(some)).sum()) if len(weights) else math.nan

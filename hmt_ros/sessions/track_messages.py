@@ -18,6 +18,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import turned
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import product
 from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.focal_length import depth_covariances
@@ -141,7 +142,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
         shown, its_frame = joints, frame
         if track.fixed is not None:
             rotation, translation = track.fixed.camera
-            shown, its_frame = joints @ rotation.T + translation, track.fixed.name
+            shown, its_frame = product(joints, rotation.T) + translation, track.fixed.name
         edges = [(names[a], names[b]) for a, b in skeleton.bones]
         ranks = max(tracker.settings.max_hypotheses, len(posterior))
         array = skeleton_markers(

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import length, product
 from msg_tools.files.error_line import one_line
 from msg_tools.messages.headers import SECOND_NS, time_ns
 
@@ -51,14 +53,14 @@ class Transform(NamedTuple):
     def after(self, inner: Transform) -> Transform:
         """The transform that applies this one to the results of another."""
         return Transform(
-            self.rotation @ inner.rotation,
-            self.rotation @ inner.translation + self.translation,
+            product(self.rotation, inner.rotation),
+            product(self.rotation, inner.translation) + self.translation,
         )
 
     def inverse(self) -> Transform:
         """The transform back."""
         back = self.rotation.T
-        return Transform(back, -back @ self.translation)
+        return Transform(back, product(-back, self.translation))
 
 
 class _Sample(NamedTuple):
@@ -254,15 +256,15 @@ def rotation_matrix(quaternion: Array) -> Array:
 
 def slerp(start: Array, end: Array, share: float) -> Array:
     """Unit quaternion (4,) on the shortest arc from one to another (Shoemake 1985)."""
-    cosine = float(start @ end)
+    cosine = float(product(start, end))
     if cosine < 0:
         end, cosine = -end, -cosine
     if cosine > _CLOSE:
         between = start + share * (end - start)
     else:
-        angle = np.arccos(cosine)
-        between = np.sin((1 - share) * angle) * start + np.sin(share * angle) * end
-    return between / np.linalg.norm(between)
+        angle = elementary.arccos(cosine)
+        between = elementary.sin((1 - share) * angle) * start + elementary.sin(share * angle) * end
+    return between / length(between)
 
 
 def _name(frame: Any) -> str:

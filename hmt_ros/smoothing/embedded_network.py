@@ -19,11 +19,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
 
+from hmt_ros.core import elementary
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.gaussian_pairs import pair_log_densities
+from hmt_ros.inference.linear_algebra import log_sum_exp, product
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 
 
@@ -66,12 +67,14 @@ def embedded_network(
     for i, interval in enumerate(different):
         a, q = dynamics.transition(float(interval))
         own, other = a[:d, :d], a[:d, d:]
-        noise = q[:d, :d] + other @ dynamics.unknown_velocity @ other.T if n > d else q
+        noise = (
+            q[:d, :d] + product(product(other, dynamics.unknown_velocity), other.T) if n > d else q
+        )
         at: Any = slice(0, begin[-2])
         if len(different) > 1:
             at = np.repeat(which == i, np.diff(begin[:-1])).nonzero()[0]
-        predicted[at] = means[at] @ own.T
-        spread[at] = own @ covariances[at] @ own.T + noise
+        predicted[at] = product(means[at], own.T)
+        spread[at] = product(product(own, covariances[at]), own.T) + noise
 
     # All pairs in one go: the modes of a time with each other, and with those of the next time.
     within = [_pairs_within(len(mixture)) for mixture in mixtures]
@@ -105,7 +108,7 @@ def _node_values(weights: Array, densities: Array, pairs: Index) -> Array:
     log[row, column] = log[column, row] = densities
     # scipy's logsumexp, without its overhead for axes and signs.
     top = log.max(1, keepdims=True)
-    return np.asarray(np.log(np.exp(log - top) @ weights) + top[:, 0])
+    return np.asarray(elementary.log(product(elementary.exp(log - top), weights)) + top[:, 0])
 
 
 @lru_cache(maxsize=256)
@@ -140,7 +143,7 @@ class Paths:
     @property
     def weights(self) -> Array:
         """Probabilities (P,) of the paths among themselves."""
-        return np.asarray(np.exp(self.log_values - logsumexp(self.log_values)))
+        return np.asarray(elementary.exp(self.log_values - log_sum_exp(self.log_values)))
 
 
 def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:

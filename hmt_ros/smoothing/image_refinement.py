@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 from hmt_ros.smoothing.mixture_smoother import trajectory_mixture
 from hmt_ros.smoothing.motion_smoother import ANEW, MotionSmoother, SmoothedMotions
@@ -87,7 +88,7 @@ def refined_on_images(
     into = np.zeros((len(motions), count + len(others)))
     into[origin, labels] = 1.0
     into[others, count + np.arange(len(others))] = 1.0
-    weights = motions.weights @ into
+    weights = product(motions.weights, into)
     total = float(weights[:count].sum())
     fitted = minimise_free_energy(
         weights[:count] / total,
@@ -103,7 +104,7 @@ def refined_on_images(
         max_iterations=ITERATIONS,
     )
     into[:, :count] *= total * fitted.weights / weights[:count]
-    weights = motions.weights @ into
+    weights = product(motions.weights, into)
     result = trajectory_mixture(
         weights,
         np.concatenate([optima.states, motions.states[others]]),
@@ -122,7 +123,7 @@ def refined_on_images(
         free_energy=fitted.free_energy,
         free_energy_fresh=fitted.fresh,
         strays=motions.strays,
-        weights_in_time=None if in_time is None else in_time @ into[:, order],
+        weights_in_time=None if in_time is None else product(in_time, into[:, order]),
         disagreements=None if apart is None else apart[which],
     )
 

@@ -12,13 +12,12 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dtrtri
-from scipy.special import logsumexp
 
-from hmt_ros.core import add_mixture_energy
+from hmt_ros.core import add_mixture_energy, elementary
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
+from hmt_ros.inference.linear_algebra import inverse_triangular, log_sum_exp, product
 
 
 class SequenceLikelihood(EnergyTerm, Protocol):
@@ -65,16 +64,16 @@ class MixtureLikelihood:
         kept = [mixture[mixture.weights > 0] for mixture in mixtures]
         first = np.concatenate([[0], np.cumsum([len(mixture) for mixture in kept])])
         factors = np.concatenate([mixture.cholesky() for mixture in kept])
-        whiteners = np.array([dtrtri(factor, lower=1)[0] for factor in factors])
+        whiteners = inverse_triangular(factors)
         d = whiteners.shape[1]
-        log_norms = np.log(np.diagonal(whiteners, axis1=1, axis2=2)).sum(1)
+        log_norms = elementary.log(np.diagonal(whiteners, axis1=1, axis2=2)).sum(1)
         weights = np.concatenate([mixture.weights for mixture in kept])
         return cls(
             first.astype(np.int64),
-            np.log(weights) + log_norms - 0.5 * d * np.log(2 * np.pi),
+            elementary.log(weights) + log_norms - 0.5 * d * elementary.log(2 * np.pi),
             np.ascontiguousarray(np.concatenate([mixture.means for mixture in kept])),
             np.tril(whiteners),
-            whiteners.swapaxes(1, 2) @ whiteners,
+            product(whiteners.swapaxes(1, 2), whiteners),
         )
 
     @property
@@ -152,8 +151,8 @@ def counted(mixture: GaussianMixture, share: float) -> GaussianMixture:
     if not 0.0 < share <= 1.0:
         raise ValueError(f'the share of the evidence must lie in (0, 1], saw {share}')
     some = mixture[mixture.weights > 0]
-    log_weights = share * np.log(some.weights) + 0.5 * (1.0 - share) * some.log_determinants
-    weights = np.exp(log_weights - logsumexp(log_weights))
+    log_weights = share * elementary.log(some.weights) + 0.5 * (1.0 - share) * some.log_determinants
+    weights = elementary.exp(log_weights - log_sum_exp(log_weights))
     return GaussianMixture(weights, some.means, some.covariances / share)
 
 

@@ -305,7 +305,9 @@ def with_refined_parts(
     times = starts.shape[1]
     parts: dict[tuple[int, int], list[int]] = {}
     for i, same in enumerate(shared):
-        apart = np.convolve(~same, np.ones(2 * MARGIN + 1), 'same') > 0
+        apart = np.lib.stride_tricks.sliding_window_view(np.pad(~same, MARGIN), 2 * MARGIN + 1).any(
+            1
+        )
         edges = np.flatnonzero(np.diff(apart, prepend=False, append=False))
         for first, last in zip(edges[::2], edges[1::2]):
             if last - first <= times // 2:

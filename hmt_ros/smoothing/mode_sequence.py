@@ -21,15 +21,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
-from hmt_ros.core import add_diagonal
+from hmt_ros.core import add_diagonal, elementary
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
-    factorise_band,
+    factorise,
 )
+from hmt_ros.inference.linear_algebra import log_sum_exp, product
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing.embedded_network import (
@@ -117,7 +117,7 @@ class TrajectoryGaussians:
     @property
     def weights(self) -> Array:
         """Proportions (P,)."""
-        return np.asarray(np.exp(self.log_weights - logsumexp(self.log_weights)))
+        return np.asarray(elementary.exp(self.log_weights - log_sum_exp(self.log_weights)))
 
 
 def path_gaussians(
@@ -132,18 +132,18 @@ def path_gaussians(
         log_scales, means, precisions = likelihood.modes_of(path)
         columns = band.copy()
         add_diagonal(columns, precisions, n)
-        factor = factorise_band(columns.T, times, n)
+        factor = factorise(columns, times, n)
         right = prior.information.copy()
-        pull = (precisions @ means[:, :, None])[:, :, 0]
+        pull = product(precisions, means[:, :, None])[:, :, 0]
         right[:, :d] += pull
         states[i] = factor.solve(right)
         log_weights[i] = (
             -prior.constant
             + log_scales.sum()
-            - 0.5 * float(np.vdot(means, pull))
-            + 0.5 * float(np.vdot(states[i], right))
+            - 0.5 * float((means * pull).sum())
+            + 0.5 * float((states[i] * right).sum())
             - 0.5 * factor.log_determinant
-            + 0.5 * times * n * np.log(2 * np.pi)
+            + 0.5 * times * n * elementary.log(2 * np.pi)
         )
         factors.append(factor)
     return TrajectoryGaussians(states, tuple(factors), log_weights)

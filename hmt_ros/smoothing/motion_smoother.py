@@ -26,6 +26,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
 from hmt_ros.inference.error_model import TOGETHER, CueErrors
+from hmt_ros.inference.linear_algebra import inverse, log_determinant, product, solve
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.inference.mode_chain import Link, backward_weights, drawn_paths
 from hmt_ros.smoothing.motions import (
@@ -318,10 +319,10 @@ class MotionSmoother:
         shares = np.zeros((int(labels.max()) + 1, past.shares.shape[1]))
         np.add.at(shares, labels, weights[:, None] * past.shares[nodes])
         shares /= shares.sum(1, keepdims=True)
-        means = shares @ past.first.means
+        means = product(shares, past.first.means)
         offsets = past.first.means - means[:, None]
         covariances = np.einsum('mk,kij->mij', shares, past.first.covariances)
-        covariances += (offsets * shares[:, :, None]).swapaxes(1, 2) @ offsets
+        covariances += product((offsets * shares[:, :, None]).swapaxes(1, 2), offsets)
         return FirstStates(means, covariances, past.first.liveliness[shares.argmax(1)])
 
     def _states(
@@ -334,7 +335,7 @@ class MotionSmoother:
     ) -> MotionStates:
         """The states of motion m; `held`: points that rest are."""
         dynamics, d = self.dynamics, self.dynamics.dimension
-        means, precisions = evidence.means[m], np.linalg.inv(evidence.covariances[m])
+        means, precisions = evidence.means[m], inverse(evidence.covariances[m])
         places, trust = self.points_of(means), np.ones(len(means))
         begins = np.zeros(len(means), dtype=np.bool_)
         if self.points is not None:
@@ -344,14 +345,14 @@ class MotionSmoother:
             before = self.points_of(first.means[m, :d])
             begins[0] = self.points is not None and mean_distances(before, places).min() > WRONG
             if not begins[0]:
-                at, known = first.means[m], np.linalg.inv(first.covariances[m])
+                at, known = first.means[m], inverse(first.covariances[m])
                 least = first.liveliness[m] / LIVELIER[1]
         known = 0.5 * (known + known.T)
         for liveliness in (x for x in LIVELIER if x >= least):
             noise = np.where(begins[1:], ANEW, liveliness)
             prior = dynamics.prior(intervals, initial=False, noise=noise)
             prior.precision.diagonal[0] += known
-            prior.information[0] += known @ at
+            prior.information[0] += product(known, at)
             states, factor = _conditioned(prior, precisions, means)
             away = self._away(states, places)
             if self.points is None or np.median(away) <= ASTRAY:
@@ -364,10 +365,10 @@ class MotionSmoother:
             states, factor = _conditioned(prior, precisions * trust[:, None, None], means)
             away = self._away(states, places)
         precisions = precisions * trust[:, None, None]
-        pull = (precisions @ means[:, :, None])[:, :, 0]
-        seen = 0.5 * (np.vdot(means, pull) - np.linalg.slogdet(precisions)[1].sum())
-        seen += 0.5 * (at @ known @ at) + prior.constant
-        gained = 0.5 * (np.vdot(states, prior.information) + np.vdot(states[:, :d], pull))
+        pull = product(precisions, means[:, :, None])[:, :, 0]
+        seen = 0.5 * ((means * pull).sum() - log_determinant(precisions).sum())
+        seen += 0.5 * product(product(at, known), at) + prior.constant
+        gained = 0.5 * ((states * prior.information).sum() + (states[:, :d] * pull).sum())
         if held and self.resting is not None and len(states) > 1:
             # Covariances ignore what rests: rest is a decision, the same from image to image.
             poses = np.clip(states, *self.limits())[:, :d]
@@ -403,10 +404,10 @@ class MotionSmoother:
             means, covariances = found.first.means, found.first.covariances
         for t in range(count):
             seen, spread = evidence.means[:, t], evidence.covariances[:, t]
-            gains = np.linalg.solve(covariances[:, :d, :d] + spread, covariances[:, :d])
+            gains = solve(covariances[:, :d, :d] + spread, covariances[:, :d])
             gains = gains.swapaxes(1, 2)
-            means = means + (gains @ (seen - means[:, :d])[:, :, None])[:, :, 0]
-            covariances = covariances - gains @ covariances[:, :d]
+            means = means + product(gains, (seen - means[:, :d])[:, :, None])[:, :, 0]
+            covariances = covariances - product(gains, covariances[:, :d])
             anew = begins[:, t]
             means[anew] = dynamics.initial_mean
             means[anew, :d] = seen[anew]
@@ -417,7 +418,9 @@ class MotionSmoother:
             covariances = covariances + livelier * dynamics.transition(interval)[1]
             covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
         shares = (
-            found.shares[count] if count < len(stamps) else after.link.origins @ found.shares[-1]
+            found.shares[count]
+            if count < len(stamps)
+            else product(after.link.origins, found.shares[-1])
         )
         places = self.points_of(found.trajectories.means[:, count - 1])
         return Past(shares, FirstStates(means, covariances, found.liveliness), places)
@@ -461,6 +464,6 @@ def _conditioned(
     d = means.shape[1]
     diagonal, right = prior.precision.diagonal.copy(), prior.information.copy()
     diagonal[:, :d, :d] += precisions
-    right[:, :d] += (precisions @ means[:, :, None])[:, :, 0]
+    right[:, :d] += product(precisions, means[:, :, None])[:, :, 0]
     factor = BlockTridiagonal(diagonal, prior.precision.lower).cholesky()
     return factor.solve(right), factor

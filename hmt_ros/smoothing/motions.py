@@ -21,10 +21,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 
 SECOND_NS = 10**9
 # Distance of two paths below which they are one motion, and the most that a span counts with, m.
@@ -87,7 +87,8 @@ def _apart(places: Sequence[Array]) -> Array:
     """Distances (N, N) of paths over a span, of whose images places (N, P, 3) are given, m."""
     means = np.mean(places, axis=0)
     flat = means.reshape(len(means), -1)
-    return np.asarray(cdist(flat, flat) / np.sqrt(means.shape[1]))
+    apart = np.sqrt(((flat[:, None] - flat) ** 2).sum(2))
+    return np.asarray(apart / np.sqrt(means.shape[1]))
 
 
 def grouped(weights: Array, distances: Array, means: Array, most: int, least: float) -> Index:
@@ -104,7 +105,7 @@ def grouped(weights: Array, distances: Array, means: Array, most: int, least: fl
     """
     near, left, leaders = distances <= SAME_MOTION, weights.copy(), list[int]()
     while len(leaders) < most and left.any():
-        leaders.append(int(np.argmax(near @ left)))
+        leaders.append(int(np.argmax(product(near, left))))
         left[near[leaders[-1]]] = 0.0
     labels = np.argmin(means[leaders], axis=0)
     masses = np.bincount(labels, weights, minlength=len(leaders))
@@ -112,7 +113,7 @@ def grouped(weights: Array, distances: Array, means: Array, most: int, least: fl
         leaders = [leaders[m] for m in np.flatnonzero(masses >= min(least, masses.max()))]
         labels = np.argmin(means[leaders], axis=0)
     order = np.argsort(-np.bincount(labels, weights, minlength=len(leaders)), kind='stable')
-    labels = np.argsort(order)[labels]
+    labels = np.argsort(order, kind='stable')[labels]
     # A leader whose paths are nearer to others has none.
     return np.asarray(np.unique(labels, return_inverse=True)[1].reshape(-1))
 
@@ -142,10 +143,10 @@ def evidence_of_motions(
             heaviest = points[t][shares.argmax(1), None]
             shares[mean_distances(heaviest, points[t]) > OPPOSITE] = 0.0
         shares /= shares.sum(1, keepdims=True)
-        means[:, t] = shares @ mixture.means
+        means[:, t] = product(shares, mixture.means)
         offsets = mixture.means - means[:, t, None]
-        apart[:, t] = (offsets * shares[:, :, None]).swapaxes(1, 2) @ offsets
-        flat = shares @ mixture.covariances.reshape(len(mixture), -1)
+        apart[:, t] = product((offsets * shares[:, :, None]).swapaxes(1, 2), offsets)
+        flat = product(shares, mixture.covariances.reshape(len(mixture), -1))
         covariances[:, t] = flat.reshape(-1, d, d)
     covariances += apart
     return MotionEvidence(means, covariances, apart)

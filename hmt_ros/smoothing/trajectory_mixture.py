@@ -15,14 +15,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import logsumexp
 
+from hmt_ros.core import elementary
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     BlockTridiagonal,
 )
+from hmt_ros.inference.linear_algebra import log_sum_exp
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +176,7 @@ class TrajectoryMixture:
         for i in range(len(self)):
             each[:, i] = self._component_log_density(i, x)
         with np.errstate(divide='ignore'):
-            result: Array = logsumexp(each + np.log(self.weights), axis=1)
+            result: Array = log_sum_exp(each + elementary.log(self.weights), axis=1)
         return result
 
     def _component_log_density(self, i: int, x: Array) -> Array:
@@ -195,7 +196,7 @@ class TrajectoryMixture:
             offset[:, :, d:] = -hidden.solve(pull)
             log -= 0.5 * hidden.log_determinant
         white = factor.whiten(offset)
-        log -= self.times * d * (np.log(scale) + 0.5 * np.log(2 * np.pi))
+        log -= self.times * d * (elementary.log(scale) + 0.5 * elementary.log(2 * np.pi))
         return np.asarray(log - 0.5 * np.einsum('stn,stn->s', white, white))
 
     def mean(self) -> Array:

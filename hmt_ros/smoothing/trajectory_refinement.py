@@ -19,15 +19,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg.blas import dsbmv
-from scipy.linalg.lapack import dpbtrs
 
-from hmt_ros.core import add_diagonal, hold
+from hmt_ros.core import add_band_product, add_diagonal, hold
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     NotPositiveDefiniteError,
-    factorise_band,
+    factorise,
 )
 from hmt_ros.inference.bounded_newton import Status, TrustRegion, resting
 from hmt_ros.inference.energy import Derivatives
@@ -160,7 +158,6 @@ class _Problem:
         count, self.times, self.size = starts.shape
         self.prior, self.likelihood = prior, likelihood
         self.low, self.high = limits_of_states(lower, upper, prior.dimension, self.size)
-        self.width = prior.precision.bandwidth
         self.band = prior.precision.band()
         self.region = TrustRegion(
             count, FIRST_DAMPING, limit=DAMPING_LIMIT, least_factor=0.1, least_refused=FIRST_DAMPING
@@ -235,13 +232,12 @@ class _Problem:
         slope, hessian = found.derivatives()
         observed = found.value.reshape(m, self.times).sum(1)
         energy = observed + self.prior.constant
-        gradient = np.empty((m, self.times, self.size))
-        information = self.prior.information.reshape(-1)
-        for i in range(m):
-            flat = states[i].reshape(-1)
-            product = dsbmv(self.width, 1.0, self.band.T, flat, lower=1)
-            energy[i] += flat @ (0.5 * product - information)
-            gradient[i] = (product - information).reshape(self.times, self.size)
+        flat, information = states.reshape(m, -1), self.prior.information.reshape(-1)
+        gradient = np.zeros((m, self.times, self.size))
+        moved = gradient.reshape(m, -1)
+        add_band_product(self.band, flat, moved)
+        energy += (flat * (0.5 * moved - information)).sum(1)
+        moved -= information
         gradient[:, :, :d] += slope.reshape(m, self.times, d)
         return energy, observed, gradient, hessian.reshape(m, self.times, d, d)
 
@@ -274,9 +270,9 @@ class _Problem:
                     self.region.damping[i] *= 4.0
         for row, i in enumerate(active):
             move = np.clip(self.states[i] + step[row], self.low, self.high) - self.states[i]
-            slope = float(np.vdot(self.gradient[i], move))
+            slope = float((self.gradient[i] * move).sum())
             damping = self.region.damping[i] * float(
-                np.vdot(move * self._metric(self.hessian[i]), move)
+                (move * move * self._metric(self.hessian[i])).sum()
             )
             predicted[row] = -0.5 * slope + 0.5 * damping if slope < 0 else 0.0
             step[row] = move
@@ -289,8 +285,7 @@ class _Problem:
         if factor is None:
             return False
         right = np.where(held, 0.0, -self.gradient[i])
-        solution, _ = dpbtrs(factor.band, right.reshape(-1, 1), lower=1, overwrite_b=1)
-        step[:] = solution.reshape(step.shape)
+        step[:] = factor.solve(right)
         return True
 
     def _metric(self, hessian: Array) -> Array:
@@ -310,7 +305,7 @@ class _Problem:
         if held is not None:
             hold(columns, np.flatnonzero(held))
         try:
-            return factorise_band(columns.T, self.times, self.size)
+            return factorise(columns, self.times, self.size)
         except NotPositiveDefiniteError:
             return None
 

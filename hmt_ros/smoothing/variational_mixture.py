@@ -30,17 +30,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.special import logsumexp
 
-from hmt_ros.core import add_band_product, add_component_overlaps
+from hmt_ros.core import add_band_product, add_component_overlaps, elementary
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockCholesky
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.gaussian_pairs import pair_distances
+from hmt_ros.inference.lbfgs import descent
+from hmt_ros.inference.linear_algebra import log_sum_exp, product
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.inference.threads import together
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
@@ -50,6 +51,7 @@ ADAPTABLE = ('weights', 'means', 'inflation')
 PARTS = 4
 # Iterations in a row that may pass without a gain on samples that the descent does not see.
 PATIENCE = 3
+MEMORY = 8  # pairs of steps and gradients
 # Least proportion that scales the variables of a component.
 LEAST_WEIGHT = 1e-4
 # Logarithm of an overlap that makes no difference.
@@ -83,7 +85,7 @@ def laplace_masses(energies: Array, factors: Sequence[BlockCholesky]) -> Array:
     """log (M,) of the integrals of p(X, R) around optima, as if it were Gaussian there."""
     size = factors[0].times * factors[0].size
     determinants = np.array([factor.log_determinant for factor in factors])
-    return np.asarray(-energies - 0.5 * determinants + 0.5 * size * np.log(2 * np.pi))
+    return np.asarray(-energies - 0.5 * determinants + 0.5 * size * elementary.log(2 * np.pi))
 
 
 def minimise_free_energy(
@@ -142,7 +144,7 @@ def minimise_free_energy(
         inflation,
         trace,
         held_out,
-        (float(a @ each.mean(1)), error),
+        (float(product(a, each.mean(1))), error),
     )
 
 
@@ -169,49 +171,32 @@ def _descend(
     With few samples the descent ends up fitting their noise. The iterate is kept that has the least
     F on other samples, and the descent ends when F no longer falls on those.
     """
-    iterates = [np.zeros(objective.parameters)]
-    first = objective(iterates[0])
-    trace = [first[0]]
-    held_out = [_free_energy(objective, iterates[0], choice)]
-    last = (first[0], iterates[0])
-
-    def function(x: Array) -> tuple[float, Array]:
-        nonlocal last
-        # Where the descent begins has been evaluated.
-        value, gradient = objective(x) if x.any() else first
-        last = (value, x.copy())
-        return value, gradient
-
-    def record(x: Array) -> None:
-        value = last[0] if np.array_equal(last[1], x) else objective(x)[0]
+    best = start = np.zeros(objective.parameters)
+    first = objective(start)
+    trace, held_out = [first[0]], [_free_energy(objective, start, choice)]
+    # Where the descent begins has been evaluated.
+    iterates = descent(
+        lambda x: objective(x) if x.any() else first,
+        start,
+        memory=MEMORY,
+        most_evaluations=3 * max_iterations,
+    )
+    for x, value in islice(iterates, max_iterations):
         if value > trace[-1]:
-            raise StopIteration
+            break
         gained = trace[-1] - value
         trace.append(value)
         held_out.append(_free_energy(objective, x, choice))
-        iterates.append(x.copy())
-        # Two iterates are held: the best so far, and the last.
-        for i in range(len(iterates) - 1):
-            if i != int(np.argmin(held_out)):
-                iterates[i] = iterates[0][:0]
+        if held_out[-1] < min(held_out[:-1]):
+            best = x
         if gained < tolerance or len(held_out) - 1 - int(np.argmin(held_out)) >= PATIENCE:
-            raise StopIteration
-
-    minimize(
-        function,
-        iterates[0].copy(),
-        jac=True,
-        method='L-BFGS-B',
-        callback=record,
-        options={'maxiter': max_iterations, 'maxcor': 8, 'maxfun': 3 * max_iterations},
-    )
-    best = int(np.argmin(held_out))
-    return iterates[best], np.array(trace[: best + 1]), np.array(held_out)
+            break
+    return best, np.array(trace[: int(np.argmin(held_out)) + 1]), np.array(held_out)
 
 
 def _free_energy(objective: FreeEnergy, x: Array, noise: Array) -> float:
     mixture = objective.mixture(x)
-    return float(mixture[0] @ objective.sampled(mixture, noise).mean(1))
+    return float(product(mixture[0], objective.sampled(mixture, noise).mean(1)))
 
 
 # Proportions (M,), means (M, D) and inflations (M,).
@@ -238,7 +223,7 @@ class FreeEnergy:
         self.prior, self.likelihood, self.noise = prior, likelihood, noise
         self.band = prior.precision.band()
         self.start = np.ascontiguousarray(states.reshape(self.count, -1))
-        self.log_weights = np.log(np.maximum(weights, 1e-300))
+        self.log_weights = elementary.log(np.maximum(weights, 1e-300))
         self.factors = list(factors)
         self.low = np.tile(np.broadcast_to(low, (self.size,)), self.times)
         self.high = np.tile(np.broadcast_to(high, (self.size,)), self.times)
@@ -256,7 +241,7 @@ class FreeEnergy:
                 self.slices[name] = slice(at, at + size)
                 at += size
         self.parameters = at
-        self.bands = np.stack([factor.band.T for factor in factors])
+        self.bands = np.stack([factor.columns for factor in factors])
         self.marginals = np.stack([factor.inverse_blocks() for factor in factors])
         self.log_determinants = np.array([factor.log_determinant for factor in factors])
         self.roots = self._coloured(noise)
@@ -276,8 +261,10 @@ class FreeEnergy:
             means = np.clip(means + self._coloured(moves), self.low, self.high)
         inflation = np.ones(self.count)
         if 'inflation' in self.slices:
-            inflation = np.exp(np.clip(x[self.slices['inflation']] / self.spread, -3.0, 3.0))
-        return np.exp(log - logsumexp(log)), means, inflation
+            inflation = elementary.exp(
+                np.clip(x[self.slices['inflation']] / self.spread, -3.0, 3.0)
+            )
+        return elementary.exp(log - log_sum_exp(log)), means, inflation
 
     def sampled(self, mixture: Mixture, noise: Array) -> Array:
         """log q(X) - log p(X, R) at samples of each component, (M, S), with noise (M, S, D)."""
@@ -289,7 +276,7 @@ class FreeEnergy:
         weights, means, inflation = mixture
         each, slope, parts = self._evaluate(mixture, self.noise, self.roots)
         mean_gradient, inflation_gradient, weight_gradient = parts
-        value = float(weights @ each.mean(1))
+        value = float(product(weights, each.mean(1)))
         gradient = np.empty(self.parameters)
         share = weights / each.shape[1]
         if 'weights' in self.slices:
@@ -312,9 +299,9 @@ class FreeEnergy:
         weights, means, inflation = mixture
         count, samples, total = noise.shape
         log_scales = 0.5 * self.log_determinants - total * (
-            np.log(inflation) + 0.5 * np.log(2 * np.pi)
+            elementary.log(inflation) + 0.5 * elementary.log(2 * np.pi)
         )
-        log_weights = np.log(np.maximum(weights, 1e-300))
+        log_weights = elementary.log(np.maximum(weights, 1e-300))
         near, farthest = self._near(means, inflation)
         each = np.empty((count, samples))
         slope = np.empty((count, samples, total))

@@ -127,7 +127,7 @@ class Appearance:
         most = self.colours.score(image, unseen=1.0)
         if most is None:
             return None
-        against = float(np.clip(1.0 - 2.0 * most, 0.0, 1.0))
+        against = min(max(1.0 - 2.0 * most, 0.0), 1.0)
         return False, against * self.colours.stillness(image)
 
     def motion(self, view: View) -> Motion:

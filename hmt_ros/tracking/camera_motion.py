@@ -88,6 +88,7 @@ class CameraMotion:
         """Modes in the new camera frame: poses, velocities, covariances, soles and ways to face."""
         poses = self.poses(body, modes.poses)
         jacobians = self.jacobians(body, modes.poses, poses)
+        joints = body.joint_positions(poses)
         count = modes.state_covariances.shape[1] // body.dimension
         states = np.zeros_like(modes.state_covariances)
         for i in range(count):
@@ -96,7 +97,7 @@ class CameraMotion:
         return replace(
             modes,
             poses=poses,
-            back=ways(body, poses, poses[0]),
+            back=ways(body, joints, joints[0]),
             expected=self.poses(body, modes.expected),
             soles=self.points(modes.soles),
             velocities=(jacobians @ modes.velocities[..., None])[..., 0],

@@ -34,11 +34,15 @@ is not: the two differ in that people turn slowly and detectors change their min
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from hmt_ros import core
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.mirror import faces_back, left_directions, root_rotation_dofs
+from hmt_ros.body.mirror import faces_back, root_rotation_dofs, trunk_of
+from hmt_ros.core import elementary
 from hmt_ros.image.keypoint_schemes import exchange_rates, usual_exchanges
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
@@ -46,6 +50,7 @@ from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.markov_chain import MarkovChain
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.settings import FACING_VALID, LEAST_EXCHANGE, MAX_FACING_NATS
+from hmt_ros.tracking.weighting import Continuity
 
 EXCHANGES = MarkovChain(exchange_rates())
 
@@ -53,16 +58,41 @@ EXCHANGES = MarkovChain(exchange_rates())
 # The way to face.
 
 
-def ways(body: Body, poses: Array, reference: Array) -> Mask:
-    """Whether poses (N, d) face the other way than a pose (d,); a body without a trunk never."""
+class Ways(NamedTuple):
+    """What is known of the two ways when hypotheses are weighed, for the core.
+
+    Attributes:
+        before: (K,) modes that face the other way than the heaviest.
+        back: (N,) hypotheses that do.
+        variance: of turns since the image before, rad^2.
+        log_odds: of the other way, as the chain goes on.
+        price: -log of the probability that the way has changed meanwhile, nats.
+        valid: share of the images that show the facing direction.
+        most: bound on the log odds.
+    """
+
+    before: Mask
+    back: Mask
+    variance: float
+    log_odds: float
+    price: float
+    valid: float
+    most: float
+
+
+def ways(body: Body, joints: Array, reference: Array) -> Mask:
+    """Whether poses with joints (N, J, 3) face the other way than one with joints (J, 3).
+
+    With a body without a trunk none does.
+    """
     if not body.trunk_pairs:
-        return np.zeros(len(poses), dtype=np.bool_)
-    return np.asarray(faces_back(body, poses, reference), dtype=np.bool_)
+        return np.zeros(len(joints), dtype=np.bool_)
+    return faces_back(body, joints, reference)
 
 
-def first_facing(body: Body, poses: Array, log_weights: Array) -> Array:
-    """Log odds (N,) of the way that each of poses (N, d) faces at the start of a track."""
-    back = ways(body, poses, poses[np.argmax(log_weights)])
+def first_facing(body: Body, joints: Array, log_weights: Array) -> Array:
+    """Log odds (N,) of the way that each pose, by its joints, faces at the start of a track."""
+    back = ways(body, joints, joints[np.argmax(log_weights)])
     log_odds = -MAX_FACING_NATS
     if back.any():
         log_odds = max(float(log_weights[back].max() - log_weights[~back].max()), -MAX_FACING_NATS)
@@ -80,103 +110,68 @@ def lost_a_facing(back: Mask, log_weights: Array) -> bool:
     return bool(one_way or log_weights[back].max() > log_weights[~back].max() + MAX_FACING_NATS)
 
 
-def best_of_the_other_way(body: Body, poses: Array, log_weights: Array, least: float) -> list[int]:
-    """The heaviest of poses (N, d) that faces the other way than the heaviest of all, if any.
+def best_of_the_other_way(body: Body, joints: Array, log_weights: Array, least: float) -> list[int]:
+    """The heaviest of N poses that faces the other way than the heaviest of all, if any.
 
     It is kept as long as its way has any mass: small steps do not lead back to it.
 
     Args:
         body: of the poses.
-        poses, log_weights: (N, d), (N,).
+        joints, log_weights: (N, J, 3), (N,).
         least: log weight relative to the heaviest below which a way has no mass.
     """
     best = int(np.argmax(log_weights))
-    back = np.flatnonzero(ways(body, poses, poses[best]))
+    back = np.flatnonzero(ways(body, joints, joints[best]))
     back = back[log_weights[back] >= log_weights[best] + least]
     return [int(back[np.argmax(log_weights[back])])] if len(back) else []
 
 
 def weigh_ways(
-    body: Body,
     modes: Modes,
-    predicted: Array,
-    poses: Array,
+    continuity: Continuity,
+    joints: Array,
     transitions: Array,
     log_weights: Array,
     evidence: Array,
     followed: Mask,
-    dt: float,
-) -> tuple[Array, Array]:
-    """Log weights (N,) of poses (N, d), in which either way has the weight of its history.
+) -> tuple[Array, Array, Array]:
+    """Log weights (N,) of poses, in which either way has the weight of its history.
 
     Args:
-        body: of the poses.
         modes: of the image before, K.
-        predicted: (K, d) poses that they are moved to.
-        poses: (N, d).
+        continuity: of the image, with the poses that they are moved to.
+        joints: (N, J, 3) of the poses, m.
         transitions: (K, N) log t(x_n, x_k) from the modes.
         log_weights: (N,); only their ratios within a way are used.
         evidence: (N,) energies of the image, nats.
         followed: (N,) whether each has moved on from a mode.
-        dt: time since the image before, s.
 
     Returns:
-        The log weights, and the log odds (N,) of the way that each faces.
+        The log weights, the log odds (N,) of the way that each faces, and what (6) adds to log t
+        (K, N).
     """
+    body, dt = continuity.body, continuity.dt
     log_odds = -float(modes.facing[0])
+    facing, turned = np.full(len(joints), -log_odds), np.zeros_like(transitions)
     if not body.trunk_pairs:
-        return log_weights, np.full(len(poses), -log_odds)
-    back = ways(body, poses, modes.poses[0])
-    across = np.minimum(
-        transitions[np.ix_(~modes.back, back)],
-        log_turns(body, predicted[~modes.back], poses[back], dt),
+        return log_weights, facing, turned
+    reversal = body.symmetries['reversal']
+    of_ways = Ways(
+        modes.back,
+        ways(body, joints, body.joint_positions(modes.poses[:1])[0]),
+        # People turn about as far as their pelvis wanders about the vertical by itself.
+        float(body.rates[root_rotation_dofs(body.skeleton)[0]]) * dt,
+        reversal.after(log_odds, dt),
+        reversal.price(dt),
+        FACING_VALID,
+        MAX_FACING_NATS,
     )
-    stayed = body.symmetries['reversal'].after(log_odds, dt)
-    log_odds = max(stayed, float(across.max(initial=-np.inf)))
-    on, off = followed & ~back, followed & back
-    if on.any() and off.any():
-        log_odds += believed(float(evidence[on].min() - evidence[off].min()))
-    log_odds = float(np.clip(log_odds, -MAX_FACING_NATS, MAX_FACING_NATS))
-    if back.all():
-        # All modes went over: the track is as sure of this way as it was of the other one.
-        log_odds = abs(log_odds)
-    facing = np.where(back, log_odds, -log_odds)
-    if back.all() or not back.any():
-        return log_weights, facing
-    result = log_weights.copy()
-    for which, odds in ((back, log_odds), (~back, -log_odds)):
-        share = -np.logaddexp(0.0, -odds)
-        result[which] += share - np.logaddexp.reduce(log_weights[which])
-    return result, facing
-
-
-def log_turned(
-    body: Body, modes: Modes, predicted: Array, poses: Array, transitions: Array, dt: float
-) -> Array:
-    """What (6) adds to log t (K, N) of poses (N, d); arguments as of `weigh_ways`."""
-    if not body.trunk_pairs:
-        return np.zeros_like(transitions)
-    other = modes.back[:, None] != ways(body, poses, modes.poses[0])
-    turns = np.minimum(transitions, log_turns(body, predicted, poses, dt))
-    turned = np.logaddexp(turns, -body.symmetries['reversal'].price(dt))
-    return np.where(other, turned - transitions, 0.0)
-
-
-def log_turns(body: Body, first: Array, last: Array, dt: float) -> Array:
-    """How well people turn from poses (M, d) to poses (N, d) in dt s, (M, N), nats below the best.
-
-    They turn about as far as their pelvis wanders about the vertical by itself (`Body.rates`).
-    """
-    cosines = left_directions(body, first) @ left_directions(body, last).T
-    angles = np.arccos(np.clip(cosines, -1.0, 1.0))
-    variance = body.rates[root_rotation_dofs(body.skeleton)[0]] * dt
-    return np.asarray(-0.5 * angles**2 / variance)
-
-
-def believed(evidence: float) -> float:
-    """Evidence for a facing direction, bounded as an image may show something else, (3)."""
-    valid, other = np.log(FACING_VALID), np.log1p(-FACING_VALID)
-    return float(np.logaddexp(valid + evidence, other) - np.logaddexp(valid, other + evidence))
+    result, first = np.empty_like(log_weights), continuity.joints
+    core.weigh_ways(
+        trunk_of(body), of_ways, first, joints, transitions, log_weights, evidence, followed,
+        result, facing, turned,
+    )  # fmt: skip
+    return result, facing, turned
 
 
 # The sides.
@@ -184,7 +179,8 @@ def believed(evidence: float) -> float:
 
 def predicted_exchanges(exchanges: Array, dt: float) -> Array:
     """Log probabilities (K, E) of exchanges of sides a time dt, s, later, (4)."""
-    return np.log(np.maximum(EXCHANGES.predict(np.exp(exchanges), dt), LEAST_EXCHANGE))
+    p = EXCHANGES.predict(elementary.exp(exchanges), dt)
+    return np.asarray(elementary.log(np.maximum(p, LEAST_EXCHANGE)), dtype=np.float64)
 
 
 def known_exchanges(exchanges: Array) -> Array:

@@ -42,6 +42,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_ros.body.body import Body
+from hmt_ros.core import elementary
 from hmt_ros.image.keypoint_evidence import keypoint_evidence, suffices
 from hmt_ros.image.person_colours import Motion
 from hmt_ros.image.still_picture import StillPicture
@@ -146,7 +147,7 @@ class Existence:
     @property
     def log_odds(self) -> float:
         """Of somebody in view, nats."""
-        nobody, somebody = np.log(np.maximum(self._p, 1e-300))
+        nobody, somebody = elementary.log(np.maximum(self._p, 1e-300))
         return float(somebody - nobody)
 
     @property
@@ -175,7 +176,7 @@ class Existence:
         if self._stamps is not None and not still:
             self._p = CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
         # After so long a time the person who was seen last may have gone.
-        forgotten = CHAIN.transition(self.appearance.unseen(stamp))[1, 1] < MAJORITY
+        forgotten = bool(CHAIN.closed(1.0, self.appearance.unseen(stamp)) < MAJORITY)
         hidden = self.appearance.open_to_view(view.others) < 1.0 - MAJORITY
         cues, usable, apart = self._cues(view, body)
         denied = min((value * cue.nats for value, cue in cues.values()), default=0.0)

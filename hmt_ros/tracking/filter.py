@@ -24,11 +24,11 @@ from hmt_ros.image.surface_points import SurfacePoints, seen_points
 from hmt_ros.image.unseen_limbs import UnseenLimbs
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
+from hmt_ros.inference.linear_algebra import inverse, log_sum_exp
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.classes import (
     best_of_the_other_way,
     first_facing,
-    log_turned,
     seen_exchanges,
     ways,
     weigh_ways,
@@ -143,7 +143,7 @@ class MixtureFilter:
         if start.expected is not None:
             with np.errstate(divide='ignore'):
                 log_weights = np.log(start.expected.normalised().weights)
-            precisions = np.asarray(np.linalg.inv(start.expected.covariances), dtype=np.float64)
+            precisions = inverse(start.expected.covariances)
         seen = observation
         if start.clicked is not None:
             seen = replace(observation, keypoints=start.clicked)
@@ -181,12 +181,13 @@ class MixtureFilter:
         optimised = _finite(optimised)
         log_weights = optimised.hypotheses.log_weights
         log_weights = log_weights - ERRORS['image'].independent * optimised.minima.value
-        joints = self.body.relative_joints(optimised.minima.x)
-        rows = distinct_hypotheses(joints, log_weights, self.settings.hypothesis_merge_distance)
-        optimised, log_weights = optimised[rows], log_weights[rows]
-        facing = first_facing(self.body, optimised.minima.x, log_weights)
+        joints = self.body.joint_positions(optimised.minima.x)
+        same = self.settings.hypothesis_merge_distance
+        rows = distinct_hypotheses(joints - joints[:, :1], log_weights, same)
+        log_weights, joints = log_weights[rows], joints[rows]
+        facing = first_facing(self.body, joints, log_weights)
         nothing = np.empty((0, len(rows)))
-        self._select(optimised, log_weights, facing, nothing, observation, None)
+        self._select(optimised[rows], joints, log_weights, facing, nothing, observation, None)
 
     # One image after another.
 
@@ -211,7 +212,7 @@ class MixtureFilter:
         s, modes, posterior = self.settings, self.modes, self.posterior
         self.spent.clear()
         predicted, states = predict(modes, self.body, self.dynamics, dt)
-        precisions = np.asarray(np.linalg.inv(states.pose_covariances), dtype=np.float64)
+        precisions = inverse(states.pose_covariances)
         continuity = Continuity(self.body, predicted.poses, modes.log_weights, dt)
         predicted = follow_flow(predicted, precisions, self._points, observation, posterior)
         term = posterior.given(observation, predicted.expected, precisions, predicted.exchanges)
@@ -238,40 +239,37 @@ class MixtureFilter:
 
     # The steps.
 
-    def _weigh(self, search: Search, optimised: Optimised) -> tuple[Optimised, Array, Array, Array]:
+    def _weigh(
+        self, search: Search, optimised: Optimised
+    ) -> tuple[Optimised, Array, Array, Array, Array]:
         """The hypotheses that are distinct, with their weights: what `_select` takes."""
         optimised = _finite(optimised)
         evidence = search.evidence(optimised)
         # Where hypotheses meet, one that has moved there is kept before one that has jumped.
         followed = np.asarray(~optimised.hypotheses.jumped.any(1))
         order = np.lexsort((evidence, ~followed))
-        joints = self.body.relative_joints(optimised.minima.x[order])
+        joints = self.body.joint_positions(optimised.minima.x)
         ranks = -np.arange(len(order), dtype=np.float64)
         same = self.settings.hypothesis_merge_distance
-        rows = order[distinct_hypotheses(joints, ranks, same)]
-        optimised, evidence = optimised[rows], evidence[rows]
-        poses = optimised.minima.x
-        transitions = search.continuity.log_transitions(poses)
-        histories = search.continuity.log_histories(poses)
-        log_weights, facing = weigh_ways(
-            self.body,
+        rows = order[distinct_hypotheses((joints - joints[:, :1])[order], ranks, same)]
+        optimised, joints, evidence = optimised[rows], joints[rows], evidence[rows]
+        transitions = search.continuity.log_transitions(joints)
+        histories = search.continuity.log_histories(joints, transitions)
+        log_weights, facing, turned = weigh_ways(
             search.modes,
-            search.continuity.predicted,
-            poses,
+            search.continuity,
+            joints,
             transitions,
-            np.logaddexp.reduce(histories, axis=0) - evidence,
+            log_sum_exp(histories, axis=0) - evidence,
             evidence,
             np.asarray(~optimised.hypotheses.jumped.all(1)),
-            search.dt,
         )
-        histories = histories + log_turned(
-            self.body, search.modes, search.continuity.predicted, poses, transitions, search.dt
-        )
-        return optimised, log_weights, facing, histories
+        return optimised, joints, log_weights, facing, histories + turned
 
     def _select(
         self,
         optimised: Optimised,
+        joints: Array,
         log_weights: Array,
         facing: Array,
         histories: Array,
@@ -282,6 +280,7 @@ class MixtureFilter:
 
         Args:
             optimised: N distinct hypotheses at their optima.
+            joints: (N, J, 3) of these, m.
             log_weights: (N,).
             facing: (N,) log odds of the way that each faces.
             histories: (K, N) log w_k p(x_n | x_k), of K modes before, for the ancestry; K is 0
@@ -295,11 +294,11 @@ class MixtureFilter:
         best = poses[int(np.argmax(log_weights))]
         self.limbs.look(self.body, self.camera, observation, best, dt)
         kept = choose_hypotheses(
-            self.body.relative_joints(poses)[:, self.limbs.shown_joints(self.body)],
+            (joints - joints[:, :1])[:, self.limbs.shown_joints(self.body)],
             log_weights,
             s.plan.hypotheses,
             same=s.hypothesis_merge_distance,
-            first=best_of_the_other_way(self.body, poses, log_weights, s.least_log_weight),
+            first=best_of_the_other_way(self.body, joints, log_weights, s.least_log_weight),
         )
         weights = at_least(normalised(kept.log_weights), s.least_log_weight)
         order = np.argsort(-weights, kind='stable')
@@ -319,7 +318,7 @@ class MixtureFilter:
         modes = replace(
             modes,
             facing=facing[rows],
-            back=ways(self.body, modes.poses, modes.poses[0]),
+            back=ways(self.body, joints[rows], joints[rows[0]]),
             exchanges=seen_exchanges(
                 posterior.likelihood, observation, modes.poses, selected.hypotheses.exchanges
             ),

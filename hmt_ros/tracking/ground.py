@@ -13,6 +13,7 @@ and contradict them, but never replace them.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 
@@ -31,13 +32,16 @@ from hmt_ros.body.ground_terms import (
     masses,
     sole_points,
     soles,
+    unit,
 )
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import turned
+from hmt_ros.core import elementary
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.vertical_lines import Vertical, seen_vertical
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.error_model import seconds
+from hmt_ros.inference.linear_algebra import inverse, product, symmetric_eigen
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.settings import (
@@ -102,14 +106,14 @@ def unit_vector(up: ArrayLike) -> Array:
         ValueError: another shape, or a length that is not 1 within 1 %.
     """
     vector = np.array(up, dtype=np.float64)
-    length = float(np.linalg.norm(vector)) if vector.shape == IMAGE_UP.shape else np.nan
+    length = _length(vector) if vector.shape == IMAGE_UP.shape else np.nan
     if not abs(length - 1.0) < 0.01:
         raise ValueError(
             f'up must be a unit vector (3,) against gravity in the camera frame, saw {vector}'
         )
-    unit: Array = vector / length
-    unit.setflags(write=False)
-    return unit
+    result: Array = vector / length
+    result.setflags(write=False)
+    return result
 
 
 class GroundEstimator:
@@ -170,7 +174,7 @@ class GroundEstimator:
         A camera height that would not be positive any more is unknown from then on.
         """
         up = motion.directions(self.estimate.up)
-        rise = -float(up @ motion.translation)
+        rise = -_dot(up, motion.translation)
         known = self.known
         height = None if known.camera_height is None else known.camera_height + rise
         self.known = replace(
@@ -179,7 +183,8 @@ class GroundEstimator:
             camera_height=height if height is not None and height > 0 else None,
         )
         self._mean = motion.directions(self._mean)
-        self._covariance = motion.rotation @ self._covariance @ motion.rotation.T
+        turned = product(motion.rotation, self._covariance)
+        self._covariance = product(turned, motion.rotation.T)
         if self._seen is not None:
             self._seen = replace(self._seen, up=motion.directions(self._seen.up))
         self._levels = deque((time, level + rise) for time, level in self._levels)
@@ -189,10 +194,10 @@ class GroundEstimator:
         self, up: ArrayLike, camera_height: float | None = None, up_sigma: float = GIVEN_UP_SIGMA
     ) -> None:
         """Takes a newer direction (3,) against gravity, camera frame, and height of the camera."""
-        before, unit = self.known.up, unit_vector(up)
-        self.turning = before is not None and float(np.linalg.norm(unit - before)) > TURN_NOISE
+        before, vector = self.known.up, unit_vector(up)
+        self.turning = before is not None and _length(vector - before) > TURN_NOISE
         height = self.known.camera_height if camera_height is None else camera_height
-        self.known = KnownGround(unit, height, up_sigma)
+        self.known = KnownGround(vector, height, up_sigma)
         self._conclude()
 
     @property
@@ -201,7 +206,7 @@ class GroundEstimator:
         up = self.known.up
         if up is None:
             return False
-        return self._by_keypoints < (0.0 if up @ IMAGE_UP < 0.0 else -HEAD_DOWN_IMAGES)
+        return self._by_keypoints < (0.0 if _dot(up, IMAGE_UP) < 0.0 else -HEAD_DOWN_IMAGES)
 
     @property
     def contradicted(self) -> bool:
@@ -210,7 +215,7 @@ class GroundEstimator:
         if given is None:
             return False
         # A camera that hangs or lies is more often given the wrong one.
-        upright = bool(given @ IMAGE_UP >= 0.5)
+        upright = _dot(given, IMAGE_UP) >= 0.5
         prior = -RIGHT_VERTICAL_NATS if upright else 1.0 - RIGHT_VERTICAL_NATS
         return prior + self._by_lines + self._by_person > 0.0
 
@@ -229,8 +234,8 @@ class GroundEstimator:
         """Takes in which way up a detector sees the person, by names of our joints."""
         if self.known.up is not None:
             trunk = keypoints.trunk
-            length = max(float(np.linalg.norm(trunk)), np.finfo(np.float64).eps)
-            self._by_keypoints += float(trunk @ self.known.up[:2]) / length
+            length = max(_length(trunk), np.finfo(np.float64).eps)
+            self._by_keypoints += _dot(trunk, self.known.up[:2]) / length
             self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
@@ -246,9 +251,9 @@ class GroundEstimator:
         if not self._missed or again:
             self._seen, self._missed = found, False
         if given is not None:
-            said = -np.log(found.agreement(given, self.known.up_sigma))
-            said = np.clip(said, -LOOK_NATS, LOOK_NATS)
-            self._by_lines = float(np.clip(self._by_lines + said, -LOOK_NATS, 2.0 * LOOK_NATS))
+            said = -float(elementary.log(found.agreement(given, self.known.up_sigma)))
+            said = min(max(said, -LOOK_NATS), LOOK_NATS)
+            self._by_lines = min(max(self._by_lines + said, -LOOK_NATS), 2.0 * LOOK_NATS)
         self._conclude()
 
     @property
@@ -302,60 +307,59 @@ class GroundEstimator:
             resting: probability that both feet rest.
             dt: since the image before, s.
         """
-        feet, mass = soles(body), masses(body)
+        feet, mass = soles(body), masses(body.skeleton)
         if not len(feet):
             return
         frames = forward(body.skeleton, modes.poses)
-        weights = np.exp(modes.log_weights)
+        weights = elementary.exp(modes.log_weights)
         weights = weights / weights.sum()
-        points = frames.points(feet.segments, feet.local)
+        points = frames.places(feet.segments, feet.local)
         self._time += dt
-        place = frames.origins[0] @ weights
+        place = product(weights, frames.segments[1][:, 0])
         if mass.known:
-            axes = mass.centre_of_mass(frames) - points.mean(0)
-            axis = axes / np.linalg.norm(axes, axis=0) @ weights
+            axis = product(weights, unit(mass.centre_of_mass(frames) - points.mean(1)))
             if self._given is not None:
-                cosine = float(axis @ self._given)
-                stands = (
-                    2.0 * UPRIGHT_CONCENTRATION * np.exp(UPRIGHT_CONCENTRATION * (cosine - 1.0))
-                )
-                most = RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0))
-                said = -np.log(stands + np.exp(-most)) * min(dt / VERTICAL_TIME, 1.0)
-                self._by_person = float(np.clip(self._by_person + said, -RIGHT_VERTICAL_NATS, most))
+                self._by_person = self._said_by_person(_dot(axis, self._given), dt)
             elif self._seen is None:
                 self._follow_axis(axis, place, resting, dt)
                 self._conclude()
         up = self.estimate.up
-        level = float(-np.einsum('pin,i->pn', points, up).min(0) @ weights)
+        level = float(-_dot(weights, product(points, up).min(1)))
         self._levels.append((self._time, level))
         while self._levels[0][0] < self._time - LEVEL_TIME:
             self._levels.popleft()
-        self._distance = float(np.linalg.norm(place - up * (up @ place)))
+        self._distance = _length(place - up * _dot(up, place))
         self._conclude()
+
+    def _said_by_person(self, cosine: float, dt: float) -> float:
+        """Nats against the given vertical after an image where a person stands at this cosine."""
+        stands = 2.0 * UPRIGHT_CONCENTRATION
+        stands *= elementary.exp(UPRIGHT_CONCENTRATION * (cosine - 1.0))
+        most = RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0))
+        said = -elementary.log(stands + elementary.exp(-most)) * min(dt / VERTICAL_TIME, 1.0)
+        return min(max(self._by_person + float(said), -RIGHT_VERTICAL_NATS), most)
 
     def _follow_axis(self, axis: Array, place: Array, resting: float, dt: float) -> None:
         """Moves the vertical by the mean axis (3,) of the body at a place (3,)."""
-        length = np.linalg.norm(axis)
+        length = _length(axis)
         if dt <= 0 or resting <= 0 or length == 0:
             return
-        ray = place / np.linalg.norm(place)
+        ray = unit(place)
         along = np.outer(ray, ray)
         error = AXIS_SIGMA**2 * (AXES - along) + (2.0 * AXIS_SIGMA) ** 2 * along
         error = error * max(VERTICAL_TIME / (resting * dt), 1.0)
         covariance = self._covariance + UP_DRIFT**2 * dt * AXES
-        gain = covariance @ np.linalg.inv(covariance + error)
-        mean = self._mean + gain @ (axis / length - self._mean)
-        mean = mean / np.linalg.norm(mean)
-        angle = float(np.arccos(np.clip(mean @ IMAGE_UP, -1.0, 1.0)))
+        gain = product(covariance, inverse(covariance + error))
+        mean = unit(self._mean + product(gain, axis / length - self._mean))
         most = 2.0 * UP_SIGMA
-        if angle > most:
-            aside = mean - IMAGE_UP * (mean @ IMAGE_UP)
-            aside = aside / np.linalg.norm(aside)
-            mean = np.cos(most) * IMAGE_UP + np.sin(most) * aside
+        cosine = _dot(mean, IMAGE_UP)
+        if elementary.arccos(min(max(cosine, -1.0), 1.0)) > most:
+            aside = unit(mean - IMAGE_UP * cosine)
+            mean = elementary.cos(most) * IMAGE_UP + elementary.sin(most) * aside
         self._mean = mean
-        values, vectors = np.linalg.eigh(covariance - gain @ covariance)
+        values, vectors = symmetric_eigen(covariance - product(gain, covariance))
         values = np.clip(values, AXIS_SIGMA**2, UP_SIGMA**2)
-        self._covariance = (vectors * values) @ vectors.T
+        self._covariance = product(vectors * values, vectors.T)
 
     def _conclude(self) -> None:
         known, seen, given = self.known, self._seen, self._given
@@ -370,7 +374,7 @@ class GroundEstimator:
         if known.camera_height is not None:
             self.estimate = Ground(seen.up, seen.sigma, known.camera_height, 2.0 * MEASURED_SIGMA)
             # An error of the vertical lifts the floor where the person is.
-            sigma = float(np.hypot(self.estimate.height_sigma, seen.sigma * self._distance))
+            sigma = math.hypot(self.estimate.height_sigma, seen.sigma * self._distance)
             if sigma <= tracked.height_sigma:
                 self.plane = replace(self.estimate, height_sigma=sigma)
 
@@ -378,10 +382,27 @@ class GroundEstimator:
         """Height of the camera over the lowest soles of the last seconds, and its deviation, m."""
         if not self._levels:
             return None, np.inf
-        levels = np.array([level for _, level in self._levels])
-        low, high = np.quantile(levels, [0.5, LEVEL_QUANTILE])
-        few = 2.0 * LEVEL_SIGMA / np.sqrt(len(levels))
-        return float(high), float(np.sqrt(LEVEL_SIGMA**2 + (high - low) ** 2 + few**2))
+        levels = sorted(level for _, level in self._levels)
+        low, high = _quantile(levels, 0.5), _quantile(levels, LEVEL_QUANTILE)
+        few = 2.0 * LEVEL_SIGMA / math.sqrt(len(levels))
+        return high, math.sqrt(LEVEL_SIGMA**2 + (high - low) ** 2 + few**2)
+
+
+def _dot(a: Array, b: Array) -> float:
+    """Scalar product of vectors (N,)."""
+    return float(product(a, b))
+
+
+def _length(vector: Array) -> float:
+    return math.sqrt(_dot(vector, vector))
+
+
+def _quantile(rising: list[float], share: float) -> float:
+    """The value that a share of values does not exceed, interpolated."""
+    place = share * (len(rising) - 1)
+    first = int(place)
+    low, high = rising[first], rising[min(first + 1, len(rising) - 1)]
+    return low + (place - first) * (high - low)
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,5 +424,5 @@ class Gravity:
 
     def turned(self, body: Body, poses: Array) -> Array:
         """Poses (N, d) upright in the image, turned the shortest way to be upright in space."""
-        turn = shortest_turn(body.level @ IMAGE_UP, self.plane.up)
+        turn = shortest_turn(product(body.level, IMAGE_UP), self.plane.up)
         return np.clip(turned(body, poses, body, turn), body.lower, body.upper)

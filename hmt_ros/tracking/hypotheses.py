@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import relevelled, reverse_depth
+from hmt_ros.core import elementary
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.bounded_newton import Minimum
+from hmt_ros.inference.linear_algebra import log_sum_exp
 from hmt_ros.inference.mixture import GaussianMixture
 
 if TYPE_CHECKING:
@@ -167,7 +169,7 @@ class Modes(Hypotheses):
     @property
     def mixture(self) -> GaussianMixture:
         """The modes as a mixture over poses."""
-        weights = np.exp(self.log_weights - np.logaddexp.reduce(self.log_weights))
+        weights = elementary.exp(self.log_weights - log_sum_exp(self.log_weights))
         return GaussianMixture(weights, self.poses, self.covariances)
 
 

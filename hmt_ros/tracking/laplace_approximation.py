@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hmt_ros.core import determined, elementary, shift_modes
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.inference.arrays import Array, Index
@@ -40,7 +41,7 @@ from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.weighting import at_least, normalised
 
 # Smallest log weight of a mode of a likelihood, nats: its exponential is a number still.
-MIN_LOG_WEIGHT = np.log(np.finfo(np.float64).tiny)
+MIN_LOG_WEIGHT = elementary.log(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,7 @@ def posterior_modes(
     """
     h, solved = selected.hypotheses, selected.minima
     poses = solved.x
-    filtered = free_covariances(solved.hessian, solved.free)
+    filtered, _ = free_covariances(solved.hessian[:, None], solved.free)
     fit = posterior.fit(poses, observation)
     covariances = alone = filtered
     measured = bool(observation.evidence) or observation.keypoints is not None
@@ -157,19 +158,18 @@ def likelihood_modes(
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation, LIFTED_AS_KEYPOINTS)
-    covariances = fit.covariances
-    gradient = np.where(fit.free, fit.energy.derivatives()[0], 0.0)
-    step = -np.einsum('kij,kj->ki', covariances, gradient)
-    limit = MAX_MODE_SHIFT * np.sqrt(np.einsum('kii->ki', modes.covariances))
-    step = np.clip(step, -limit, limit)
-    means = np.clip(poses + step, body.lower, body.upper)
-    volumes = 0.5 * np.linalg.slogdet(covariances)[1]
-    weights = np.exp(at_least(normalised(volumes - fit.energy.value), MIN_LOG_WEIGHT))
+    gradient, covariances = fit.energy.derivatives()[0], fit.covariances
+    means, limits = np.empty_like(poses), np.stack([body.lower, body.upper])
+    shift_modes(
+        poses, gradient, fit.free, covariances, modes.covariances, MAX_MODE_SHIFT, limits, means
+    )
+    volumes = 0.5 * fit.log_determinants
+    weights = elementary.exp(at_least(normalised(volumes - fit.energy.value), MIN_LOG_WEIGHT))
     order = np.argsort(-weights, kind='stable')
-    mixture = GaussianMixture(weights, means, covariances)[order]
+    mixture = GaussianMixture(weights[order], means[order], covariances[order])
     seen = PoseEnergy(posterior.likelihood, posterior.likelihood.seen(observation))
     values = -seen.energy(mixture.means, derivatives=Derivatives.NONE).value
-    gives_way = covariances[:1] * (fit.free[:1, :, None] & fit.free[:1, None, :])
+    gives_way = fit.given_way()[1][:1]
     unknown = shape.considered(posterior.likelihood, observation, poses[:1], gives_way)[0]
     stamp, ancestral = before
     follows = modes.origins.shape[1] > 0
@@ -177,7 +177,7 @@ def likelihood_modes(
     return Likelihood(
         mixture,
         values,
-        _errors(fit, covariances, weights),
+        _errors(fit, weights),
         unknown,
         modes=order,
         posterior_weights=modes.mixture.weights[order],
@@ -188,18 +188,14 @@ def likelihood_modes(
     )
 
 
-def _errors(fit: ImageFit, covariances: Array, weights: Array) -> CueErrors:
+def _errors(fit: ImageFit, weights: Array) -> CueErrors:
     """How long errors of an energy last; its Hessian H = sum_g H_g has the inverse S in a mode.
 
     A cue counts with the number of variables that it determines, tr(S H_g), in the mean over modes.
     """
-    _, hessian = fit.energy.derivatives()
-    parts = {'image': fit.image_hessian, 'keypoints': fit.keypoint_hessian}
-    parts['prior'] = hessian - fit.image_hessian - fit.keypoint_hessian
-    amounts = {
-        name: max(float(np.einsum('k,kij,kji->', weights, covariances, part)), 0.0)
-        for name, part in parts.items()
-    }
-    if not sum(amounts.values()) > 0.0:
-        amounts['prior'] = 1.0
-    return errors_of_cues(amounts)
+    amounts = np.empty(3)
+    determined(weights, fit.covariances, fit.hessians, amounts)
+    if not amounts.max() > 0.0:
+        amounts[2] = 1.0
+    names = 'image', 'keypoints', 'prior'
+    return errors_of_cues(dict(zip(names, np.maximum(amounts, 0.0).tolist(), strict=True)))

@@ -49,7 +49,7 @@ class Misfit(NamedTuple):
     @property
     def share(self) -> float:
         """Share over all measurements together; 0 where there are none."""
-        return float(self.shares @ self.counts / max(self.counts.sum(), 1.0))
+        return float((self.shares * self.counts).sum() / max(self.counts.sum(), 1.0))
 
 
 def of_silhouette(

@@ -62,13 +62,18 @@ class Search:
 
     def rated(self, poses: Array, energies: Array) -> Array:
         """About the log weights (N,) that poses (N, d) of these energies (N,) would have."""
-        return self.continuity.rated(poses) - ERRORS['image'].share(self.dt) * energies
+        joints = self.posterior.body.joint_positions(poses)
+        return self._rated(joints, energies)
+
+    def _rated(self, joints: Array, energies: Array) -> Array:
+        return self.continuity.rated(joints) - ERRORS['image'].share(self.dt) * energies
 
     def best(self, poses: Array, energies: Array) -> Index:
         """Rows of poses (N, d) of these energies (N,) that stand for all, as many as candidates."""
+        joints = self.posterior.body.joint_positions(poses)
         return choose_hypotheses(
-            self.posterior.body.relative_joints(poses),
-            self.rated(poses, energies),
+            joints - joints[:, :1],
+            self._rated(joints, energies),
             self.plan.candidates,
             same=self.posterior.settings.hypothesis_merge_distance,
         ).chosen

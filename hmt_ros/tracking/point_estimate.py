@@ -20,7 +20,9 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import left_directions, propagated, root_rotation_dofs
-from hmt_ros.inference.arrays import Array, Mask
+from hmt_ros.core import condition
+from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.camera_motion import CameraMotion
@@ -52,7 +54,7 @@ class PointEstimate:
         self._leader = motion.poses(body, self._leader[None])[0]
         turned = motion.jacobians(body, before, self.pose[None])
         whole = np.kron(np.eye(len(self._mean) // d), turned[0])
-        self._mean = np.concatenate([self.pose, (whole @ self._mean)[d:]])
+        self._mean = np.concatenate([self.pose, product(whole, self._mean)[d:]])
         self._covariance = propagated(whole[None], self._covariance[None])[0]
 
     def expect(self, body: Body, dynamics: LinearGaussianDynamics, dt: float) -> None:
@@ -75,8 +77,8 @@ class PointEstimate:
             posterior: over the poses.
             dt: time since the image before, s; None: the modes begin with this image.
         """
-        turns = self._choose_way(body, posterior, begins=dt is None)
-        found, uncertain = _moments(body, posterior, self._leader)
+        turns, own = self._choose_way(body, posterior, begins=dt is None)
+        found, uncertain = _moments(body, posterior[own].normalised(), self._leader)
         if dt is None or turns:
             at_rest = dynamics.initial_mean[body.dimension :]
             self._mean = np.concatenate([found, at_rest])
@@ -85,17 +87,28 @@ class PointEstimate:
             self._condition(body, *self._predicted(dynamics, dt), found, uncertain)
         self.pose = self._mean[: body.dimension].copy()
 
-    def _choose_way(self, body: Body, posterior: GaussianMixture, *, begins: bool) -> bool:
-        """Takes the mode that leads from now on; whether it faces another way than before."""
-        weights = posterior.weights
-        alike = np.ones(len(weights), dtype=np.bool_)
-        turns = False
-        if not begins:
-            alike = _faces_as(body, posterior.means, self._leader)
-            turns = not alike.any() or weights[~alike].sum() > FACING_VALID * weights.sum()
-            alike = ~alike if turns else alike
-        self._leader = posterior.means[int(np.argmax(np.where(alike, weights, -1.0)))]
-        return turns
+    def _choose_way(
+        self, body: Body, posterior: GaussianMixture, *, begins: bool
+    ) -> tuple[bool, Index]:
+        """Takes the mode that leads from now on.
+
+        Returns:
+            Whether it faces another way than before, and the modes that face as it does.
+        """
+        weights, means = posterior.weights, posterior.means
+        alike = np.ones((len(weights), len(weights) + 1), dtype=np.bool_)
+        if body.trunk_pairs:
+            poses = means if begins else np.concatenate([means, self._leader[None]])
+            left = left_directions(body, poses)
+            # Turned by at most 90 degrees from each other.
+            alike[:, : len(poses)] = product(left[: len(weights)], left.T) >= 0
+        as_before = alike[:, -1]
+        turns = not as_before.any() or bool(
+            weights[~as_before].sum() > FACING_VALID * weights.sum()
+        )
+        leads = int(np.argmax(np.where(as_before != turns, weights, -1.0)))
+        self._leader = means[leads]
+        return turns, np.flatnonzero(alike[:, leads])
 
     def _predicted(self, dynamics: LinearGaussianDynamics, dt: float) -> tuple[Array, Array]:
         """Mean (n,) and covariance (n, n) of the motion after dt seconds."""
@@ -107,30 +120,20 @@ class PointEstimate:
     ) -> None:
         """Conditions a prediction on a pose (d,) that was found, of a covariance (d, d)."""
         d = body.dimension
-        gain = np.linalg.solve(covariance[:d, :d] + uncertain, covariance[:d]).T
         offset = _differences(body, found[None], mean[:d])[0]
-        moved = mean + gain @ offset
+        moved, left = np.empty_like(mean), np.empty_like(covariance)
+        condition(mean, covariance, offset, uncertain, moved, left)
         # The root counts its turns as the modes do.
         moved[:d] += found - mean[:d] - offset
         moved[:d] = np.clip(moved[:d], body.lower, body.upper)
-        left = covariance - gain @ covariance[:d]
-        self._mean, self._covariance = moved, 0.5 * (left + left.T)
+        self._mean, self._covariance = moved, left
 
 
-def _moments(body: Body, posterior: GaussianMixture, leader: Array) -> tuple[Array, Array]:
+def _moments(body: Body, own: GaussianMixture, leader: Array) -> tuple[Array, Array]:
     """Mean (d,) and covariance (d, d), as in (1), of the modes that face as one of them does."""
-    own = posterior[np.flatnonzero(_faces_as(body, posterior.means, leader))].normalised()
-    mean = leader + own.weights @ _differences(body, own.means, leader)
-    covariance = np.tensordot(own.weights, own.covariances, axes=1)
-    return np.clip(mean, body.lower, body.upper), np.asarray(covariance, dtype=np.float64)
-
-
-def _faces_as(body: Body, poses: Array, reference: Array) -> Mask:
-    """Whether poses (N, d) are turned by at most 90 degrees from a reference pose (d,)."""
-    if not body.trunk_pairs:
-        return np.ones(len(poses), dtype=np.bool_)
-    left = left_directions(body, np.concatenate([reference[None], poses]))
-    return np.asarray(left[1:] @ left[0] >= 0, dtype=np.bool_)
+    mean = leader + product(own.weights, _differences(body, own.means, leader))
+    covariance = product(own.weights, own.covariances.reshape(len(own), -1))
+    return np.clip(mean, body.lower, body.upper), covariance.reshape(own.covariances.shape[1:])
 
 
 def _differences(body: Body, poses: Array, reference: Array) -> Array:

@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hmt_ros import core
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.ground_terms import GroundTerm, without_root_lean
@@ -26,9 +27,15 @@ from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic
 from hmt_ros.inference.error_model import ERRORS
+from hmt_ros.inference.linear_algebra import product
 from hmt_ros.tracking.classes import known_exchanges
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.settings import LIMIT_SIGMA, MAX_SIGMA, MINIMUM_TOLERANCE, TrackerSettings
+
+# Share of Hessians that are no sums.
+ALONE = np.ones(1)
+# Precisions of a variable that rests on a limit, and of one that nothing is known of.
+PRECISIONS = LIMIT_SIGMA**-2.0, MAX_SIGMA**-2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,20 +45,20 @@ class ImageFit:
     Attributes:
         energy: with the priors of the body.
         image_energy: (K,) of the image and the keypoints alone.
-        image_hessian: (K, d, d) of the image terms alone, keypoints apart.
-        keypoint_hessian: (K, d, d) of the keypoints alone.
+        hessians: (K, 3, d, d) of the image terms, of the keypoints, and of all else.
         outline_costs: (K, M) of the samples of the silhouette's outline.
         free: (K, d) variables that do not rest on a limit, where only the image moves them.
         covariances: (K, d, d) inverse Hessians of the energy on these; see `free_covariances`.
+        log_determinants: (K,) of the covariances.
     """
 
     energy: Energy
     image_energy: Array
-    image_hessian: Array
-    keypoint_hessian: Array
+    hessians: Array
     outline_costs: Array
     free: Mask
     covariances: Array
+    log_determinants: Array
 
     def given_way(self) -> tuple[Array, Array]:
         """Response of the poses to other changes.
@@ -72,10 +79,8 @@ class ImageFit:
             free: (K, d) variables that do not rest on a limit.
             dt: time since the image before, s.
         """
-        _, hessian = self.energy.derivatives()
-        lasting = (1.0 - ERRORS['image'].share(dt)) * self.image_hessian
-        lasting = lasting + (1.0 - ERRORS['keypoints'].share(dt)) * self.keypoint_hessian
-        return free_covariances(hessian - lasting, free)
+        shares = np.array([ERRORS['image'].share(dt), ERRORS['keypoints'].share(dt), 1.0])
+        return free_covariances(self.hessians, free, shares)[0]
 
 
 class Posterior:
@@ -205,11 +210,10 @@ class Posterior:
         fit = ImageFit(
             found.energy,
             found.values[:, :2].sum(1),
-            found.hessians[:, 0],
-            found.hessians[:, 1],
+            found.hessians,
             found.outline_costs,
             free,
-            free_covariances(hessian, free),
+            *free_covariances(hessian[:, None], free),
         )
         self._last_fit = (poses, observation, share, fit)
         return fit
@@ -238,7 +242,7 @@ class Posterior:
         )
         terms = (*seen, *self.likelihood.priors, *self.known)
         values = PoseEnergy(self.likelihood, terms).by_cue(poses, derivatives=False).values
-        return np.asarray(values @ [share['image'], 1.0, share['prior']])
+        return np.asarray(product(values, np.array([share['image'], 1.0, share['prior']])))
 
 
 def step_scale(body: Body) -> Array:
@@ -246,17 +250,17 @@ def step_scale(body: Body) -> Array:
     return np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
 
 
-def free_covariances(hessians: Array, free: Mask) -> Array:
-    """Inverses (K, d, d) of Hessians (K, d, d) on the free variables (K, d).
+def free_covariances(hessians: Array, free: Mask, shares: Array = ALONE) -> tuple[Array, Array]:
+    """Inverses (K, d, d) of sums of Hessians on the free variables, and log determinants (K,).
 
     A variable at its limit has the deviation `LIMIT_SIGMA`, and none one above `MAX_SIGMA`.
+
+    Args:
+        hessians: (K, C, d, d), one of each cue.
+        free: (K, d).
+        shares: (C,) of the cues.
     """
-    h = hessians.copy()
-    rows, dofs = np.nonzero(~free)
-    h[rows, dofs, :] = 0.0
-    h[rows, :, dofs] = 0.0
-    h[rows, dofs, dofs] = LIMIT_SIGMA**-2.0
-    diagonal = np.arange(h.shape[1])
-    h[:, diagonal, diagonal] += MAX_SIGMA**-2.0
-    result = np.linalg.inv(0.5 * (h + h.transpose(0, 2, 1)))
-    return 0.5 * (result + result.transpose(0, 2, 1))
+    result, log_determinants = np.empty_like(hessians[:, 0]), np.empty(len(hessians))
+    hessians = np.ascontiguousarray(hessians, dtype=np.float64)
+    core.free_covariances(hessians, shares, free, *PRECISIONS, result, log_determinants)
+    return result, log_determinants

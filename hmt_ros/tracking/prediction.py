@@ -57,7 +57,7 @@ def predicted_states(
 ) -> PredictedStates:
     """States of modes with covariances (K, n, n) after dt seconds."""
     known = np.concatenate([modes.poses, modes.velocities], axis=1)
-    means = known[:, : dynamics.state_dimension]
+    means = np.ascontiguousarray(known[:, : dynamics.state_dimension])
     has_velocities = dynamics.state_dimension > dynamics.dimension
     wandered = body.rates * dt if has_velocities else np.zeros(body.dimension)
     return PredictedStates(dynamics, *dynamics.predict(means, covariances, dt), wandered)

@@ -15,9 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_ros.core import choose_representatives
+from hmt_ros.core import choose_representatives, keep_apart
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.reduction import leaders
 from hmt_ros.tracking.settings import MAX_JOINT_DISTANCE
 
 
@@ -54,22 +53,20 @@ def choose_hypotheses(
         cap: largest distance that a joint counts with, m.
         first: hypotheses that are kept in any case, after the heaviest.
     """
-    top = log_weights.max()
-    weights = np.exp(log_weights - top)
-    n = len(weights)
-    chosen, owner = np.empty(min(count, n), dtype=np.intp), np.empty(n, dtype=np.intp)
+    n = len(log_weights)
+    most = min(count, n)
+    chosen, owner, groups = np.empty(most, np.intp), np.empty(n, np.intp), np.empty(most)
     kept = choose_representatives(
         np.ascontiguousarray(joints, dtype=np.float64),
-        weights / weights.sum(),
+        np.ascontiguousarray(log_weights, dtype=np.float64),
         same,
         cap,
         np.array(first, dtype=np.intp),
         chosen,
         owner,
+        groups,
     )
-    chosen = chosen[:kept]
-    groups = np.array([np.logaddexp.reduce(log_weights[owner == k]) for k in range(len(chosen))])
-    return Kept(chosen, owner, groups)
+    return Kept(chosen[:kept], owner, groups[:kept])
 
 
 def distinct_hypotheses(joints: Array, log_weights: Array, same: float) -> Index:
@@ -80,8 +77,6 @@ def distinct_hypotheses(joints: Array, log_weights: Array, same: float) -> Index
         log_weights: (N,).
         same: mean distance below which two hypotheses are one, m.
     """
-
-    def distances(i: int) -> Array:
-        return np.asarray(np.linalg.norm(joints - joints[i], axis=2).mean(1))
-
-    return leaders(log_weights, distances, same)
+    order, kept = np.argsort(-log_weights, kind='stable'), np.empty(len(joints), dtype=np.intp)
+    count = keep_apart(np.ascontiguousarray(joints, dtype=np.float64), order, same, kept)
+    return kept[:count]

@@ -23,11 +23,13 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import ShapeSpace
+from hmt_ros.core import consider_shape, inform_shape
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.residuals import RECORDED
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
+from hmt_ros.inference.linear_algebra import product, solve
 from hmt_ros.tracking.settings import (
     MAX_ANGLE_SHIFT,
     MAX_SHAPE_CHANGE,
@@ -100,26 +102,20 @@ class ShapeEstimate:
             covariances: (K, d, d) inverse Hessians of that energy; on a limit a variable has none.
             trust: tau, share of the image that is believed.
         """
-        size = self._space.size
-        information, pull = np.zeros((size, size)), np.zeros(size)
         linear = self.linearised(likelihood, observation, poses)
-        for k, (weight, gradient, covariance) in enumerate(
-            zip(weights, gradients, covariances, strict=True)
-        ):
-            mixed = linear.mixed[k]
-            shift = self._limited(covariance @ gradient, covariance)
-            information += weight * (linear.curvature[k] - mixed @ (covariance @ mixed.T))
-            pull += weight * (linear.by_shape[k] - mixed @ shift)
-        information = 0.5 * (information + information.T)
+        size, turns = self._space.size, self._space.body.skeleton.dof_is_rotation
+        information, pull = np.empty((size, size)), np.empty(size)
+        modes = (np.ascontiguousarray(x) for x in (weights, gradients, covariances))
+        if not inform_shape(*linear, *modes, turns, MAX_ANGLE_SHIFT, information, pull):
+            raise np.linalg.LinAlgError('the covariance of a mode is singular')
         self._information += trust * information
-        self._vector += trust * (information @ self._taken - pull)
+        self._vector += trust * (product(information, self._taken) - pull)
         self._count += trust
         believed = ERRORS['shape'].together(self._count)
-        after = np.linalg.solve(
-            np.eye(size) + believed * (self._prior @ self._information), self._prior
-        )
+        spread = np.eye(size) + believed * product(self._prior, self._information)
+        after = solve(spread, self._prior)
         self.covariance = 0.5 * (after + after.T)
-        move = believed * (self.covariance @ self._vector) - self._offset
+        move = believed * product(self.covariance, self._vector) - self._offset
         furthest = np.abs(move / self._spread).max()
         move *= MAX_SHAPE_STEP / max(float(furthest), MAX_SHAPE_STEP)
         limit = MAX_SHAPE_CHANGE * self._spread
@@ -141,9 +137,10 @@ class ShapeEstimate:
 
         Arguments as for `update`.
         """
-        moved = covariances @ self.linearised(likelihood, observation, poses).mixed.swapaxes(1, 2)
-        result = moved @ self.covariance @ moved.swapaxes(1, 2)
-        return np.asarray(0.5 * (result + result.swapaxes(1, 2)))
+        mixed = self.linearised(likelihood, observation, poses).mixed
+        result = np.empty(covariances.shape)
+        consider_shape(mixed, np.ascontiguousarray(covariances), self.covariance, result)
+        return result
 
     def linearised(
         self, likelihood: ImageLikelihood, observation: Observation, poses: Array
@@ -166,22 +163,3 @@ class ShapeEstimate:
         found = Linearised(*self._space.second_order(frames, of_flesh, of_joints))
         self._seen, self._known = observation, (poses, found)
         return found
-
-    def _limited(self, shift: Array, covariance: Array) -> Array:
-        """A shift (d,) of a pose whose angles are limited.
-
-        The root goes where it then is best: an image does not tell the size of a person from the
-        distance, and a root that was held back would.
-        """
-        if np.abs(shift).max(initial=0.0) <= MAX_ANGLE_SHIFT:
-            return shift
-        turns = self._space.body.skeleton.dof_is_rotation
-        most = max(float(np.abs(shift[turns]).max()), MAX_ANGLE_SHIFT)
-        excess = shift[turns] * (1.0 - MAX_ANGLE_SHIFT / most)
-        result = shift.copy()
-        result[turns] -= excess
-        # Angles that rest on a limit have no variance.
-        free = turns & (np.diagonal(covariance) > 0)
-        by_turns = np.linalg.solve(covariance[np.ix_(free, free)], excess[free[turns]])
-        result[~turns] -= covariance[np.ix_(~turns, free)] @ by_turns
-        return result

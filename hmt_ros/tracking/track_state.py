@@ -93,7 +93,7 @@ class TrackState:
         """Whether who is in view at a stamp, ns, more likely is not who was seen last."""
         if self.met is None:
             return False
-        return bool(SAME_PERSON.transition(seconds(stamp - self.met))[1, 1] < 0.5)
+        return bool(SAME_PERSON.closed(1.0, seconds(stamp - self.met)) < 0.5)
 
     def reason(self, scene: str, misfit: float) -> str:
         """What is missing where the state is neither tracking nor nobody; '' where nothing is.

@@ -40,10 +40,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hmt_ros.core import elementary, step_chains
 from hmt_ros.image.observation import Beliefs
 from hmt_ros.image.terms.keypoints import EXCHANGED
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.inference.linear_algebra import log_sum_exp, product
 from hmt_ros.inference.markov_chain import MarkovChain, update
 from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SILHOUETTE, Misfit
 from hmt_ros.tracking.settings import (
@@ -67,9 +69,10 @@ AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
 CHAINS = AXES[KEYPOINTS].stop
 # States (2^n, n) of the chains, and validity v in each: groups of a failed detector are invalid.
 STATES = np.array(np.unravel_index(np.arange(2**CHAINS), (2,) * CHAINS)).T
-AXIS_CHAINS = [CHAIN] * CHAINS
-AXIS_CHAINS[DETECTOR] = MarkovChain.of_two(*RATES['detector'])
-VALID = STATES.copy()
+# (n, 2) rates at which each begins and ends.
+AXIS_RATES = np.tile(RATES['track and cues'], (CHAINS, 1))
+AXIS_RATES[DETECTOR] = RATES['detector']
+VALID = STATES.astype(np.float64)
 VALID[:, AXES[KEYPOINTS]] *= STATES[:, [DETECTOR]]
 WITHOUT_SILHOUETTE = (VALID[:, AXES[SILHOUETTE]] == 0).all(1)
 
@@ -91,14 +94,17 @@ class Validity:
     """Probabilities that the cues of one track, and the track, are valid.
 
     Attributes:
-        joint: (2, .., 2) probability of the track, of the detector and of the cues of `AXES`.
+        joint: (2^n,) probability of the states of the track, of the detector and of the cues.
     """
 
     def __init__(self) -> None:
-        usual = np.array([chain.usual for chain in AXIS_CHAINS])
-        of_states = usual[np.arange(CHAINS), STATES]
-        self.joint = of_states.prod(1).reshape((2,) * CHAINS)
+        usual = np.array([MarkovChain.of_two(*rates).usual for rates in AXIS_RATES])
+        self._take(usual[np.arange(CHAINS), STATES].prod(1))
         self._depth = CHAIN.usual
+
+    def _take(self, joint: Array) -> None:
+        self.joint = joint
+        self._chains = np.asarray(product(joint, VALID), dtype=np.float64)
 
     @property
     def track(self) -> float:
@@ -127,9 +133,9 @@ class Validity:
         """Factors on the cues of the next image."""
         cues = self.cues
         silhouette, depth = (float(cues[name][0]) for name in (SILHOUETTE, DEPTH))
-        of_person = self.joint.ravel() * STATES[:, DETECTOR]
+        of_person = self.joint * STATES[:, DETECTOR]
         detector = float(of_person.sum())
-        groups = (of_person @ VALID[:, AXES[KEYPOINTS]]) / detector
+        groups = product(of_person, VALID[:, AXES[KEYPOINTS]]) / detector
         return Beliefs(silhouette, groups * (detector >= 0.5), depth)
 
     @property
@@ -149,13 +155,14 @@ class Validity:
     def predict(self, dt: float) -> None:
         """Goes on by dt seconds, equation (1)."""
         self._depth = CHAIN.predict(self._depth, dt)
-        for axis, chain in enumerate(AXIS_CHAINS):
-            self.joint = np.moveaxis(chain.predict(np.moveaxis(self.joint, axis, -1), dt), -1, axis)
+        joint = self.joint.copy()
+        step_chains(AXIS_RATES, dt, joint)
+        self._take(joint)
 
     def search(self) -> None:
         """The track begins anew: nothing is known of its modes."""
-        of_cues = self.joint.sum(TRACK)
-        self.joint = np.multiply.outer(CHAIN.usual, of_cues)
+        of_cues = self.joint.reshape(2, -1).sum(TRACK)
+        self._take(np.multiply.outer(CHAIN.usual, of_cues).ravel())
 
     def update(
         self, misfits: Mapping[str, Misfit], dt: float, alone: ByKeypoints | None = None
@@ -179,19 +186,15 @@ class Validity:
         of_track[TRACK] = says.get(OUTLINE, np.zeros(1))[0]
         for name in AXES.keys() & says.keys():
             of_track[AXES[name]] = says[name]
-        log_ratios = np.asarray(VALID @ of_track, dtype=np.float64)
+        log_ratios = np.asarray(product(VALID, of_track), dtype=np.float64)
         if alone is not None:
             log_ratios = _divided(of_track, share, alone)
         log_ratios = np.where(VALID[:, TRACK] == 1, log_ratios, 0.0)
-        self.joint = update(self.joint.ravel(), log_ratios).reshape(self.joint.shape)
+        self._take(update(self.joint, log_ratios))
 
     def update_depths(self, share: float, dt: float) -> None:
         """Takes in the share of depths that no pose explains; dt as for `update`."""
         self.update({DEPTH: Misfit(np.array([share]), np.array([VALIDITY_COUNT]))}, dt)
-
-    @property
-    def _chains(self) -> Array:
-        return np.asarray(self.joint.ravel() @ VALID)
 
 
 def _divided(of_track: Array, share: float, alone: ByKeypoints) -> Array:
@@ -205,9 +208,9 @@ def _divided(of_track: Array, share: float, alone: ByKeypoints) -> Array:
     own = of_track.copy()
     for axes in AXES.values():
         own[axes] = np.minimum(own[axes], 0.0)
-    at_modes = VALID @ own
+    at_modes = product(VALID, own)
     own[AXES[KEYPOINTS]] = np.minimum(share * evidence_of(KEYPOINTS, alone.keypoints), 0.0)
-    by_keypoints = VALID @ own + alone.gain
+    by_keypoints = product(VALID, own) + alone.gain
     return np.asarray(np.where(WITHOUT_SILHOUETTE, by_keypoints, at_modes), dtype=np.float64)
 
 
@@ -226,6 +229,7 @@ def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
     return _mixed(PLACED_PROBABILITY, e) - _mixed(1.0 - PLACED_PROBABILITY, e)
 
 
-def _mixed(p: Array | float, evidence: Array) -> Array:
+def _mixed(p: float, evidence: Array) -> Array:
     """log(p exp(e) + 1 - p)."""
-    return np.asarray(np.logaddexp(np.log(p) + evidence, np.log1p(-p)))
+    both = elementary.log(p) + evidence, np.full_like(evidence, elementary.log1p(-p))
+    return np.asarray(log_sum_exp(both, axis=0), dtype=np.float64)

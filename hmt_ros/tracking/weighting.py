@@ -23,12 +23,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from hmt_ros.body.body import Body
+from hmt_ros.core import elementary, rate_histories, rate_transitions
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import log_sum_exp, product
 from hmt_ros.tracking.settings import END_NATS, TRANSITION_SPREAD, TRANSITION_TAILS
+
+
+class Transition(NamedTuple):
+    """Student's density of the mean squared distance of joints, for the core.
+
+    Attributes:
+        variance: by which people leave their prediction meanwhile, m^2.
+        tails: nu.
+    """
+
+    variance: float
+    tails: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,38 +63,40 @@ class Continuity:
     dt: float
 
     @cached_property
-    def _joints(self) -> Array:
-        return self.body.relative_joints(self.predicted)
+    def joints(self) -> Array:
+        """Joints (K, J, 3) of the predicted poses, m."""
+        return self.body.joint_positions(self.predicted)
 
-    def log_transitions(self, poses: Array) -> Array:
-        """log t(x_n, x_k), (K, N), of poses (N, d), equation (3)."""
-        return self._log_transitions(self._joints, self.body.relative_joints(poses))
+    @property
+    def _transition(self) -> Transition:
+        return Transition(TRANSITION_SPREAD * self.dt, TRANSITION_TAILS)
 
-    def _log_transitions(self, first: Array, joints: Array) -> Array:
-        a, b = (x.reshape(len(x), -1) for x in (first, joints))
-        squares = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * a @ b.T
-        ratio = np.maximum(squares, 0.0) / (joints.shape[1] * TRANSITION_SPREAD * self.dt)
-        return np.asarray(-0.5 * TRANSITION_TAILS * np.log1p(ratio / TRANSITION_TAILS))
-
-    def rated(self, poses: Array) -> Array:
-        """log sum_k w_k t(x_n, x_k), (N,), of poses (N, d): how well each alone goes on."""
-        result: Array = np.logaddexp.reduce(
-            self.log_weights[:, None] + self.log_transitions(poses), axis=0
-        )
+    def log_transitions(self, joints: Array) -> Array:
+        """log t(x_n, x_k), (K, N), of poses with joints (N, J, 3), equation (3)."""
+        result = np.empty((len(self.joints), len(joints)))
+        rate_transitions(self.joints, joints, self._transition, result)
         return result
 
-    def log_histories(self, poses: Array) -> Array:
-        """log w_k p(x_n | x_k), (K, N), of all hypotheses (N, d) of an image, equation (2)."""
-        joints = self.body.relative_joints(poses)
-        near = np.logaddexp.reduce(self._log_transitions(joints, joints), axis=0)
-        moves = self._log_transitions(self._joints, joints) - near
-        total = np.logaddexp(np.logaddexp.reduce(moves, axis=1), -END_NATS)
-        return np.asarray((self.log_weights - total)[:, None] + moves)
+    def rated(self, joints: Array) -> Array:
+        """log sum_k w_k t(x_n, x_k), (N,), of poses with joints: how well each alone goes on."""
+        rates = self.log_weights[:, None] + self.log_transitions(joints)
+        return np.asarray(log_sum_exp(rates, axis=0), dtype=np.float64)
+
+    def log_histories(self, joints: Array, transitions: Array) -> Array:
+        """log w_k p(x_n | x_k), (K, N), of all hypotheses of an image, equation (2).
+
+        Args:
+            joints: (N, J, 3) of the hypotheses.
+            transitions: (K, N) log t.
+        """
+        result = np.empty_like(transitions)
+        rate_histories(self.log_weights, transitions, joints, self._transition, END_NATS, result)
+        return result
 
 
 def normalised(log_weights: Array) -> Array:
     """Log weights (N,) whose weights sum to 1."""
-    return np.asarray(log_weights - np.logaddexp.reduce(log_weights), dtype=np.float64)
+    return np.asarray(log_weights - log_sum_exp(log_weights), dtype=np.float64)
 
 
 def at_least(log_weights: Array, least: float) -> Array:
@@ -100,10 +117,7 @@ def pooled_origins(histories: Array, log_weights: Array, owner: Index) -> Array:
         log_weights: (N,).
         owner: (N,) the kept mode that stands for each hypothesis, 0 to M - 1.
     """
-    origins = np.exp(histories - np.logaddexp.reduce(histories, axis=0)).T
-    shares = np.exp(log_weights - log_weights.max())
-    result = np.zeros((int(owner.max()) + 1, len(histories)))
-    total = np.zeros((len(result), 1))
-    np.add.at(result, owner, shares[:, None] * origins)
-    np.add.at(total, owner, shares[:, None])
-    return np.asarray(result / total)
+    origins = elementary.exp(histories - log_sum_exp(histories, axis=0))
+    shares = elementary.exp(log_weights - log_weights.max())
+    member = np.where(owner == np.arange(owner.max() + 1)[:, None], shares, 0.0)
+    return np.asarray(product(member, origins.T) / member.sum(1, keepdims=True))

@@ -54,9 +54,9 @@ def looks(n, seed):
 
 
 def frames_of(rotations, places):
-    columns = rotations.transpose(2, 1, 0)[None]  # (1, axis, coordinate, n)
-    empty = np.empty((0, 3, len(places)))
-    return Frames(HUMAN.skeleton, empty, columns, places.T[None], empty, empty)
+    n = len(places)
+    placed = rotations.swapaxes(1, 2)[:, None].copy(), places[:, None].copy()
+    return Frames(HUMAN.skeleton, np.empty((n, 0)), placed, (np.empty((n, 0, 3)),) * 2)
 
 
 def test_surface_points_satisfy_the_implicit_equation(part):

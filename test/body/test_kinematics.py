@@ -210,8 +210,8 @@ def test_a_pose_moves_no_point_within_its_segment(seed, name):
     [
         (np.zeros(37), r'shape \(N, 37\), saw \(37,\)'),
         (np.zeros((2, 36)), r'shape \(N, 37\), saw \(2, 36\)'),
-        (np.full((1, 37), np.nan), 'must be finite'),
-        (np.full((1, 37), np.inf), 'must be finite'),
+        (np.full((1, 37), np.nan), 'finite'),
+        (np.full((1, 37), np.inf), 'finite'),
     ],
 )
 def test_wrong_poses_are_refused(poses, message):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cached_property
+
 import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
+from hmt_ros.body.skeleton import Skeleton
 
 SKELETON = load_body('human37').skeleton
 
@@ -68,3 +72,17 @@ def test_chains_own_their_degrees_of_freedom_and_joints():
     ]  # fmt: skip
     joints = [SKELETON.joint_names[j] for j in SKELETON.chain_joints['left_arm']]
     assert joints == ['left_shoulder', 'left_elbow', 'left_wrist', 'left_hand']
+
+
+@pytest.mark.parametrize('name', ['human32', 'human37'])
+def test_other_lengths_change_all_that_follows_from_them(name):
+    before = load_body(name).skeleton
+    derived = [key for key, x in vars(Skeleton).items() if isinstance(x, cached_property)]
+    for key in derived:
+        getattr(before, key)
+    lengths = dict(zip(before.length_names, 1.1 * before.lengths, strict=True))
+    after, wanted = before.with_lengths(lengths), replace(before, lengths=1.1 * before.lengths)
+    for key in (*derived, 'lengths', 'mounts'):
+        np.testing.assert_equal(getattr(after, key), getattr(wanted, key))
+    assert not after.lengths.flags.writeable
+    assert not np.array_equal(after.offsets, before.offsets)

@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
 
-from hmt_ros.core import add_band_product, add_diagonal, fill_lower, hold
+from hmt_ros.core import (
+    add_band_product,
+    add_diagonal,
+    factorise_band,
+    fill_lower,
+    hold,
+    multiply_band_transposed,
+    solve_band_lower,
+    solve_band_transposed,
+)
 
 
 def dense(columns):
@@ -43,6 +52,42 @@ def test_held_variables_have_the_rows_of_the_unit_matrix():
 
 
 @pytest.mark.parametrize(
+    ('size', 'width'), [(1, 0), (1, 5), (7, 0), (9, 2), (30, 8), (41, 13), (50, 31), (6, 20)]
+)
+def test_factors_and_solutions_are_those_of_the_dense_matrix(size, width):
+    rng = np.random.default_rng(width)
+    columns = 0.3 * rng.normal(size=(size, width + 1))
+    columns[:, 0] = width + 1.0
+    matrix, x = dense(columns), rng.normal(size=(3, size))
+    beyond = np.add.outer(np.arange(size), np.arange(width + 1)) >= size
+    columns[beyond] = np.nan
+    factor = np.linalg.cholesky(matrix)
+    assert factorise_band(columns) == size
+    assert np.isnan(columns[beyond]).all()
+    np.testing.assert_allclose(np.tril(dense(columns)), factor, rtol=0, atol=1e-13)
+    for function, wanted in (
+        (solve_band_lower, np.linalg.solve(factor, x.T).T),
+        (solve_band_transposed, np.linalg.solve(factor.T, x.T).T),
+        (multiply_band_transposed, x @ factor),
+    ):
+        found = x.copy()
+        function(columns, found)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize('value', [-1.0, 0.0, np.nan, np.inf])
+def test_a_factor_ends_at_the_first_pivot_that_is_none(value):
+    columns = np.zeros((20, 4))
+    columns[:, 0] = 1.0
+    columns[11, 0] = value
+    assert factorise_band(columns) == 11
+    columns = np.zeros((20, 4))
+    columns[:, 0] = 1.0
+    columns[11, 2] = np.nan
+    assert factorise_band(columns) == 13
+
+
+@pytest.mark.parametrize(
     ('function', 'arguments', 'text'),
     [
         (add_diagonal, (np.zeros((4, 2)), np.zeros((2, 2, 3)), 2), 'blocks: wanted shape'),
@@ -57,6 +102,11 @@ def test_held_variables_have_the_rows_of_the_unit_matrix():
         (hold, (np.zeros((4, 2)), np.array([4])), 'held: wanted numbers'),
         (hold, (np.zeros((4, 2)), np.array([-1])), 'held: wanted numbers'),
         (hold, (np.zeros((4, 0)), np.array([0])), 'columns: wanted a diagonal'),
+        (factorise_band, (np.zeros((4, 0)),), 'columns: wanted a diagonal'),
+        (factorise_band, (np.zeros((2, 4)).T,), 'columns: wanted .*contiguous'),
+        (solve_band_lower, (np.ones((4, 2)), np.zeros((2, 3))), 'x: wanted shape'),
+        (solve_band_transposed, (np.ones((4, 2)), np.zeros((4, 2)).T), 'x: wanted .*contiguous'),
+        (multiply_band_transposed, (np.ones((4, 0)), np.zeros((1, 4))), 'columns: wanted a'),
     ],
 )
 def test_what_does_not_fit_is_refused(function, arguments, text):
@@ -69,3 +119,5 @@ def test_nothing_comes_of_nothing():
     add_band_product(np.zeros((3, 0)), np.ones((1, 3)), np.zeros((1, 3)))
     fill_lower(np.zeros((2, 0)), np.ones((0, 2, 2)))
     hold(np.zeros((0, 1)), np.array([], np.int64))
+    assert factorise_band(np.zeros((0, 2))) == 0
+    solve_band_lower(np.ones((3, 2)), np.zeros((0, 3)))

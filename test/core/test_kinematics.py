@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from hmt_ros import core
 from hmt_ros.body import load_body
-from hmt_ros.body.kinematics import placing_of
+from hmt_ros.body.kinematics import forward, joint_positions, placing_of
 from test.core.arguments import assert_arguments_are_checked
 
 SKELETON = load_body('human32').skeleton
@@ -24,14 +25,26 @@ def test_poses_are_placed_with_arguments_that_fit():
     assert_arguments_are_checked(
         core.place_poses, {'tree': tree, 'poses': poses, **frames}, ' '.join(frames)
     )
-    joints = {
-        'joint_segments': SKELETON.joint_segments,
-        'joint_offsets': SKELETON.joint_offsets,
-        'joints': np.zeros((2, J, 3)),
+    points = {
+        'segments': SKELETON.joint_segments,
+        'local': SKELETON.joint_offsets,
+        'relative': False,
+        'points': np.zeros((2, J, 3)),
     }
     assert_arguments_are_checked(
-        core.place_joints, {'tree': tree, 'poses': poses, **joints}, 'joints'
+        core.place_points, {'tree': tree, 'poses': poses, **points}, 'points'
     )
+
+
+@pytest.mark.parametrize('count', [0, 1, 8, 19])
+@pytest.mark.parametrize('turn', [1.0, 1e9])
+def test_poses_side_by_side_are_placed_as_each_alone(count, turn):
+    poses = np.random.default_rng(0).uniform(-3.0, 3.0, (count, D))
+    poses[:, SKELETON.dof_is_rotation] *= turn
+    alone = forward(SKELETON, poses).joints().transpose(2, 0, 1)
+    assert np.array_equal(joint_positions(SKELETON, poses), alone)
+    relative = joint_positions(SKELETON, poses, relative=True)
+    assert np.array_equal(relative, alone - alone[:, :1])
 
 
 def test_derivatives_need_arguments_that_fit():
@@ -50,7 +63,7 @@ def test_derivatives_need_arguments_that_fit():
     lifts = {
         'parents': np.array(SKELETON.parents),
         'basis': SKELETON.offset_basis,
-        'columns': np.ones((S, 3, 3, 2)),
-        'result': np.zeros((S, 3, lengths, 2)),
+        'columns': np.ones((2, S, 3, 3)),
+        'result': np.zeros((2, S, 3, lengths)),
     }
     assert_arguments_are_checked(core.lift_origins, lifts, 'result')

@@ -81,7 +81,7 @@ def test_a_file_holds_it(tmp_path):
 def test_a_file_whose_layers_do_not_fit_is_refused(tmp_path):
     arrays = model().to_arrays()
     arrays['hidden'] = arrays['hidden'][:, :3]
-    with pytest.raises(ValueError, match='matmul'):
+    with pytest.raises(ValueError, match='product'):
         NetworkExperts.from_arrays(arrays)
 
 

@@ -9,13 +9,13 @@ import pytest
 from hmt_learning.rendering.renderer import render, sensed_depth
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
-from hmt_ros.body.flesh import signed_power
 from hmt_ros.body.kinematics import forward
 from hmt_ros.core import ASIDE, BEHIND, COVER, DEPTH_JUMP, FEWEST, LEAST_COSINE
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import observe
 from hmt_ros.image.surface import flesh_table_of
 from hmt_ros.image.terms.depth import DEPTH, usable_depths
+from test.oracles.numpy_contour import signed_power
 from test.oracles.single_terms import image_energy
 
 ALONE = LikelihoodSettings.of_terms(depth=DEPTH.settings)

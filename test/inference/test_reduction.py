@@ -13,8 +13,6 @@ from hmt_ros.inference.reduction import (
     assignment,
     clustered,
     gaussian_divergences,
-    leaders,
-    led,
     merged,
     merged_if_close,
     merged_pairwise,
@@ -135,28 +133,3 @@ def test_determinants_of_pairs_are_those_of_their_moments(rng):
         )
         wanted = [np.linalg.slogdet(mixture[pair].covariance())[1] for pair in pairs]
         np.testing.assert_allclose(found, wanted, atol=1e-12)
-
-
-def test_leaders_are_apart_and_the_heaviest():
-    places = np.array([0.0, 0.1, 1.0, 1.05, 3.0])
-    log_weights = np.log([0.2, 0.3, 0.1, 0.35, 0.05])
-
-    def distances(i):
-        return np.abs(places - places[i])
-
-    assert leaders(log_weights, distances, 0.5).tolist() == [3, 1, 4]
-    assert leaders(log_weights, distances, 0.5, 2).tolist() == [3, 1]
-    assert leaders(log_weights, distances, 0.01).tolist() == [3, 1, 0, 2, 4]
-    # What is chosen already comes first, near to others or not.
-    assert leaders(log_weights, distances, 0.5, 3, [0, 2]).tolist() == [0, 2, 4]
-
-
-def test_what_is_near_a_leader_gives_it_its_weight():
-    weights = np.array([0.2, 0.3, 0.5, 0.0])
-    points = np.zeros((4, 2, 3))
-    points[:, 1, 0] = [0.0, 0.1, 1.0, 2.0]
-    found, chosen = led(weights, points, 0.5, 8)
-    assert chosen.tolist() == [2, 1, 3]
-    np.testing.assert_allclose(found, [0.5, 0.5, 0.0])
-    found, chosen = led(weights, points, 0.5, 1)
-    np.testing.assert_allclose(found, [1.0])

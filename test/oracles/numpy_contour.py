@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.body.flesh import Flesh, Superquadric, signed_power, surfaces
+from hmt_ros.body.flesh import Flesh, Superquadric, surfaces
 from hmt_ros.body.kinematics import Frames
 
 Array = NDArray[np.float64]
@@ -126,5 +126,10 @@ def _bracketed_angles(
 
 def surface(part: Superquadric, s: Array, w: Array) -> tuple[Array, Array]:
     """Points and normals (R, 3) of a part at heights s (R,) and angles w (R,)."""
-    points, normals = surfaces((part,), s, w)
-    return points[0], normals[0]
+    points, normals = surfaces(Flesh((part,)).table, s, w)
+    return points[0, :-2], normals[0, :-2]
+
+
+def signed_power(x: Array, exponent: Array | float) -> Array:
+    """sgn(x) |x|^exponent."""
+    return np.asarray(np.sign(x) * np.abs(x) ** exponent)

@@ -238,7 +238,9 @@ def visibility(body: Body, frames: Frames, points: Array, parts: Index) -> tuple
     mk = np.einsum('nbip,nbi->nbp', m, k)
     discriminant = mk * mk - mm * ((k * k).sum(2) - 1.0)[:, :, None]
     through = (discriminant > 0) & (np.arange(count)[:, None] != parts)
-    before = through & (mk - np.sqrt(np.maximum(discriminant, 0.0)) < (1.0 - BEHIND) * mm)
+    root = np.sqrt(np.maximum(discriminant, 0.0))
+    through &= mk + root > 0.0  # what is behind the camera covers nothing
+    before = through & (mk - root < (1.0 - BEHIND) * mm)
     return through.any(1).T, before.any(1).T
 
 

@@ -22,6 +22,7 @@ from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.prediction import dynamics_of, predicted_states
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
+from hmt_ros.tracking.weighting import Continuity
 
 FRAME = 100_000_000  # ns
 UP = np.array([0.0, -1.0, 0.0])
@@ -170,7 +171,8 @@ def test_ways_to_face_are_carried(body):
     heading = body.dof_names.index('root_z')
     poses[:, heading] += np.radians([30.0, 210.0, -30.0])
     odds = np.array([3.0, -3.0, 3.0])
-    modes = replace(modes_of(body, poses), back=ways(body, poses, poses[0]), facing=odds)
+    joints = body.joint_positions(poses)
+    modes = replace(modes_of(body, poses), back=ways(body, joints, joints[0]), facing=odds)
     assert modes.back.tolist() == [False, True, False]
     for degrees, back in ((90.0, [False, True, True]), (20.0, [False, True, False])):
         # Around the person: from the side one of two who faced the camera turns the back.
@@ -186,11 +188,12 @@ def test_ways_to_face_are_carried(body):
         for some in (modes[:2], carried[:2]):
             nothing = np.zeros(2)
             transitions = np.full((2, 2), -20.0)
+            continuity = Continuity(body, some.poses, nothing, 0.1)
             found.append(
                 weigh_ways(
-                    body, some, some.poses, some.poses, transitions, nothing, nothing,
-                    np.ones(2, dtype=np.bool_), 0.1,
-                )
+                    some, continuity, continuity.joints, transitions, nothing, nothing,
+                    np.ones(2, dtype=np.bool_),
+                )[:2]
             )  # fmt: skip
         np.testing.assert_allclose(found[1], found[0])
         assert 2.0 < found[0][0][0] - found[0][0][1] < 3.0

@@ -16,12 +16,8 @@ from hmt_ros.body.mirror import (
     root_rotation_dofs,
     root_rotations,
 )
-from hmt_ros.tracking.classes import (
-    believed,
-    first_facing,
-    ways,
-    weigh_ways,
-)
+from hmt_ros.core import believed
+from hmt_ros.tracking.classes import first_facing, ways, weigh_ways
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.settings import FACING_VALID, MAX_FACING_NATS
 from hmt_ros.tracking.weighting import Continuity
@@ -69,16 +65,18 @@ def weigh(human32, both):
 
 def weighed(body, modes, predicted, poses, transitions, before, evidence, followed, dt):
     """Log weights of poses, and the poses as modes."""
-    log_weights, facing = weigh_ways(
-        body, modes, predicted, poses, transitions, before, np.asarray(evidence, dtype=float),
-        np.asarray(followed), dt,
+    continuity = Continuity(body, predicted, np.zeros(len(modes)), dt)
+    log_weights, facing, _ = weigh_ways(
+        modes, continuity, body.joint_positions(poses), transitions, before,
+        np.asarray(evidence, dtype=float), np.asarray(followed),
     )  # fmt: skip
     return log_weights, begun(body, poses, facing)
 
 
 def begun(body, poses, facing=None, log_odds=-MAX_FACING_NATS):
     """Modes, the first of which leads; log odds that the person faces the other way."""
-    back = ways(body, poses, poses[0])
+    joints = body.joint_positions(poses)
+    back = ways(body, joints, joints[0])
     if facing is None:
         facing = np.where(back, log_odds, -log_odds)
     return replace(Modes.blank(*poses.shape), poses=poses, back=back, facing=facing)
@@ -115,7 +113,9 @@ def test_evidence_that_lasts_turns_the_track_about(human32, both, weigh):
 def test_one_image_does_not_turn_the_track_about(human32, both, weigh):
     log_weights, modes = weigh(begun(human32, both, log_odds=-4.0), [22.0, 20.0])
     assert log_weights[0] > log_weights[1] + 1.0
-    assert log_odds_of(modes) == pytest.approx(REVERSALS.after(-4.0, DT) + believed(2.0))
+    assert log_odds_of(modes) == pytest.approx(
+        REVERSALS.after(-4.0, DT) + believed(2.0, FACING_VALID)
+    )
 
 
 def test_hypotheses_that_were_not_followed_are_no_evidence(human32, both, weigh):
@@ -132,10 +132,10 @@ def test_one_image_says_only_as_much_as_it_may_be_believed():
             (FACING_VALID * ratio + 1.0 - FACING_VALID)
             / (FACING_VALID + (1.0 - FACING_VALID) * ratio)
         )
-        assert believed(evidence) == pytest.approx(wanted)
-        assert believed(-evidence) == pytest.approx(-believed(evidence))
-    assert believed(1e6) == pytest.approx(logit(FACING_VALID))
-    assert believed(-np.inf) == pytest.approx(-logit(FACING_VALID))
+        assert believed(evidence, FACING_VALID) == pytest.approx(wanted)
+        assert believed(-evidence, FACING_VALID) == pytest.approx(-believed(evidence, FACING_VALID))
+    assert believed(1e6, FACING_VALID) == pytest.approx(logit(FACING_VALID))
+    assert believed(-np.inf, FACING_VALID) == pytest.approx(-logit(FACING_VALID))
 
 
 def test_seen_from_the_side_either_way_may_go_on(human32, both):
@@ -153,13 +153,17 @@ def test_a_person_who_turns_away_leads_the_track_along(human32, both, turned):
     side = next(
         a
         for a in np.arange(0.0, np.pi, 0.01)
-        if faces_back(human32, turned(both[0], a + step), turned(both[0], a)[0])[0]
+        if faces_back(
+            human32,
+            human32.joint_positions(turned(both[0], a + step)),
+            human32.joint_positions(turned(both[0], a))[0],
+        )[0]
     )
     before = turned(both[0], side)
     first = begun(human32, before, log_odds=-8.0)
     poses = np.concatenate([before, turned(both[0], side + step)])
     continuity = Continuity(human32, before, np.zeros(1), 1.0)
-    transitions = continuity.log_transitions(poses)
+    transitions = continuity.log_transitions(human32.joint_positions(poses))
     assert transitions[0, 1] > -0.5
     log_weights, _ = weighed(
         human32, first, before, poses, transitions, np.zeros(2), [3.0, 0.0], KNOWN, 1.0
@@ -173,10 +177,11 @@ def test_a_person_who_turns_away_leads_the_track_along(human32, both, turned):
 
 
 def test_a_start_says_which_way(human32, both):
-    facing = first_facing(human32, both, np.log([0.8, 0.2]))
+    joints = human32.joint_positions(both)
+    facing = first_facing(human32, joints, np.log([0.8, 0.2]))
     assert facing == pytest.approx(np.log([4.0, 0.25]))
-    assert first_facing(human32, both[:1], np.zeros(1)) == pytest.approx([MAX_FACING_NATS])
-    assert first_facing(human32, both, np.array([0.0, -1e9])) == pytest.approx(
+    assert first_facing(human32, joints[:1], np.zeros(1)) == pytest.approx([MAX_FACING_NATS])
+    assert first_facing(human32, joints, np.array([0.0, -1e9])) == pytest.approx(
         [MAX_FACING_NATS, -MAX_FACING_NATS]
     )
 
@@ -184,6 +189,9 @@ def test_a_start_says_which_way(human32, both):
 def test_a_body_without_a_trunk_is_left_alone(both):
     class Trunkless:
         trunk_pairs = ()
+
+        def joint_positions(self, poses):
+            return np.zeros((len(poses), 1, 3))
 
     modes = begun(Trunkless(), both, first_facing(Trunkless(), both, np.zeros(2)))
     before = np.log([0.2, 0.8])

@@ -67,16 +67,18 @@ def test_directions_to_the_left(human32, motion):
 
 def test_the_reversal_in_depth_faces_the_other_way(human32, motion):
     both = np.concatenate([motion, reverse_depth(human32, motion)])
-    back = faces_back(human32, both, motion[0])
+    joints = human32.joint_positions(both)
+    back = faces_back(human32, joints, joints[0])
     assert not back[: len(motion)].any()
     assert back[len(motion) :].all()
 
 
 def ways(body, posteriors, poses):
     """Of each posterior the weight of the modes that face as the person does."""
+    true = body.joint_positions(poses[: len(posteriors)])
     return [
-        float(p.weights[~faces_back(body, p.means, pose)].sum())
-        for p, pose in zip(posteriors, poses)
+        float(p.weights[~faces_back(body, body.joint_positions(p.means), joints)].sum())
+        for p, joints in zip(posteriors, true)
     ]
 
 

@@ -163,7 +163,7 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     energy = PoseEnergy(of_keypoints, terms).energy(posterior.means)
     gradient, hessian = energy.derivatives()
     free = ~resting(posterior.means, gradient, human32.lower, human32.upper)
-    volumes = np.sqrt(np.linalg.det(1e3 * free_covariances(hessian, free)))
+    volumes = np.sqrt(np.linalg.det(1e3 * free_covariances(hessian[:, None], free)[0]))
     weights = volumes * np.exp(energy.value.min() - energy.value)
     order = np.argsort(-weights, kind='stable')
     assert np.allclose(likelihood.weights, (weights / weights.sum())[order], rtol=1e-9)

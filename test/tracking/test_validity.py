@@ -22,6 +22,7 @@ from hmt_ros.tracking.settings import (
 )
 from hmt_ros.tracking.validity import (
     CHAIN,
+    CHAINS,
     DEPTH,
     DETECTOR,
     UNDECIDED,
@@ -206,7 +207,8 @@ def test_keypoints_that_leave_the_person_are_doubted():
 def test_the_pose_by_keypoints_stands_for_the_states_without_the_silhouette(gain):
     """Enumerated: silhouette and one group of keypoints, at the modes and by keypoints alone."""
     validity, dt = Validity(), 0.1
-    before, share = validity.joint.copy(), share_of_time(dt, MISFIT_TIME)
+    before = validity.joint.reshape((2,) * CHAINS).copy()
+    share = share_of_time(dt, MISFIT_TIME)
     none = Misfit(np.zeros(3), np.array([0, 4, 0]))
     groups = Misfit(np.array([0.0, 0.9, 0.0]), np.array([0, 4, 0]))
     at_modes = share * evidence_of(KEYPOINTS, groups)[1]
@@ -217,7 +219,7 @@ def test_the_pose_by_keypoints_stands_for_the_states_without_the_silhouette(gain
         # What either pose explains does not count, as it was led there.
         wanted = at_modes * group if silhouette else gain
         before[v] *= np.exp(wanted if track else 0.0)
-    np.testing.assert_allclose(validity.joint, before / before.sum(), atol=1e-12)
+    np.testing.assert_allclose(validity.joint, before.ravel() / before.sum(), atol=1e-12)
 
 
 def test_nothing_measured_says_nothing():

@@ -46,16 +46,22 @@ def transition(body, pose, expected, all_poses, dt):
     return share(pose) / (sum(share(x) for x in all_poses) + np.exp(-END_NATS))
 
 
+def log_histories(continuity, poses):
+    """log w_k p(x_n | x_k), (K, N)."""
+    joints = continuity.body.joint_positions(poses)
+    return continuity.log_histories(joints, continuity.log_transitions(joints))
+
+
 def log_priors(continuity, poses):
     """log sum_k w_k p(x_n | x_k), (N,)."""
-    histories = continuity.log_histories(poses)
-    return np.logaddexp.reduce(histories, axis=0)
+    return np.logaddexp.reduce(log_histories(continuity, poses), axis=0)
 
 
 @pytest.mark.parametrize('dt', [0.01, 0.1, 3.0])
 def test_transitions_are_a_student_density_of_the_joints(human32, poses_near, dt):
     before, poses = poses_near(3, 1), poses_near(5, 2, 0.3)
-    found = Continuity(human32, before, np.zeros(3), dt).log_transitions(poses)
+    joints = human32.joint_positions(poses)
+    found = Continuity(human32, before, np.zeros(3), dt).log_transitions(joints)
     wanted = [[log_transition(human32, x, b, dt) for x in poses] for b in before]
     assert found == pytest.approx(np.array(wanted), abs=1e-9)
 
@@ -118,7 +124,7 @@ def test_copies_of_a_continuation_do_not_multiply_the_mass_of_a_mode(human32, po
     assert weights[0] == pytest.approx(0.7, rel=0.02)
     assert weights[1:].sum() == pytest.approx(0.3, rel=0.1)
     # Each alone would have as much as the mode itself.
-    assert np.exp(continuity.rated(near)) == pytest.approx(0.3, rel=0.1)
+    assert np.exp(continuity.rated(human32.joint_positions(near))) == pytest.approx(0.3, rel=0.1)
 
 
 def test_copies_of_a_motion_draw_no_weight_from_another(human32, poses_near):
@@ -134,7 +140,7 @@ def test_copies_of_a_motion_draw_no_weight_from_another(human32, poses_near):
         weights = np.exp(normalised(log_priors(continuity, poses)))
     assert weights[0] == pytest.approx(0.5, abs=0.1)
     # There is a way from the one to the other.
-    ways = np.exp(continuity.log_histories(poses) - np.log(weights)[:, None])
+    ways = np.exp(log_histories(continuity, poses) - np.log(weights)[:, None])
     assert ways[0, 1:].sum() > 0.01
 
 
@@ -142,7 +148,8 @@ def test_copies_of_a_motion_draw_no_weight_from_another(human32, poses_near):
 def test_gaps_of_any_length_give_finite_numbers(human32, poses_near, dt):
     before, poses = poses_near(3, 1), poses_near(4, 2, 1.0)
     continuity = Continuity(human32, before, np.log([0.9, 0.1, 1e-6]), dt)
-    for found in (log_priors(continuity, poses), continuity.rated(poses)):
+    rated = continuity.rated(human32.joint_positions(poses))
+    for found in (log_priors(continuity, poses), rated):
         assert np.isfinite(found).all()
     if dt > 1.0:
         # After so long every pose goes on from every mode alike.

@@ -30,7 +30,7 @@ from hmt_ros.sessions.transform_buffer import TF_STATIC
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 
 # Long limits, which end a replay that hangs. The end of a node is noticed at once.
-START_SECONDS = 600.0  # kernels may have to be compiled first
+START_SECONDS = 600.0
 MESSAGE_SECONDS = 120.0
 STOP_SECONDS = 20.0
 STALE_SECONDS = 3600.0

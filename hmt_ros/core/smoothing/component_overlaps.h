@@ -7,7 +7,8 @@
 // component no longer counts.
 #pragma once
 
-#include "../fused_products.h"
+#include "../lanes.h"
+#include "../wide.h"
 
 namespace hmt {
 
@@ -45,7 +46,7 @@ inline constexpr Index overlap_stride = 32;  // columns between looks at whether
 // log_density, gradient: (S,), (S, D) log q and its gradient by the sample, written.
 // mean_gradient, inflation_gradient, weight_gradient: (M, D), (M,), (M,); the derivatives of the
 // sum of log q by means, log s and log a at fixed samples are added.
-HMT_FUSED inline void add_component_overlaps(
+HMT_WIDE inline void add_component_overlaps(
     Index own, const Table& samples, const Table& noise, const Numbers& log_weights,
     const Numbers& log_scales, const Table& means, const Numbers& inflation, const Tables& bands,
     const Mask& near, const Places& begin, bool derivatives, double share,

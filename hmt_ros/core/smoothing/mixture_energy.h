@@ -1,7 +1,8 @@
 // -log of mixtures p(r_t | x) = sum_k w_k N(x; m_k, S_k); see hmt_ros/smoothing/likelihood.py.
 #pragma once
 
-#include "../fused_products.h"
+#include "../lanes.h"
+#include "../wide.h"
 
 namespace hmt {
 
@@ -11,12 +12,12 @@ inline constexpr double negligible_mode = 60.0;
 // Writes value (N,), gradient (N, d) and, if `second`, Hessian (N, d, d) at poses (N, d) of times
 // (N,); with `exact` the Hessian has its negative part. The modes of time t are first[t] up to
 // first[t + 1]; log_scales (K,), means (K, d), whiteners and precisions (K, d, d).
-HMT_FUSED inline void add_mixture_energy(const Table& poses, const Places& times,
-                                         const Places& first, const Numbers& log_scales,
-                                         const Table& means, const Tables& whiteners,
-                                         const Tables& precisions, bool second, bool exact,
-                                         const Vector& value, const Matrix& gradient,
-                                         const Tensor& hessian) {
+HMT_WIDE inline void add_mixture_energy(const Table& poses, const Places& times,
+                                        const Places& first, const Numbers& log_scales,
+                                        const Table& means, const Tables& whiteners,
+                                        const Tables& precisions, bool second, bool exact,
+                                        const Vector& value, const Matrix& gradient,
+                                        const Tensor& hessian) {
   const Index poses_count = poses.size(), d = poses.size(1), modes = means.size();
   expect_shape("times", times, {poses_count});
   expect_range("times", times, 0, first.size() - 1);

@@ -8,7 +8,6 @@
 #pragma once
 
 #include "../pose_view.h"
-#include "../wide.h"
 
 namespace hmt {
 
@@ -49,86 +48,82 @@ struct CoverageInputs {
 };
 
 // The points of a contour that no other part covers; all that exist where it is covered everywhere.
-inline Index matched_points(const Contour& contour, const Array<Index, 1>& use) {
+inline Index matched_points(const Contour& contour, Index* use) {
   Index used = 0;
-  for (Index i = 0; i < contour.count(); ++i) {
-    if (contour.valid[i] && !contour.covered[i]) use[used++] = i;
+  for (Index i = 0; i < contour.count; ++i) {
+    use[used] = i;
+    used += contour.valid[i] > contour.covered[i];
   }
   if (used > 0) return used;
-  for (Index i = 0; i < contour.count(); ++i) {
-    if (contour.valid[i]) use[used++] = i;
+  for (Index i = 0; i < contour.count; ++i) {
+    use[used] = i;
+    used += contour.valid[i] > 0.0;
   }
   return used;
 }
 
-// So many samples are matched at once.
-inline constexpr Index lanes = 8;
-using Lanes [[gnu::vector_size(lanes * sizeof(float))]] = float;
-using WholeLanes [[gnu::vector_size(lanes * sizeof(std::int32_t))]] = std::int32_t;
-
-// Samples of the outline, or points of the contour as they are matched: pixel and scaled normal.
-struct Matched {
-  Lanes u, v, nu, nv;
-};
-
-// For each of the samples the nearest of so many points (4,): pixel and scaled normal.
-HMT_WIDE inline void find_nearest(const float* points, Index number, const Matched* samples,
-                                  Index blocks, WholeLanes* nearest) {
-  for (Index block = 0; block < blocks; ++block) {
-    const Matched own = samples[block];
-    Lanes least_gap = Lanes{} + std::numeric_limits<float>::infinity();
-    WholeLanes found{};
+// For so many samples (4, M), whole lanes, the place in `use` of the nearest point (4,): pixel and
+// scaled normal.
+inline void find_nearest(const float* points, Index number, const float* samples, Index count,
+                         std::int32_t* nearest) {
+  constexpr Index together = 2 * lanes;
+  for (Index first = 0; first < count; first += together) {
+    const float *us = samples + first, *vs = us + count, *nus = vs + count, *nvs = nus + count;
+    float gaps[together];
+    std::int32_t found[together] = {};
+    std::fill_n(gaps, together, std::numeric_limits<float>::infinity());
     for (Index i = 0; i < number; ++i) {
-      const float* point = points + 4 * i;
-      const Lanes du = point[0] - own.u, dv = point[1] - own.v;
-      const Lanes dnu = point[2] - own.nu, dnv = point[3] - own.nv;
-      const Lanes gap = du * du + dv * dv + dnu * dnu + dnv * dnv;
-      const WholeLanes closer = gap < least_gap;
-      least_gap = closer ? gap : least_gap;
-      found = closer ? WholeLanes{} + static_cast<std::int32_t>(i) : found;
+      const float *point = points + 4 * i, u = point[0], v = point[1], nu = point[2], nv = point[3];
+      const std::int32_t own = static_cast<std::int32_t>(i);
+#pragma omp simd
+      for (Index k = 0; k < together; ++k) {
+        const float du = u - us[k], dv = v - vs[k], dnu = nu - nus[k], dnv = nv - nvs[k];
+        const float gap = du * du + dv * dv + dnu * dnu + dnv * dnv;
+        found[k] = gap < gaps[k] ? own : found[k];
+        gaps[k] = gap < gaps[k] ? gap : gaps[k];
+      }
     }
-    nearest[block] = found;
+    std::copy(found, found + together, nearest + first);
   }
 }
 
-// For each sample the point of the contour, one of `use`, that is nearest and points its way.
-inline void match_outline(const Outline& outline, const Contour& contour, const Places& use,
-                          const Array<std::int32_t, 1>& nearest) {
+// For each sample the point of the contour that is nearest and points its way; there is one.
+inline void match_outline(const Outline& outline, const Contour& contour, const Index* use,
+                          Index used, Index* nearest) {
   constexpr float turn = static_cast<float>(outline_turn);
-  const Index count = outline.count(), blocks = (count + lanes - 1) / lanes;
-  Scratch<Matched, 1> samples(blocks);
-  Scratch<WholeLanes, 1> found(blocks);
-  Scratch<float, 2> points(use.size(), 4);
+  const Index count = outline.count(), whole = (count + 2 * lanes - 1) / (2 * lanes) * 2 * lanes;
+  Scratch<float, 1> room(4 * (whole + used));
+  Scratch<std::int32_t, 1> found(whole);
+  float *samples = room.view().data, *points = samples + 4 * whole;
   for (Index m = 0; m < count; ++m) {
-    Matched& own = samples[m / lanes];
-    own.u[m % lanes] = static_cast<float>(outline.pixels(m, 0));
-    own.v[m % lanes] = static_cast<float>(outline.pixels(m, 1));
-    own.nu[m % lanes] = turn * static_cast<float>(outline.normals(m, 0));
-    own.nv[m % lanes] = turn * static_cast<float>(outline.normals(m, 1));
-  }
-  for (Index a = 0; a < use.size(); ++a) {
     for (int k = 0; k < 2; ++k) {
-      points(a, k) = static_cast<float>(contour.pixels(use[a], k));
-      points(a, 2 + k) = static_cast<float>(outline_turn * contour.normals(use[a], k));
+      samples[k * whole + m] = static_cast<float>(outline.pixels(m, k));
+      samples[(2 + k) * whole + m] = turn * static_cast<float>(outline.normals(m, k));
     }
   }
-  find_nearest(points[0].data, use.size(), samples.view().data, blocks, found.view().data);
-  for (Index m = 0; m < count; ++m) {
-    nearest[m] = static_cast<std::int32_t>(use[found[m / lanes][m % lanes]]);
+  for (Index a = 0; a < used; ++a) {
+    const Index i = use[a];
+    points[4 * a] = static_cast<float>(contour.u[i]);
+    points[4 * a + 1] = static_cast<float>(contour.v[i]);
+    points[4 * a + 2] = static_cast<float>(outline_turn * contour.nu[i]);
+    points[4 * a + 3] = static_cast<float>(outline_turn * contour.nv[i]);
   }
+  find_nearest(points, used, samples, whole, found.view().data);
+  for (Index m = 0; m < count; ++m) nearest[m] = use[found[m]];
 }
 
 // Adds the residuals of the pose in a view, returns its energy.
-inline double add_term(const PoseView& view, const CoverageInputs& inputs, const Sums& sums) {
+HMT_WIDE inline double add_term(const PoseView& view, const CoverageInputs& inputs,
+                                const Sums& sums) {
   const Weighting& term = inputs.term;
   const Outline& outline = inputs.outline;
   const Contour& contour = view.contour;
-  const Index count = outline.count();
-  const double share = term.weight / double(count);
+  const Index count = outline.count(), whole = in_whole_lanes(count);
+  const double share = term.weight / double(count), per_scale = 1.0 / (term.scale * term.scale);
   const double* explained = inputs.explained[inputs.explained.size() > 1 ? view.number : 0].data;
   double* costs = inputs.costs[view.number].data;
-  Scratch<Index, 1> use(contour.count());
-  const Index used = matched_points(contour, use);
+  Scratch<Index, 1> use(contour.count + 1), nearest(count);
+  const Index used = matched_points(contour, use.view().data);
   double energy = 0.0;
   if (used == 0) {
     for (Index m = 0; m < count; ++m) {
@@ -137,41 +132,42 @@ inline double add_term(const PoseView& view, const CoverageInputs& inputs, const
     }
     return energy;
   }
-  Scratch<std::int32_t, 1> nearest(count);
-  match_outline(outline, contour, use.view().rows(0, used), nearest);
-  Scratch<double, 1> inverse(contour.count()), across(count), beyond(count);
-  for (Index i = 0; i < contour.count(); ++i) {
-    inverse[i] = 1.0 / contour_sigma(term, contour.noise[i]);
-  }
-  const double per_scale = 1.0 / (term.scale * term.scale);
+  match_outline(outline, contour, use.view().data, used, nearest.view().data);
+  const Matrix rows = view.rows(8, whole);
+  rows.fill(0.0);
+  double *du = rows[0].data, *dv = rows[1].data, *nx = rows[2].data, *ny = rows[3].data;
+  double *inverse = rows[4].data, *across = rows[5].data, *beyond = rows[6].data;
+  double* value = rows[7].data;
   for (Index m = 0; m < count; ++m) {
     const Index i = nearest[m];
-    const double du = contour.pixels(i, 0) - outline.pixels(m, 0);
-    const double dv = contour.pixels(i, 1) - outline.pixels(m, 1);
-    const double nx = outline.normals(m, 0), ny = outline.normals(m, 1);
-    const double along = nx * dv - ny * du;
-    across[m] = (nx * du + ny * dv) * inverse[i];
-    beyond[m] = (along - between(along, -outline_spacing, outline_spacing)) * inverse[i];
-    const double squared = across[m] * across[m] + beyond[m] * beyond[m];
-    const double rho = 0.5 * share * outline.beliefs[m] * squared / (1.0 + squared * per_scale);
-    costs[m] = least(rho, explained[m]);
-    energy += costs[m];
+    du[m] = contour.u[i] - outline.pixels(m, 0);
+    dv[m] = contour.v[i] - outline.pixels(m, 1);
+    nx[m] = outline.normals(m, 0);
+    ny[m] = outline.normals(m, 1);
+    inverse[m] = contour.noise[i];
   }
+#pragma omp simd
+  for (Index m = 0; m < whole; ++m) {
+    inverse[m] = 1.0 / contour_sigma(term, inverse[m]);
+    const double along = nx[m] * dv[m] - ny[m] * du[m];
+    across[m] = (nx[m] * du[m] + ny[m] * dv[m]) * inverse[m];
+    beyond[m] = (along - between(along, -outline_spacing, outline_spacing)) * inverse[m];
+    const double squared = across[m] * across[m] + beyond[m] * beyond[m];
+    value[m] = squared / (1.0 + squared * per_scale);
+  }
+  for (Index m = 0; m < count; ++m) {
+    value[m] = costs[m] = least(0.5 * share * outline.beliefs[m] * value[m], explained[m]);
+  }
+  energy = sum_of(value, whole);
   if (!sums.wanted()) return energy;
   for (Index m = 0; m < count; ++m) {
+    if (!(costs[m] < explained[m])) continue;
     const double squared = across[m] * across[m] + beyond[m] * beyond[m];
-    const Robust robust = geman_mcclure(std::sqrt(squared), term.scale, share * outline.beliefs[m]);
-    if (robust.value >= explained[m]) continue;
-    const Index i = nearest[m], segment = view.owner(contour.parts[i]);
-    const double *p = contour.points[i].data, *j = contour.projections[i].data;
-    const double k = robust.curvature;
-    const double nx = outline.normals(m, 0) * inverse[i], ny = outline.normals(m, 1) * inverse[i];
-    const Gradient a = by_point(nx, ny, j);
-    sums.add(segment, p, a.x, a.y, a.z, k * across[m], k);
-    if (beyond[m] != 0.0) {
-      sums.add(segment, p, nx * j[3] - ny * j[0], nx * j[4] - ny * j[1], nx * j[5] - ny * j[2],
-               k * beyond[m], k);
-    }
+    const double shrink = 1.0 / (1.0 + squared * per_scale);
+    const double k = share * outline.beliefs[m] * shrink * shrink;
+    const double gu = nx[m] * inverse[m], gv = ny[m] * inverse[m];
+    view.add(nearest[m], gu, gv, k * across[m], k, sums);
+    if (beyond[m] != 0.0) view.add(nearest[m], -gv, gu, k * beyond[m], k, sums);
   }
   return energy;
 }

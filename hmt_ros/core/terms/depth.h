@@ -54,42 +54,34 @@ inline Sample sample_depth(const ImageMap& map, double u, double v) {
 // Fills in the points of the pose in a view that face the camera, two on each ring; their noise
 // becomes that along the ray.
 inline void trace_front(const PoseView& view, const Contour& front) {
-  const FleshTable& flesh = view.model.flesh;
-  const Index rings = flesh.rings();
-  for (Index r = 0; r < rings; ++r) {
-    const Index part = flesh.ring_parts[r];
-    front.parts[r] = front.parts[r + rings] = part;
-    front.valid[r] = front.valid[r + rings] = false;
-    if (!view.model.traced[part]) continue;
-    const Ring ring = flesh.ring(r);
-    const Index s = view.owner(part);
-    const double *axes = view.columns[s].data, *origin = view.origins[s].data;
-    double seen[3];
-    ring_seen(ring, axes, origin, seen);
-    double fx = -(seen[0] - seen[2] * ring.leans[0]) / ring.radii[0];
-    double fy = -(seen[1] - seen[2] * ring.leans[1]) / ring.radii[1];
-    const double size = most(std::sqrt(fx * fx + fy * fy), 1e-12);
-    fx = fx / size;
-    fy = fy / size;
-    for (int side = 0; side < 2; ++side) {
-      const Index i = r + side * rings;
-      const double turn = side == 0 ? -aside_sine : aside_sine;
-      const double c = fx * aside_cosine - fy * turn, sn = fy * aside_cosine + fx * turn;
-      double *p = front.points[i].data, n[3];
-      ring_point(ring, c, sn, axes, origin, p, n);
-      const double sizes = std::sqrt((n[0] * n[0] + n[1] * n[1] + n[2] * n[2]) *
-                                     (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]));
-      const double cosine = -(n[0] * p[0] + n[1] * p[1] + n[2] * p[2]) / most(sizes, 1e-12);
-      front.noise[i] = ring_deviation(ring, c, sn) / cosine;
-      front.valid[i] =
-          cosine > least_cosine && project(view.model.lens, p[0], p[1], p[2], front.pixels[i].data,
-                                           front.projections[i].data);
-    }
+  const Index n = view.rings.count();
+  const double c = aside_cosine, s = aside_sine;
+#pragma omp simd
+  for (Index i = 0; i < n; ++i) {
+    const Turned turned = turned_ring(view.rings, view.frames_of_rings, i);
+    const double size = most(std::sqrt(turned.x * turned.x + turned.y * turned.y), 1e-12);
+    const double fx = -turned.x / size, fy = -turned.y / size;
+    front.cosine[i] = fx * c + fy * s;
+    front.sine[i] = fy * c - fx * s;
+    front.cosine[n + i] = fx * c - fy * s;
+    front.sine[n + i] = fy * c + fx * s;
+    front.valid[i] = front.valid[n + i] = view.rings.traced()[i];
+  }
+  place_on_rings(view.rings, view.frames_of_rings, front);
+  project_points(view.model.lens, front);
+#pragma omp simd
+  for (Index i = 0; i < front.count; ++i) {
+    const double x = front.x[i], y = front.y[i], z = front.z[i];
+    const double nx = front.nx[i], ny = front.ny[i], nz = front.nz[i];
+    const double sizes = std::sqrt((nx * nx + ny * ny + nz * nz) * (x * x + y * y + z * z));
+    const double cosine = -(nx * x + ny * y + nz * z) / most(sizes, 1e-12);
+    front.noise[i] /= cosine;
+    front.valid[i] = cosine > least_cosine ? front.valid[i] : 0.0;
   }
 }
 
 // Adds the residuals of the pose in a view, returns its energy.
-inline double add_term(const PoseView& view, const DepthInputs& inputs, const Sums& sums) {
+HMT_WIDE inline double add_term(const PoseView& view, const DepthInputs& inputs, const Sums& sums) {
   const Weighting& term = inputs.term;
   const Contour& front = view.front;
   trace_front(view, front);
@@ -97,22 +89,22 @@ inline double add_term(const PoseView& view, const DepthInputs& inputs, const Su
   const double each = weight_of_each(term.weight, view.model.contour_points * 5 / 10, front);
   const double unknown = geman_mcclure(1.0, term.scale, each).value;
   double energy = 0.0;
-  for (Index i = 0; i < front.count(); ++i) {
-    if (!front.valid[i] || front.hidden[i]) continue;
-    const Sample depth = sample_depth(inputs.depths, front.pixels(i, 0), front.pixels(i, 1));
+  for (Index i = 0; i < front.count; ++i) {
+    if (!front.shows(i)) continue;
+    const Sample depth = sample_depth(inputs.depths, front.u[i], front.v[i]);
     if (depth.value <= 0.0) {
       energy += unknown;
       continue;
     }
-    const double *p = front.points[i].data, noise = front.noise[i];
-    const double own = term.growth * depth.value * depth.value;
+    const double noise = front.noise[i], own = term.growth * depth.value * depth.value;
     const double inverse = 1.0 / std::sqrt(term.sigma * term.sigma + own * own + noise * noise);
-    const double error = (depth.value - p[2]) * inverse;
-    const Robust robust = geman_mcclure(error, term.scale, each);
+    const Robust robust = geman_mcclure((depth.value - front.z[i]) * inverse, term.scale, each);
     energy += robust.value;
-    const Gradient a = by_point(depth.slope_u, depth.slope_v, front.projections[i].data);
-    sums.add(view.owner(front.parts[i]), p, a.x * inverse, a.y * inverse, (a.z - 1.0) * inverse,
-             robust.pull, robust.curvature);
+    const auto by = [&](int k) {
+      return depth.slope_u * front.by[k][i] + depth.slope_v * front.by[3 + k][i];
+    };
+    sums.add(view.owner(front.parts[i]), front.point(i).data(), by(0) * inverse, by(1) * inverse,
+             (by(2) - 1.0) * inverse, robust.pull, robust.curvature);
   }
   return energy;
 }

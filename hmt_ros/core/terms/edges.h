@@ -20,36 +20,66 @@ struct EdgeInputs {
   void check() const {
     if (term.weight > 0.0)
       expect_shape("distances.values", distances.values, {orientations, -1, -1});
+    expect(distances.values.count() < std::numeric_limits<std::int32_t>::max(), "distances.values",
+           "fewer pixels");
   }
 };
 
 // The orientation that a normal is nearest to, of angle k pi / 4.
-inline Index orientation(double x, double y) {
-  if (std::abs(y) <= half_bin * std::abs(x)) return 0;
-  if (std::abs(x) <= half_bin * std::abs(y)) return 2;
-  return x * y > 0.0 ? 1 : 3;
+inline std::int32_t orientation(double x, double y) {
+  const std::int32_t diagonal = x * y > 0.0 ? 1 : 3;
+  const std::int32_t steep = std::abs(x) <= half_bin * std::abs(y) ? 2 : diagonal;
+  return std::abs(y) <= half_bin * std::abs(x) ? 0 : steep;
+}
+
+// Reads the four pixels around each point that is seen, of the map of its orientation.
+inline void read_cells(const ImageMap& map, const Contour& contour, std::int32_t* cells,
+                       const std::array<double*, 4>& corners) {
+  const std::int32_t h = map.values.size(1), w = map.values.size(2);
+#pragma omp simd
+  for (Index i = 0; i < contour.count; ++i) {
+    const auto column = static_cast<std::int32_t>(inside(contour.u[i] - double(map.left), w));
+    const auto row = static_cast<std::int32_t>(inside(contour.v[i] - double(map.top), h));
+    const std::int32_t channel = orientation(contour.nu[i], contour.nv[i]);
+    const bool shown = contour.valid[i] > contour.hidden[i];
+    cells[i] = shown ? (channel * h + row) * w + column : 0;
+  }
+  for (Index i = 0; i < contour.count; ++i) {
+    const float* at = map.values.data + cells[i];
+    corners[0][i] = at[0];
+    corners[1][i] = at[1];
+    corners[2][i] = at[w];
+    corners[3][i] = at[w + 1];
+  }
 }
 
 // Adds the residuals of the pose in a view, returns its energy.
-inline double add_term(const PoseView& view, const EdgeInputs& inputs, const Sums& sums) {
+HMT_WIDE inline double add_term(const PoseView& view, const EdgeInputs& inputs, const Sums& sums) {
   const Weighting& term = inputs.term;
   const Contour& contour = view.contour;
+  const Index count = contour.count;
   const double each = weight_of_each(term.weight, view.model.contour_points * 6 / 10, contour);
-  double energy = 0.0;
-  for (Index i = 0; i < contour.count(); ++i) {
-    if (!contour.valid[i] || contour.hidden[i]) continue;
-    const Index channel = orientation(contour.normals(i, 0), contour.normals(i, 1));
+  const Matrix rows = view.rows(9, count);
+  const Scratch<std::int32_t, 1> cells(count);
+  double *a = rows[0].data, *b = rows[1].data, *p = rows[2].data, *q = rows[3].data;
+  read_cells(inputs.distances, contour, cells.view().data, {a, b, p, q});
+  double *gu = rows[4].data, *gv = rows[5].data, *value = rows[6].data;
+  double *pull = rows[7].data, *curvature = rows[8].data;
+#pragma omp simd
+  for (Index i = 0; i < count; ++i) {
     const Sample distance =
-        sample_distance(inputs.distances, channel, contour.pixels(i, 0), contour.pixels(i, 1));
+        distance_between({a[i], b[i], p[i], q[i]}, inputs.distances, contour.u[i], contour.v[i]);
     const double sigma = contour_sigma(term, contour.noise[i]);
     const Robust robust = geman_mcclure(distance.value / sigma, term.scale, each);
-    energy += robust.value;
-    const Gradient a =
-        by_point(distance.slope_u / sigma, distance.slope_v / sigma, contour.projections[i].data);
-    sums.add(view.owner(contour.parts[i]), contour.points[i].data, a.x, a.y, a.z, robust.pull,
-             robust.curvature);
+    const bool shown = contour.valid[i] > contour.hidden[i];
+    value[i] = shown ? robust.value : 0.0;
+    gu[i] = shown ? distance.slope_u / sigma : 0.0;
+    gv[i] = shown ? distance.slope_v / sigma : 0.0;
+    pull[i] = shown ? robust.pull : 0.0;
+    curvature[i] = shown ? robust.curvature : 0.0;
   }
-  return energy;
+  if (sums.wanted()) view.add_all(gu, gv, pull, curvature, sums);
+  return sum_of(value, count);
 }
 
 }  // namespace hmt

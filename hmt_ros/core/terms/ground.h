@@ -121,9 +121,10 @@ inline double add_floor(const GroundConstants& ground, const Tables& columns, co
 }
 
 // Energy of one pose; adds its gradient (d,) and Hessian (d, d), where wanted.
-inline double add_ground_energy(const GroundConstants& ground, const Tables& columns,
-                                const Table& origins, const Table& axes, const Table& dof_origins,
-                                bool wanted, const Vector& gradient, const Matrix& hessian) {
+HMT_WIDE inline double add_ground_energy(const GroundConstants& ground, const Tables& columns,
+                                         const Table& origins, const Table& axes,
+                                         const Table& dof_origins, bool wanted,
+                                         const Vector& gradient, const Matrix& hessian) {
   const Index d = ground.dimension();
   expect_frames(ground.moves.size(), d, columns, origins, axes, dof_origins);
   expect_shape("gradient", gradient, {d});

@@ -99,10 +99,10 @@ struct KeypointRoom {
         energies(inputs.groups(), 2),
         shares(inputs.groups(), 2),
         behind(inputs.lifted.joints()),
+        by_joint(2, in_whole_lanes(inputs.lifted.joints())),
         places(1 + inputs.lifted.joints(), 3),
         responsibilities(2, inputs.lifted.components()),
-        wrenches(inputs.tree.segments(), 6),
-        stiffnesses(inputs.tree.segments(), 6, 6),
+        segments(inputs.tree.segments()),
         axes(inputs.tree.dimension(), 3),
         dof_origins(inputs.tree.dimension(), 3) {}
 
@@ -110,17 +110,17 @@ struct KeypointRoom {
   Scratch<double, 2> energies;          // of the groups, as they are called and exchanged
   Scratch<double, 2> shares;            // probabilities that groups are exchanged or not
   Scratch<double, 1> behind;            // how far the joints are behind the middle of the hips
+  Scratch<double, 2> by_joint;          // any numbers of the joints, and 0 up to whole lanes
   Scratch<double, 2> places;            // the middle of the hips and the joints
   Scratch<double, 2> responsibilities;  // of the components, by the readings
-  Scratch<double, 2> wrenches;
-  Scratch<double, 3> stiffnesses;
+  Scratch<SegmentSums, 1> segments;
   Scratch<double, 2> axes, dof_origins;  // where the middle of the hips rests
 
   // Sums over the segments, zero.
   Sums no_sums() const {
-    wrenches.fill(0.0);
-    stiffnesses.fill(0.0);
-    return {wrenches.view(), stiffnesses.view(), {}};
+    const Sums sums{segments.view(), {}};
+    sums.clear();
+    return sums;
   }
 };
 
@@ -199,14 +199,17 @@ inline void lifted_energies(const Lifted& lifted, const Tables& columns, const T
   }
   for (int e = 0; e < 2; ++e) {
     const Vector shares = room.responsibilities[e];
+    room.by_joint.fill(0.0);
     double top = -infinity, mass = 0.0;
     for (Index c = 0; c < lifted.components(); ++c) {
       const double *precision = lifted.precisions[e][c].data, *depth = lifted.depths[e][c].data;
-      double total = lifted.log_weights[c];
+      double* costs = room.by_joint[0].data;
+#pragma omp simd
       for (Index k = 0; k < joints; ++k) {
         const double residual = precision[k] * (behind[k] - depth[k]);
-        total -= geman_mcclure(residual, lifted.scale, 1.0).value;
+        costs[k] = geman_mcclure(residual, lifted.scale, 1.0).value;
       }
+      const double total = lifted.log_weights[c] - sum_of(costs, room.by_joint.size(1));
       shares[c] = total;
       top = most(top, total);
     }
@@ -240,22 +243,27 @@ inline void add_lifted(const KeypointInputs& inputs, const double* readings, con
   }
   const Sums sums = room.no_sums();
   const double* ray = lifted.ray.data;
-  for (Index k = 0; k < lifted.joints(); ++k) {
-    double pull = 0.0, curvature = 0.0;
-    for (int e = 0; e < 2; ++e) {
-      for (Index c = 0; c < lifted.components(); ++c) {
-        const double precision = lifted.precisions(e, c, k);
-        const double share = lifted.weight * readings[e] * room.responsibilities(e, c);
-        const double residual = precision * (room.behind[k] - lifted.depths(e, c, k));
+  room.by_joint.fill(0.0);
+  double *pulls = room.by_joint[0].data, *curvatures = room.by_joint[1].data;
+  const double* behind = room.behind.view().data;
+  for (int e = 0; e < 2; ++e) {
+    for (Index c = 0; c < lifted.components(); ++c) {
+      const double *precision = lifted.precisions[e][c].data, *depth = lifted.depths[e][c].data;
+      const double share = lifted.weight * readings[e] * room.responsibilities(e, c);
+#pragma omp simd
+      for (Index k = 0; k < lifted.joints(); ++k) {
+        const double residual = precision[k] * (behind[k] - depth[k]);
         const Robust robust = geman_mcclure(residual, lifted.scale, share);
-        pull += precision * robust.pull;
-        curvature += precision * precision * robust.curvature;
+        pulls[k] += precision[k] * robust.pull;
+        curvatures[k] += precision[k] * precision[k] * robust.curvature;
       }
     }
-    sums.add(lifted.segments[k], room.places[1 + k].data, ray[0], ray[1], ray[2], pull, curvature);
   }
-  assemble_pose(tree, room.axes, room.dof_origins, sums.wrenches, sums.stiffnesses, gradient,
-                hessian);
+  for (Index k = 0; k < lifted.joints(); ++k) {
+    sums.add(lifted.segments[k], room.places[1 + k].data, ray[0], ray[1], ray[2], pulls[k],
+             curvatures[k]);
+  }
+  assemble_pose(tree, room.axes, room.dof_origins, sums.segments, gradient, hessian);
 }
 
 // Log probabilities (E,) of exchanges at one pose, from those before (E,); returns minus the log of
@@ -339,7 +347,7 @@ inline void record_keypoints(const KeypointInputs& inputs, const Array<const Ind
   expect_shape("residuals", residuals, {columns.size(), 1 + 2 * points, Sums::recorded});
   const KeypointRoom room(inputs);
   for (Index n = 0; n < columns.size(); ++n) {
-    const Sums list{{}, {}, residuals[n]};
+    const Sums list{{}, residuals[n]};
     list.list(0, 0) = 0.0;
     visit_keypoints(inputs, columns[n], origins[n], room,
                     [&](Index k, Index exchanged, const Landmark& mark) {
@@ -350,15 +358,17 @@ inline void record_keypoints(const KeypointInputs& inputs, const Array<const Ind
   }
 }
 
-// The energy of one pose with log probabilities (E,) of the exchanges before; adds gradient (d,)
-// and Hessian (d, d), where they are wanted. Axes and origins (d, 3) are of the degrees of freedom.
-inline double add_keypoints(const KeypointInputs& inputs, const Numbers& log_prior,
-                            const Tables& columns, const Table& origins, const Table& axes,
-                            const Table& dof_origins, bool wanted, const Vector& gradient,
-                            const Matrix& hessian, const KeypointRoom& room) {
+// The energy of one pose with log probabilities (E,) of the exchanges before. Where derivatives are
+// wanted it adds residuals of keypoints to the sums, and those of depths to gradient (d,) and
+// Hessian (d, d). Axes and origins (d, 3) are of the degrees of freedom.
+HMT_WIDE inline double add_keypoints(const KeypointInputs& inputs, const Numbers& log_prior,
+                                     const Tables& columns, const Table& origins, const Table& axes,
+                                     const Table& dof_origins, const Sums& sums,
+                                     const Vector& gradient, const Matrix& hessian,
+                                     const KeypointRoom& room) {
   const Vector& posterior = room.posterior;
   const double value = weigh_exchanges(inputs, log_prior, columns, origins, room, posterior);
-  if (!wanted) return value;
+  if (!sums.wanted()) return value;
   double readings[2] = {0.0, 0.0};
   room.shares.fill(0.0);
   for (Index e = 0; e < inputs.exchanges(); ++e) {
@@ -368,7 +378,6 @@ inline double add_keypoints(const KeypointInputs& inputs, const Numbers& log_pri
       room.shares(g, inputs.exchanged(e, g)) += probability;
     }
   }
-  const Sums sums = room.no_sums();
   for (Index k = 0; k < inputs.points.size(); ++k) {
     const Index group = inputs.points.groups[k];
     for (int e = 0; e < 2; ++e) {
@@ -378,7 +387,6 @@ inline double add_keypoints(const KeypointInputs& inputs, const Numbers& log_pri
       if (mark.shown) mark.add(inputs, k, inputs.points.segments(k, e), share, sums);
     }
   }
-  assemble_pose(inputs.tree, axes, dof_origins, sums.wrenches, sums.stiffnesses, gradient, hessian);
   if (inputs.lifted.weight > 0.0) {
     add_lifted(inputs, readings, axes, dof_origins, gradient, hessian, room);
   }

@@ -151,9 +151,10 @@ inline void derive_overlap(const Overlaps& overlaps, const Overlap& found, Index
 
 // Adds the energy of one pose and, where wanted, its gradient (d,) and Gauss-Newton Hessian (d, d).
 // That an elliptic cross-section turns is left out of them.
-inline void add_overlaps(const Overlaps& overlaps, const Tables& columns, const Table& origins,
-                         const Table& axes, const Table& dof_origins, bool wanted, double& value,
-                         const Vector& gradient, const Matrix& hessian, const OverlapRoom& room) {
+HMT_WIDE inline void add_overlaps(const Overlaps& overlaps, const Tables& columns,
+                                  const Table& origins, const Table& axes, const Table& dof_origins,
+                                  bool wanted, double& value, const Vector& gradient,
+                                  const Matrix& hessian, const OverlapRoom& room) {
   const Capsules& parts = overlaps.parts;
   place_centres(parts, columns, origins, room.centres);
   for (Index pair = 0; pair < overlaps.first.size(); ++pair) {

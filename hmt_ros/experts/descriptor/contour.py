@@ -21,8 +21,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.camera import Camera
+from hmt_ros.core import elementary
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.inference.arrays import Array, Mask
+from hmt_ros.inference.linear_algebra import product
 
 Bytes = NDArray[np.uint8]
 
@@ -186,7 +188,7 @@ def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
             np.stack([np.interp(s % length, along, closed[:, i]) for i in (0, 1)], axis=1)
             for s in (here + chord, here - chord)
         )
-        directions[mine] = np.arctan2(*(ahead - behind).T[::-1])
+        directions[mine] = elementary.arctan2(*(ahead - behind).T[::-1])
     return points, directions
 
 
@@ -210,31 +212,25 @@ def centred_view(blob: PersonBlob, camera: Camera, level: Array = UPRIGHT) -> By
     middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
     axis = camera.rays(middle)
     upright = np.array_equal(level, UPRIGHT)
-    if upright and not camera.distortion and axis[2] > np.cos(STRAIGHT):
+    if upright and not camera.distortion and axis[2] > elementary.cos(STRAIGHT):
         return blob.mask
     corners = np.array([[x, y] for x in (left, middle[0], right) for y in (top, middle[1], bottom)])
-    turn = level @ ray_rotations(axis[None] @ level)[0]  # from the view to the camera
-    seen = camera.rays(corners) @ turn
+    # From the view to the camera.
+    turn = product(level, ray_rotations(product(axis[None], level))[0])
+    seen = product(camera.rays(corners), turn)
     reach = float(np.abs(seen[:, :2] / np.maximum(seen[:, 2:], 0.1)).max())
     focal = 0.5 * FILLED * SIDE / reach
     centre = 0.5 * (SIDE - 1)
-    if not camera.distortion:
-        view = np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
-        shift = np.array([[1.0, 0.0, -blob.left], [0.0, 1.0, -blob.top], [0.0, 0.0, 1.0]])
-        to_blob = shift @ camera.matrix @ turn @ np.linalg.inv(view)
-        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        drawn = cv2.warpPerspective(blob.mask * np.uint8(255), to_blob, (SIDE, SIDE), flags=how)
-    else:
-        u, v = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
-        rays = np.stack([(u - centre) / focal, (v - centre) / focal, np.ones_like(u, float)], -1)
-        pixels = camera.project(rays @ turn.T).astype(np.float32)
-        pixels -= np.array([blob.left, blob.top], dtype=np.float32)
-        columns, rows = np.where(np.isfinite(pixels), pixels, -1e4).transpose(2, 0, 1)
-        drawn = cv2.remap(
-            blob.mask * np.uint8(255),
-            np.ascontiguousarray(columns, dtype=np.float32),
-            np.ascontiguousarray(rows, dtype=np.float32),
-            cv2.INTER_LINEAR,
-        )
+    u, v = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
+    rays = np.stack([(u - centre) / focal, (v - centre) / focal, np.ones_like(u, float)], -1)
+    pixels = camera.project(product(rays, turn.T)).astype(np.float32)
+    pixels -= np.array([blob.left, blob.top], dtype=np.float32)
+    columns, rows = np.where(np.isfinite(pixels), pixels, -1e4).transpose(2, 0, 1)
+    drawn = cv2.remap(
+        blob.mask * np.uint8(255),
+        np.ascontiguousarray(columns, dtype=np.float32),
+        np.ascontiguousarray(rows, dtype=np.float32),
+        cv2.INTER_LINEAR,
+    )
     result: Bytes = (drawn > 127).astype(np.uint8)
     return result if result.any() else blob.mask

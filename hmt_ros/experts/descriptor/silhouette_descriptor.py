@@ -34,9 +34,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.learned_file import require
+from hmt_ros.core import elementary
 from hmt_ros.experts.descriptor.contour import person_blob, sample_contour
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import squared_distances
+from hmt_ros.inference.linear_algebra import product
 
 Bytes = NDArray[np.uint8]
 
@@ -62,9 +64,9 @@ def shape_contexts(points: Array) -> Array:
     mean = distance.sum() / max(n * (n - 1), 1)
     low, high = RADII
     with np.errstate(divide='ignore'):
-        radial = np.log(distance / (mean * low)) * (RADIAL / np.log(high / low))
+        radial = elementary.log(distance / (mean * low)) * (RADIAL / elementary.log(high / low))
     ring = np.floor(np.maximum(radial, -1.0)).astype(np.intp)
-    angle = np.arctan2(off[..., 1], off[..., 0]) * (ANGULAR / (2 * np.pi))
+    angle = elementary.arctan2(off[..., 1], off[..., 0]) * (ANGULAR / (2 * np.pi))
     sector = np.floor(angle).astype(np.intp) % ANGULAR
     inside = (ring >= 0) & (ring < RADIAL)
     bins = np.arange(n)[:, None] * (RADIAL * ANGULAR) + ring * ANGULAR + sector
@@ -96,7 +98,7 @@ class ShapeContextCodebook:
         """Votes (C,) of contexts (N, 60): a histogram that sums to 1."""
         squared = squared_distances(np.sqrt(contexts), self.centres)
         votes = min(VOTES, len(self.centres))
-        nearest = np.argpartition(squared, votes - 1, axis=1)[:, :votes]
+        nearest = np.sort(np.argpartition(squared, votes - 1, axis=1)[:, :votes], axis=1)
         distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1))
         weight = 1.0 / np.maximum(distance, LEAST_DISTANCE)
         weight /= weight.sum(1, keepdims=True)
@@ -125,8 +127,8 @@ def edge_pairs(points: Array, directions: Array, mask: Bytes) -> Array:
         column, row = (start + share * off + 0.5).astype(np.int32).T
         inside &= mask[np.minimum(row, height - 1), np.minimum(column, width - 1)] > 0
     low, high = RADII
-    scale = PAIR_DISTANCES / np.log(high / low)
-    ring = np.log(np.maximum(distance[inside], 1e-9) / (mean * low)) * scale
+    scale = PAIR_DISTANCES / elementary.log(high / low)
+    ring = elementary.log(np.maximum(distance[inside], 1e-9) / (mean * low)) * scale
     turn = np.abs((directions[second] - directions[first])[inside])
     turn = np.minimum(turn % (2 * np.pi), -turn % (2 * np.pi))  # 0 to pi
     bins = np.clip(ring, 0, PAIR_DISTANCES - 1).astype(np.intp) * PAIR_ANGLES
@@ -226,7 +228,7 @@ class SilhouetteDescriptor:
     def describe(self, parts: Iterable[SilhouetteParts]) -> Array:
         """Vectors (n, p) of silhouettes."""
         features = [np.concatenate([*features_of(self.codebook, x).values()]) for x in parts]
-        return np.asarray((np.array(features) * self.scale - self.centre) @ self.basis)
+        return np.asarray(product(np.array(features) * self.scale - self.centre, self.basis))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The learned arrays in single precision, for a file."""
@@ -271,6 +273,15 @@ def _at_one_size(mask: Bytes) -> Bytes:
     return (resized > 127).astype(np.uint8)
 
 
+def _interpolated(values: Array, rows: Array, columns: Array) -> Array:
+    """Values (h, w) between pixels, at rows (m,) and columns (n,) inside, bilinearly: (m, n)."""
+    i = np.clip(np.floor(rows).astype(np.intp), 0, values.shape[0] - 2)
+    j = np.clip(np.floor(columns).astype(np.intp), 0, values.shape[1] - 2)
+    down, right = (rows - i)[:, None], columns - j
+    upper = values[i] * (1.0 - down) + values[i + 1] * down
+    return np.asarray(upper[:, j] * (1.0 - right) + upper[:, j + 1] * right)
+
+
 def _map_and_moments(mask: Bytes) -> tuple[Array, Array]:
     """Signed distances (MAP * MAP,) around the centroid, and moments (MOMENTS,)."""
     m = cv2.moments(mask, binaryImage=True)
@@ -287,22 +298,12 @@ def _map_and_moments(mask: Bytes) -> tuple[Array, Array]:
     outside = cv2.distanceTransform(1 - wide, cv2.DIST_L2, 3)
     distance = np.clip((inside - outside) / radius, -FURTHEST, DEEPEST)
     scale = MAP / (2 * half)
-    to_map = np.array(
-        [
-            [scale, 0.0, 0.5 * MAP - 0.5 - scale * (x + left)],
-            [0.0, scale, 0.5 * MAP - 0.5 - scale * (y + top)],
-        ]
-    )
-    cells = cv2.warpAffine(
-        distance.astype(np.float32),
-        to_map,
-        (MAP, MAP),
-        flags=cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=-FURTHEST,
-    )
+    steps = (np.arange(MAP) - (0.5 * MAP - 0.5)) / scale
+    cells = _interpolated(distance, y + top + steps, x + left + steps)
     second = np.array([m['mu20'], m['mu02'], m['mu11']]) / (area * radius**2)
-    third = np.array([m['mu30'], m['mu21'], m['mu12'], m['mu03']]) / (area * radius**3)
+    third = np.array([m['mu30'], m['mu21'], m['mu12'], m['mu03']]) / (
+        area * (radius * radius * radius)
+    )
     proportions = [
         0.25 * height / radius,
         0.25 * width / radius,

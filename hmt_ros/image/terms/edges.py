@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros import core
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.image_term import (
     NO_MAP,
+    NOTHING,
     ImageTerm,
     ImageWindow,
     Request,
@@ -53,33 +53,12 @@ def edge_distances(window: ImageWindow) -> ImageMap:
     grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
     dx = cv2.Sobel(grey, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(grey, cv2.CV_16S, 0, 1)
-    edges = cv2.Canny(dx, dy, EDGE_LOW, EDGE_HIGH) > 0
-    if window.widest is not None:
-        edges &= cv2.dilate(window.widest, _DISC) > 0
-    if window.others is not None:
-        edges &= window.others == 0
-    rows, columns = np.nonzero(edges)
-    angle = np.arctan2(dy[rows, columns], dx[rows, columns])
+    edges = cv2.Canny(dx, dy, EDGE_LOW, EDGE_HIGH)
+    near = NOTHING if window.widest is None else cv2.dilate(window.widest, _DISC)
+    others = NOTHING if window.others is None else window.others
     result = np.empty((ORIENTATIONS, *grey.shape), dtype=np.float32)
-    for k in range(ORIENTATIONS):
-        free = np.ones(grey.shape, dtype=np.uint8)
-        mine = _counts_for(angle, k)
-        free[rows[mine], columns[mine]] = 0
-        if mine.any():
-            result[k] = cv2.distanceTransform(free, cv2.DIST_L2, 3)
-        else:
-            result[k] = 1e3
-        if window.others is not None:
-            result[k][window.others > 0] = HIDDEN
+    core.edge_distances(edges, dx, dy, near, others, HIDDEN, result)
     return window.as_map(result)
-
-
-def _counts_for(angle: NDArray[np.float64], k: int) -> NDArray[np.bool_]:
-    """Edges within three quarters of a bin of the direction of bin k."""
-    width = np.pi / ORIENTATIONS
-    off = (angle - k * width + 0.5 * np.pi) % np.pi - 0.5 * np.pi
-    result: NDArray[np.bool_] = np.abs(off) <= 0.75 * width
-    return result
 
 
 def _inputs(term: Weighting, evidence: Any, _request: Request) -> EdgeInputs:

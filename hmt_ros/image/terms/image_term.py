@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.inference.arrays import Array, Image
 
+# A mask that is not there, and a map.
+NOTHING = np.zeros((0, 0), np.uint8)
 NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
 
 

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from hmt_ros.core import sample_outline
 from hmt_ros.image.terms.image_term import (
+    NOTHING,
     ImageTerm,
     ImageWindow,
     Request,
@@ -25,9 +27,8 @@ from hmt_ros.inference.arrays import Array
 
 # Samples on the outline.
 OUTLINE_POINTS = 120
-# Belief in a sample of the outline beyond which, this many px away, the person may go on.
-UNSURE = 0.3
-BESIDE = 4.0
+# Pixels of the shortest outline that counts.
+SHORTEST = 12
 
 
 class Outline(NamedTuple):
@@ -66,45 +67,23 @@ def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
     if mask is None:
         return None
     contours, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    contours = [c[:, 0].astype(float) for c in contours if len(c) >= 12]
+    contours = [c for c in contours if len(c) >= SHORTEST]
     if not contours:
         return NO_OUTLINE
-    steps = [np.linalg.norm(np.roll(c, -1, axis=0) - c, axis=1) for c in contours]
-    total = sum(x.sum() for x in steps)
-    points = []
-    for contour, step in zip(contours, steps, strict=True):
-        n = max(round(count * step.sum() / total), 3)
-        along = np.concatenate([[0.0], np.cumsum(step)])
-        closed = np.concatenate([contour, contour[:1]])
-        at = (np.arange(n) + 0.5) / n * along[-1]
-        points.append(np.stack([np.interp(at, along, closed[:, i]) for i in range(2)], axis=1))
-    pixels = np.concatenate(points)
-    # Out of the silhouette is against the gradient of the blurred mask.
-    blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 2.0)
-    column, row = np.round(pixels).astype(int).T
-    normals = -np.stack(
-        [
-            cv2.Sobel(blurred, cv2.CV_32F, 1, 0)[row, column],
-            cv2.Sobel(blurred, cv2.CV_32F, 0, 1)[row, column],
-        ],
-        axis=1,
-    ).astype(float)
-    length = np.linalg.norm(normals, axis=1)
-    good = length > 1e-3
-    normals = normals[good] / length[good, None]
-    # The outline lies half a pixel outside the last pixels of the silhouette.
-    pixels = pixels[good]
-    beliefs = np.ones(len(pixels))
-    if window.unsure is not None or window.others is not None:
-        column, row = np.round(pixels + BESIDE * normals).astype(int).T
-        column = np.clip(column, 0, mask.shape[1] - 1)
-        row = np.clip(row, 0, mask.shape[0] - 1)
-        if window.unsure is not None:
-            beliefs[window.unsure[row, column] > 0] = UNSURE
-        if window.others is not None:
-            beliefs[window.others[row, column] > 0] = 0.0
-    pixels = pixels + 0.5 * normals + np.array([window.left, window.top])
-    return Outline(pixels, normals, beliefs)
+    most = count + 4 * len(contours)
+    found = Outline(np.empty((most, 2)), np.empty((most, 2)), np.empty(most))
+    used = sample_outline(
+        np.concatenate(contours)[:, 0],
+        np.cumsum([len(c) for c in contours]),
+        mask,
+        NOTHING if window.unsure is None else window.unsure,
+        NOTHING if window.others is None else window.others,
+        count,
+        window.left,
+        window.top,
+        *found,
+    )
+    return Outline(*(x[:used] for x in found))
 
 
 NO_OUTLINE = Outline(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))

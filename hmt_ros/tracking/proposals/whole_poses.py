@@ -69,7 +69,8 @@ class PoseByKeypoints:
             return None
         pose = _by_keypoints(search, self.pose)
         if self.pose is None:
-            self._gain = float(np.subtract(*search.continuity.rated(np.stack([pose[0], mode]))))
+            both = search.posterior.body.joint_positions(np.stack([pose[0], mode]))
+            self._gain = float(np.subtract(*search.continuity.rated(both)))
         self.pose = pose
         if not self.contradicted:
             return None
@@ -84,7 +85,8 @@ def predicted_poses(
     if search.prediction is None:
         return sources[:0]
     poses = search.prediction.seen_as(search.posterior.person).means
-    nearest = search.continuity.log_transitions(poses).argmax(0)
+    joints = search.posterior.body.joint_positions(poses)
+    nearest = search.continuity.log_transitions(joints).argmax(0)
     return sources.proposed(nearest, poses, np.ones(poses.shape, dtype=np.bool_))
 
 

@@ -1,4 +1,3 @@
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -9,19 +8,15 @@ from hmt_ros.core import add_band_product
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def rounded_once(a, b, c):
-    return float(Fraction(a) * Fraction(b) + Fraction(c))
-
-
 def in_order(x, y):
-    """The sum as the header has it, in rational numbers that are rounded where it rounds."""
+    """The sum of products as the header has it."""
     whole = len(x) - len(x) % 8
     s = [0.0] * 8
     for i in range(whole):
-        s[i % 8] = rounded_once(x[i], y[i], s[i % 8])
+        s[i % 8] += x[i] * y[i]
     total = ((s[0] + s[4]) + (s[2] + s[6])) + ((s[1] + s[5]) + (s[3] + s[7]))
     for i in range(whole, len(x)):
-        total = rounded_once(x[i], y[i], total)
+        total += x[i] * y[i]
     return total
 
 

@@ -1,0 +1,27 @@
+// log sum exp(x).
+#pragma once
+
+#include "elementary.h"
+
+namespace hmt {
+
+// Of what lies in `x`, which is overwritten.
+HMT_WIDE inline double log_sum_exp(double* x, Index count) {
+  double largest = -infinity;
+  for (Index i = 0; i < count; ++i) {
+    if (!(x[i] <= largest)) largest = x[i];
+    if (std::isnan(largest)) return nan;
+  }
+  if (std::isinf(largest)) return largest;
+  for (Index i = 0; i < count; ++i) x[i] = elementary::exp(x[i] - largest);
+  double sum = 0.0;
+  for (Index i = 0; i < count; ++i) sum += x[i];
+  return largest + elementary::log(sum);
+}
+HMT_INLINE double log_add_exp(double a, double b) {
+  if (a == b) return a + 0x1.62e42fefa39efp-1;  // log 2; also where both are infinite
+  const double larger = a > b ? a : b;
+  return larger + elementary::log1p(elementary::exp(-std::abs(a - b)));
+}
+
+}  // namespace hmt
