@@ -70,11 +70,11 @@ inline void hold(const Matrix& columns, const Places& held) {
 // ---- Cholesky factors, in place. Read by rows i and columns c, the band is a matrix [i, c] whose
 // columns begin `width` numbers apart.
 
-inline constexpr Index panel_columns = matrices::matrix_lanes;  // eliminated at a time
+inline constexpr Index panel_columns = lanes;  // eliminated at a time
 
 // The numbers of a group, of which only `count` are there.
-HMT_INLINE void take(const double* from, Index count, matrices::Group<double>& to) {
-  double each[matrices::matrix_lanes] = {};
+HMT_INLINE void take(const double* from, Index count, Group<double>& to) {
+  double each[lanes] = {};
   std::copy_n(from, count, each);
   to = matrices::group(each);
 }
@@ -84,11 +84,10 @@ HMT_INLINE void take(const double* from, Index count, matrices::Group<double>& t
 template <int R>
 HMT_INLINE void subtract_products(double* target, Index width, const double* from, Index stride,
                                   Index count, Index rows) {
-  constexpr Index lanes = matrices::matrix_lanes;
   for (Index i = 0; i < rows; i += lanes) {
     const Index here = std::min(lanes, rows - i);
     const bool whole = here == lanes && i > 0;
-    matrices::Group<double> sums[R];
+    Group<double> sums[R];
     for (int r = 0; r < R; ++r) {
       double* column = target + r * width + i;
       if (here == lanes) {
@@ -99,7 +98,7 @@ HMT_INLINE void subtract_products(double* target, Index width, const double* fro
     }
     for (Index k = 0; k < count; ++k) {
       const double* row = from + k * stride;
-      const auto right = *reinterpret_cast<const matrices::Group<double>*>(row + i);
+      const auto right = *reinterpret_cast<const Group<double>*>(row + i);
       for (int r = 0; r < R; ++r) sums[r] -= row[r] * right;
     }
     for (int r = 0; r < R; ++r) {
@@ -118,7 +117,6 @@ HMT_INLINE void subtract_products(double* target, Index width, const double* fro
 // Returns how many columns have a pivot that is positive and finite: all, or the matrix is not
 // positive definite.
 HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& room) {
-  constexpr Index lanes = matrices::matrix_lanes;
   const Index total = columns.size(), width = columns.size(1) - 1, stride = room.size(1);
   for (Index first = 0; first < total; first += panel_columns) {
     const Index count = std::min(panel_columns, total - first);
@@ -152,8 +150,8 @@ HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& roo
 }
 inline Index factorise_band(const Matrix& columns) {
   expect(columns.size(1) > 0, "columns", "a diagonal");
-  const Index longest = matrices::padded(columns.size(1) + panel_columns);
-  const Scratch<double, 2> room(panel_columns, longest + matrices::matrix_lanes);
+  const Index longest = in_whole_lanes(columns.size(1) + panel_columns);
+  const Scratch<double, 2> room(panel_columns, longest + lanes);
   return factorise_columns(columns, room.view());
 }
 
@@ -165,7 +163,6 @@ inline void expect_vectors(const Matrix& columns, const Matrix& x) {
 // L^-1 x of vectors x (S, T n), in place.
 HMT_WIDE inline void solve_band_lower(const Matrix& columns, const Matrix& x) {
   expect_vectors(columns, x);
-  constexpr Index lanes = matrices::matrix_lanes;
   const Index total = columns.size(), width = columns.size(1) - 1;
   for (Index c = 0; c < total; ++c) {
     const double* column = columns.data + c * (width + 1);
@@ -175,8 +172,7 @@ HMT_WIDE inline void solve_band_lower(const Matrix& columns, const Matrix& x) {
       const double own = to[0] /= column[0];
       Index b = 1;
       for (; b + lanes <= last; b += lanes) {
-        matrices::group(to + b) -=
-            own * *reinterpret_cast<const matrices::Group<double>*>(column + b);
+        matrices::group(to + b) -= own * *reinterpret_cast<const Group<double>*>(column + b);
       }
       for (; b < last; ++b) to[b] -= own * column[b];
     }
@@ -192,7 +188,7 @@ HMT_WIDE inline void solve_band_transposed(const Matrix& columns, const Matrix& 
     const Index last = std::min(width, total - 1 - c);
     for (Index s = 0; s < x.size(); ++s) {
       double* to = x.data + s * total + c;
-      to[0] = (to[0] - matrices::inner_product(column + 1, to + 1, last)) / column[0];
+      to[0] = (to[0] - dot(column + 1, to + 1, last)) / column[0];
     }
   }
 }
@@ -206,7 +202,7 @@ HMT_WIDE inline void multiply_band_transposed(const Matrix& columns, const Matri
     const Index last = std::min(width + 1, total - c);
     for (Index s = 0; s < x.size(); ++s) {
       double* to = x.data + s * total + c;
-      to[0] = matrices::inner_product<double>(column, to, last);
+      to[0] = dot<double>(column, to, last);
     }
   }
 }

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "arrays.h"
+#include "wide.h"
 
 namespace hmt {
 
@@ -25,17 +26,30 @@ inline double sum_of(const double* x, Index count) {
   return sum_lanes(sums);
 }
 
-// Sum of x[i] y[i] over i < count: of partial sums s[i % lanes], and then, one after the other, the
-// products that are left beyond whole lanes.
-inline double dot(const double* x, const double* y, Index count) {
-  double sums[lanes] = {};
+// Numbers in groups of 64 bytes, whatever the processor has.
+template <class T>
+struct Lanes {
+  typedef T Group __attribute__((vector_size(64), aligned(alignof(T)), may_alias));
+  static constexpr Index count = 64 / sizeof(T);
+};
+template <class T>
+using Group = typename Lanes<T>::Group;
+
+// Sum of x[i] y[i] over i < n: of partial sums by i % count, which are added in pairs, and then,
+// one after the other, of the products that are left beyond whole groups.
+template <class T>
+HMT_INLINE T dot(const T* x, const T* y, Index n) {
+  constexpr Index count = Lanes<T>::count;
+  Group<T> sums{};
   Index i = 0;
-  for (; i + lanes <= count; i += lanes) {
-#pragma omp simd
-    for (int k = 0; k < lanes; ++k) sums[k] += x[i + k] * y[i + k];
+  for (; i + count <= n; i += count) {
+    sums += *reinterpret_cast<const Group<T>*>(x + i) * *reinterpret_cast<const Group<T>*>(y + i);
   }
-  double total = sum_lanes(sums);
-  for (; i < count; ++i) total += x[i] * y[i];
+  for (Index half = count / 2; half > 0; half /= 2) {
+    for (Index k = 0; k < half; ++k) sums[k] += sums[k + half];
+  }
+  T total = sums[0];
+  for (; i < n; ++i) total += x[i] * y[i];
   return total;
 }
 

@@ -43,7 +43,7 @@ void read(Strided<double> from, Index m, Index n, Rows to, Index column = 0) {
     } else {
       for (Index j = 0; j < n; ++j) row[j] = from(i, j);
     }
-    std::fill(row + n, row + padded(n), 0.0);
+    std::fill(row + n, row + in_whole_lanes(n), 0.0);
   }
 }
 void write(Rows from, Index column, bool good, Index m, Index n, Strided<double> to) {
@@ -53,7 +53,7 @@ void write(Rows from, Index column, bool good, Index m, Index n, Strided<double>
 }
 void set_identity(Rows rows, Index n, Index column = 0) {
   for (Index i = 0; i < n; ++i) {
-    std::fill_n(rows[i] + column, padded(n), 0.0);
+    std::fill_n(rows[i] + column, in_whole_lanes(n), 0.0);
     rows[i][column + i] = 1.0;
   }
 }
@@ -62,8 +62,8 @@ void set_identity(Rows rows, Index n, Index column = 0) {
 void cholesky_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Items items(pointers, counts, strides, 2);
   const Index n = counts[1];
-  Scratch<double, 2> room(n, padded(n));
-  const Rows rows{room[0].data, padded(n)};
+  Scratch<double, 2> room(n, in_whole_lanes(n));
+  const Rows rows{room[0].data, in_whole_lanes(n)};
   bool all = true;
   for (Index i = 0; i < items.size(); ++i) {
     const Strided<double> given = items.matrix(0, i, 0), result = items.matrix(1, i, 2);
@@ -81,19 +81,19 @@ void cholesky_loop(char** pointers, const Index* counts, const Index* strides, v
 template <int triangle>  // -1 lower, 1 upper, 0 a full matrix
 void solve_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Items items(pointers, counts, strides, 3);
-  const Index n = counts[1], m = counts[2], width = padded(n) + padded(m);
+  const Index n = counts[1], m = counts[2], width = in_whole_lanes(n) + in_whole_lanes(m);
   Scratch<double, 2> room(n, width);
   const Rows rows{room[0].data, width};
   bool all = true;
   for (Index i = 0; i < items.size(); ++i) {
     read(items.matrix(0, i, 0), n, n, rows);
-    read(items.matrix(1, i, 2), n, m, rows, padded(n));
+    read(items.matrix(1, i, 2), n, m, rows, in_whole_lanes(n));
     bool good = true;
     for (Index k = 0; k < n; ++k) good = good && rows[k][k] != 0.0;
     if (triangle == 0) good = eliminate(rows, n) != 0.0;
-    if (good) (triangle < 0 ? solve_lower : solve_upper)(rows, n, padded(n));
+    if (good) (triangle < 0 ? solve_lower : solve_upper)(rows, n, in_whole_lanes(n));
     all = all && good;
-    write(rows, padded(n), good, n, m, items.matrix(2, i, 4));
+    write(rows, in_whole_lanes(n), good, n, m, items.matrix(2, i, 4));
   }
   report_only(all ? 0 : FE_INVALID);
 }
@@ -101,17 +101,17 @@ void solve_loop(char** pointers, const Index* counts, const Index* strides, void
 // (n,n)->(n,n)
 void inverse_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Items items(pointers, counts, strides, 2);
-  const Index n = counts[1], width = 2 * padded(n);
+  const Index n = counts[1], width = 2 * in_whole_lanes(n);
   Scratch<double, 2> room(n, width);
   const Rows rows{room[0].data, width};
   bool all = true;
   for (Index i = 0; i < items.size(); ++i) {
     read(items.matrix(0, i, 0), n, n, rows);
-    set_identity(rows, n, padded(n));
+    set_identity(rows, n, in_whole_lanes(n));
     const bool good = eliminate(rows, n) != 0.0;
-    if (good) solve_upper(rows, n, padded(n));
+    if (good) solve_upper(rows, n, in_whole_lanes(n));
     all = all && good;
-    write(rows, padded(n), good, n, n, items.matrix(1, i, 2));
+    write(rows, in_whole_lanes(n), good, n, n, items.matrix(1, i, 2));
   }
   report_only(all ? 0 : FE_INVALID);
 }
@@ -120,8 +120,8 @@ void inverse_loop(char** pointers, const Index* counts, const Index* strides, vo
 void determinant_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Items items(pointers, counts, strides, 3);
   const Index n = counts[1];
-  Scratch<double, 2> room(n, padded(n));
-  const Rows rows{room[0].data, padded(n)};
+  Scratch<double, 2> room(n, in_whole_lanes(n));
+  const Rows rows{room[0].data, in_whole_lanes(n)};
   for (Index i = 0; i < items.size(); ++i) {
     read(items.matrix(0, i, 0), n, n, rows);
     double product = eliminate(rows, n), sum = product == 0.0 ? -infinity : 0.0;
@@ -164,10 +164,11 @@ template <bool with_vectors>
 void eigen_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Items items(pointers, counts, strides, with_vectors ? 3 : 2);
   const Index n = counts[1];
-  Scratch<double, 2> room(n, padded(n)), vector_room(n, padded(n)), part(4, padded(n));
+  Scratch<double, 2> room(n, in_whole_lanes(n)), vector_room(n, in_whole_lanes(n)),
+      part(4, in_whole_lanes(n));
   Scratch<Index, 1> places(n);
-  const Rows rows{room[0].data, padded(n)};
-  const Rows vectors{with_vectors ? vector_room[0].data : nullptr, padded(n)};
+  const Rows rows{room[0].data, in_whole_lanes(n)};
+  const Rows vectors{with_vectors ? vector_room[0].data : nullptr, in_whole_lanes(n)};
   double* values = part[0].data;
   double *beside = part[1].data, *scales = part[2].data, *work = part[3].data;
   bool all = true;
@@ -204,10 +205,10 @@ void eigen_loop(char** pointers, const Index* counts, const Index* strides, void
 void svd_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Items items(pointers, counts, strides, 4);
   const Index m = counts[1], n = counts[2];
-  Scratch<double, 2> room(n, padded(m)), turn_room(n, padded(n));
+  Scratch<double, 2> room(n, in_whole_lanes(m)), turn_room(n, in_whole_lanes(n));
   Scratch<double, 1> values(n);
   Scratch<Index, 1> places(n);
-  const Rows columns{room[0].data, padded(m)}, turns{turn_room[0].data, padded(n)};
+  const Rows columns{room[0].data, in_whole_lanes(m)}, turns{turn_room[0].data, in_whole_lanes(n)};
   bool all = true;
   for (Index i = 0; i < items.size(); ++i) {
     const Strided<double> given = items.matrix(0, i, 0);
@@ -217,7 +218,7 @@ void svd_loop(char** pointers, const Index* counts, const Index* strides, void*)
     const bool good = unit > 0.0 && orthogonalise(columns, turns, n);
     all = all && good;
     for (Index j = 0; j < n; ++j) {
-      values[j] = std::sqrt(inner_product(columns[j], columns[j], columns.stride));
+      values[j] = std::sqrt(dot(columns[j], columns[j], columns.stride));
     }
     sort_places(values.view().data, n, places.view().data, true);
     const Strided<double> u = items.matrix(1, i, 2), v = items.matrix(3, i, 5);
@@ -238,7 +239,7 @@ void svd_loop(char** pointers, const Index* counts, const Index* strides, void*)
 template <class T>
 void product_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Index m = counts[1], inner = counts[2], n = counts[3];
-  Scratch<T, 1> room((inner + 1) * MatrixLanes<T>::count);
+  Scratch<T, 1> room((inner + 1) * Lanes<T>::count);
   const Index* own = strides + 3;
   for (Index i = 0; i < counts[0]; ++i) {
     const Strided<T> a{pointers[0] + i * strides[0], own[0], own[1]};
@@ -259,15 +260,15 @@ void exponential_loop(char** pointers, const Index* counts, const Index* strides
   // clang-format on
   constexpr double theta = 5.371920351148152;  // the largest norm of full accuracy
   const Items items(pointers, counts, strides, 2);
-  const Index n = counts[1], width = padded(n), area = n * width;
+  const Index n = counts[1], width = in_whole_lanes(n), area = n * width;
   const Scratch<double, 2> powers(4, area), room(2, 2 * area);
-  const Scratch<double, 1> lanes((n + 1) * matrix_lanes);
+  const Scratch<double, 1> room_of_product((n + 1) * lanes);
   const auto matrix = [&](double* data) {
     return Strided<double>{reinterpret_cast<char*>(data), width * Index(sizeof(double)),
                            sizeof(double)};
   };
   const auto times = [&](double* left, double* right, double* to) {
-    multiply<double>(matrix(left), matrix(right), matrix(to), n, n, n, lanes.view().data);
+    multiply<double>(matrix(left), matrix(right), matrix(to), n, n, n, room_of_product.view().data);
   };
   double *one = powers[0].data, *two = powers[1].data, *four = powers[2].data;
   double *six = powers[3].data, *odd = room[0].data, *even = odd + area;

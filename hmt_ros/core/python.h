@@ -164,7 +164,6 @@ struct Member {
   const Name* outer;
   template <class T>
   operator T() const {
-    std::string text;
     try {
       return load<T>(PyTuple_GET_ITEM(tuple.ptr(), index), Name{"", nullptr});
     } catch (const py::builtin_exception& error) {

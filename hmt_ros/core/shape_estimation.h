@@ -36,7 +36,7 @@ inline void consider_shape(const Tables& mixed, const Tables& covariances, const
   expect_shape("of_shape", of_shape, {p, p});
   expect_shape("result", result, {k, d, d});
   const Scratch<double, 2> moved(d, p), spread(d, p);
-  const Scratch<double, 1> room((std::max(p, d) + 1) * matrices::matrix_lanes);
+  const Scratch<double, 1> room((std::max(p, d) + 1) * lanes);
   for (Index i = 0; i < k; ++i) {
     matrices::multiply(strided(covariances[i]), transposed(mixed[i]), strided(moved), d, d, p,
                        room.view().data);
@@ -63,9 +63,9 @@ inline bool limit_shift(const Table& covariance, const Mask& turns, double most_
     if (turns[i] && covariance(i, i) > 0.0) free.push_back(i);
   }
   if (largest <= most_turn) return true;
-  const Index n = static_cast<Index>(free.size()), right = matrices::padded(n);
-  const Scratch<double, 2> room(n, right + matrices::matrix_lanes);
-  const matrices::Rows rows{room.view().data, right + matrices::matrix_lanes};
+  const Index n = static_cast<Index>(free.size()), right = in_whole_lanes(n);
+  const Scratch<double, 2> room(n, right + lanes);
+  const matrices::Rows rows{room.view().data, right + lanes};
   const double held_back = 1.0 - most_turn / furthest;
   for (Index i = 0; i < n; ++i) {
     for (Index j = 0; j < n; ++j) rows[i][j] = covariance(free[i], free[j]);
@@ -103,12 +103,12 @@ inline bool inform_shape(const Table& by_shape, const Tables& curvature, const T
   expect_shape("information", information, {p, p});
   expect_shape("pull", pull, {p});
   const Scratch<double, 2> moved(d, p), given(p, p);
-  const Scratch<double, 1> shift(d), room((d + 1) * matrices::matrix_lanes);
+  const Scratch<double, 1> shift(d), room((d + 1) * lanes);
   information.fill(0.0);
   pull.fill(0.0);
   for (Index i = 0; i < k; ++i) {
     for (Index j = 0; j < d; ++j) {
-      shift[j] = matrices::inner_product(covariances[i][j].data, gradients[i].data, d);
+      shift[j] = dot(covariances[i][j].data, gradients[i].data, d);
     }
     if (!limit_shift(covariances[i], turns, most_turn, shift)) return false;
     matrices::multiply(strided(covariances[i]), transposed(mixed[i]), strided(moved), d, d, p,
@@ -116,7 +116,7 @@ inline bool inform_shape(const Table& by_shape, const Tables& curvature, const T
     matrices::multiply(strided(mixed[i]), strided(moved), strided(given), p, d, p,
                        room.view().data);
     for (Index a = 0; a < p; ++a) {
-      const double lost = matrices::inner_product(mixed[i][a].data, shift.view().data, d);
+      const double lost = dot(mixed[i][a].data, shift.view().data, d);
       pull[a] += weights[i] * (by_shape(i, a) - lost);
       for (Index b = 0; b < p; ++b) {
         information(a, b) += weights[i] * (curvature(i, a, b) - given(a, b));

@@ -6,24 +6,14 @@
 
 #include "arrays.h"
 #include "elementary.h"
+#include "lanes.h"
 #include "wide.h"
 
 namespace hmt::matrices {
 
-// A row's numbers in groups of 64 bytes, whatever the processor has.
-template <class T>
-struct MatrixLanes {
-  typedef T Group __attribute__((vector_size(64), aligned(alignof(T)), may_alias));
-  static constexpr Index count = 64 / sizeof(T);
-};
-template <class T>
-using Group = typename MatrixLanes<T>::Group;
-
-inline constexpr Index matrix_lanes = MatrixLanes<double>::count;
-inline Index padded(Index n) { return (n + matrix_lanes - 1) / matrix_lanes * matrix_lanes; }
 HMT_INLINE Group<double>& group(double* row) { return *reinterpret_cast<Group<double>*>(row); }
 
-// Rows of numbers at distances that are a multiple of `matrix_lanes`.
+// Rows of numbers at distances that are a multiple of `lanes`.
 struct Rows {
   double* data;
   Index stride;
@@ -31,10 +21,10 @@ struct Rows {
 };
 
 HMT_INLINE void subtract(double* row, double factor, double* other, Index first, Index last) {
-  for (Index b = first; b < last; b += matrix_lanes) group(row + b) -= factor * group(other + b);
+  for (Index b = first; b < last; b += lanes) group(row + b) -= factor * group(other + b);
 }
 HMT_INLINE void divide(double* row, double divisor, Index first, Index last) {
-  for (Index b = first; b < last; b += matrix_lanes) group(row + b) /= divisor;
+  for (Index b = first; b < last; b += lanes) group(row + b) /= divisor;
 }
 
 // Cholesky factorisation, rows of the upper factor in place; reads and leaves right what is not
@@ -43,9 +33,8 @@ HMT_WIDE inline bool factorise(Rows u, Index n) {
   for (Index a = 0; a < n; ++a) {
     double* row = u[a];
     if (!(row[a] > 0.0)) return false;
-    divide(row, std::sqrt(row[a]), a / matrix_lanes * matrix_lanes, u.stride);
-    for (Index c = a + 1; c < n; ++c)
-      subtract(u[c], row[c], row, c / matrix_lanes * matrix_lanes, u.stride);
+    divide(row, std::sqrt(row[a]), a / lanes * lanes, u.stride);
+    for (Index c = a + 1; c < n; ++c) subtract(u[c], row[c], row, c / lanes * lanes, u.stride);
   }
   return true;
 }
@@ -60,10 +49,10 @@ HMT_WIDE inline double eliminate(Rows u, Index n) {
       if (std::abs(u[i][j]) > std::abs(u[largest][j])) largest = i;
     }
     double* row = u[j];
-    const Index first = j / matrix_lanes * matrix_lanes;
+    const Index first = j / lanes * lanes;
     if (largest != j) {
       sign = -sign;
-      for (Index b = first; b < u.stride; b += matrix_lanes) {
+      for (Index b = first; b < u.stride; b += lanes) {
         const Group<double> other = group(row + b);
         group(row + b) = group(u[largest] + b);
         group(u[largest] + b) = other;
@@ -106,18 +95,18 @@ HMT_WIDE inline bool invert_positive(Rows u, Index n, Rows room, double& log_det
     if (!(row[a] > 0.0)) return false;
     log_determinant += elementary::log(row[a]);
     const double root = std::sqrt(row[a]);
-    const Index filled = padded(a + 1);
-    divide(row, root, a / matrix_lanes * matrix_lanes, u.stride);
+    const Index filled = in_whole_lanes(a + 1);
+    divide(row, root, a / lanes * lanes, u.stride);
     divide(own, root, 0, filled);
     for (Index c = a + 1; c < n; ++c) {
       subtract(room[c], row[c], own, 0, filled);
-      subtract(u[c], row[c], row, c / matrix_lanes * matrix_lanes, u.stride);
+      subtract(u[c], row[c], row, c / lanes * lanes, u.stride);
     }
   }
   for (Index a = 0; a < n; ++a) {
     double* row = u[a];
     std::fill_n(row, u.stride, 0.0);
-    for (Index k = a; k < n; ++k) subtract(row, -room[k][a], room[k], 0, padded(a + 1));
+    for (Index k = a; k < n; ++k) subtract(row, -room[k][a], room[k], 0, in_whole_lanes(a + 1));
     for (Index c = 0; c < a; ++c) u[c][a] = row[c];
   }
   return true;
@@ -125,7 +114,7 @@ HMT_WIDE inline bool invert_positive(Rows u, Index n, Rows room, double& log_det
 
 // Turns two rows by an angle.
 HMT_INLINE void rotate(double* p, double* q, double cosine, double sine, Index width) {
-  for (Index b = 0; b < width; b += matrix_lanes) {
+  for (Index b = 0; b < width; b += lanes) {
     const Group<double> old = group(p + b);
     group(p + b) = cosine * old - sine * group(q + b);
     group(q + b) = sine * old + cosine * group(q + b);
@@ -134,34 +123,16 @@ HMT_INLINE void rotate(double* p, double* q, double cosine, double sine, Index w
 
 inline constexpr int most_sweeps = 60;
 
-// Sum of products in `count` sums by place, which are then added in pairs.
-template <class T>
-HMT_INLINE T inner_product(const T* x, const T* y, Index n) {
-  constexpr Index count = MatrixLanes<T>::count;
-  Group<T> sums{};
-  Index i = 0;
-  for (; i + count <= n; i += count) {
-    sums += *reinterpret_cast<const Group<T>*>(x + i) * *reinterpret_cast<const Group<T>*>(y + i);
-  }
-  T each[count];
-  *reinterpret_cast<Group<T>*>(each) = sums;
-  for (Index k = 0; i + k < n; ++k) each[k] += x[i + k] * y[i + k];
-  for (Index half = count / 2; half > 0; half /= 2) {
-    for (Index k = 0; k < half; ++k) each[k] += each[k + half];
-  }
-  return each[0];
-}
-
 // Reduces a symmetric matrix to tridiagonal form by reflections: its diagonal and what lies beside
 // it. Row k keeps the reflection k right of its diagonal, `scales` its factor; `work` holds a row.
 HMT_WIDE inline void make_tridiagonal(Rows a, Index n, double* diagonal, double* beside,
                                       double* scales, double* work) {
   for (Index k = 0; k + 1 < n; ++k) {
     double* v = a[k];
-    const Index first = (k + 1) / matrix_lanes * matrix_lanes;
+    const Index first = (k + 1) / lanes * lanes;
     diagonal[k] = v[k];
     std::fill(v + first, v + k + 1, 0.0);
-    const double square = inner_product(v + first, v + first, a.stride - first);
+    const double square = dot(v + first, v + first, a.stride - first);
     const double length = v[k + 1] > 0.0 ? -std::sqrt(square) : std::sqrt(square);
     const double own = v[k + 1] * length;
     beside[k] = length;
@@ -171,7 +142,7 @@ HMT_WIDE inline void make_tridiagonal(Rows a, Index n, double* diagonal, double*
     std::fill(work + first, work + a.stride, 0.0);
     for (Index j = k + 1; j < n; ++j) subtract(work, -scales[k] * v[j], a[j], first, a.stride);
     std::fill(work + first, work + k + 1, 0.0);
-    const double share = 0.5 * scales[k] * inner_product(work + first, v + first, a.stride - first);
+    const double share = 0.5 * scales[k] * dot(work + first, v + first, a.stride - first);
     subtract(work, share, v, first, a.stride);
     for (Index j = k + 1; j < n; ++j) {
       subtract(a[j], v[j], work, first, a.stride);
@@ -247,9 +218,9 @@ HMT_WIDE inline bool orthogonalise(Rows columns, Rows turns, Index count) {
     bool turned = false;
     for (Index p = 0; p < count; ++p) {
       for (Index q = p + 1; q < count; ++q) {
-        const double own = inner_product(columns[p], columns[p], columns.stride);
-        const double others = inner_product(columns[q], columns[q], columns.stride);
-        const double x = inner_product(columns[p], columns[q], columns.stride);
+        const double own = dot(columns[p], columns[p], columns.stride);
+        const double others = dot(columns[q], columns[q], columns.stride);
+        const double x = dot(columns[p], columns[q], columns.stride);
         const double small = 0x1p-49 * std::sqrt(own) * std::sqrt(others);
         if (!(std::abs(x) > most(small, 0x1p-110))) continue;
         turned = true;
@@ -289,7 +260,7 @@ struct Strided {
 template <class T, int R, int G>
 HMT_INLINE void multiply_rows(Strided<T> a, Index first, const T* b, Index b_stride, Index inner,
                               Strided<T> result, Index column, Index columns) {
-  constexpr Index count = MatrixLanes<T>::count;
+  constexpr Index count = Lanes<T>::count;
   Group<T> sums[R][G] = {};
   for (Index k = 0; k < inner; ++k) {
     for (int c = 0; c < G; ++c) {
@@ -322,11 +293,11 @@ HMT_INLINE void multiply_columns(Strided<T> a, const T* b, Index b_stride, Index
 }
 
 // Matrix product (m, inner) (inner, n); `room` for inner groups of numbers. The sums of a single
-// column are those of `inner_product`.
+// column are those of `dot`.
 template <class T>
 HMT_WIDE void multiply(Strided<T> a, Strided<T> b, Strided<T> result, Index m, Index inner, Index n,
                        T* room) {
-  constexpr Index count = MatrixLanes<T>::count;
+  constexpr Index count = Lanes<T>::count;
   if (n == 1) {
     T* other = room + inner;
     for (Index k = 0; k < inner; ++k) room[k] = b(k, 0);
@@ -336,7 +307,7 @@ HMT_WIDE void multiply(Strided<T> a, Strided<T> b, Strided<T> result, Index m, I
         for (Index k = 0; k < inner; ++k) other[k] = a(i, k);
         row = other;
       }
-      result(i, 0) = inner_product(row, room, inner);
+      result(i, 0) = dot(row, room, inner);
     }
     return;
   }

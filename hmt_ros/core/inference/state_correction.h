@@ -13,7 +13,7 @@ namespace matrices {
 class Blocks {
  public:
   Blocks(Index rows, std::initializer_list<Index> columns) : starts_{0} {
-    for (Index count : columns) starts_.push_back(starts_.back() + padded(count));
+    for (Index count : columns) starts_.push_back(starts_.back() + in_whole_lanes(count));
     numbers_ = std::make_unique<double[]>(rows * starts_.back());
   }
   Rows rows() const { return {numbers_.get(), starts_.back()}; }
@@ -88,7 +88,7 @@ inline void widen_precisions(const Tables& precisions, const Places& ancestors,
   expect_range("ancestors", ancestors, 0, precisions.size());
   expect_shape("jumped", jumped, {count, d});
   expect_shape("result", result, {count, d, d});
-  const Scratch<double, 1> room((d + 1) * matrix_lanes);
+  const Scratch<double, 1> room((d + 1) * lanes);
   const Scratch<double, 2> loss(d, d);
   std::vector<Index> rows;
   for (Index n = 0; n < count; ++n) {
@@ -124,7 +124,7 @@ inline void fuse(const Tables& a, const Tables& b, const Tensor& result) {
   expect_shape("a", a, {-1, d, d});
   expect_shape("b", b, {a.size(), d, d});
   expect_shape("result", result, {a.size(), d, d});
-  const Scratch<double, 1> room((d + 1) * matrix_lanes);
+  const Scratch<double, 1> room((d + 1) * lanes);
   const Scratch<double, 2> loss(d, d);
   const Blocks blocks(d, {d, d});
   for (Index n = 0; n < a.size(); ++n) {
@@ -169,7 +169,7 @@ inline void correct_states(const Predicted& predicted, const Places& ancestors,
   expect_shape("found", found, {count, d, d});
   expect_shape("velocities", velocities, {count, d});
   expect_shape("result", result, {count, 2 * d, 2 * d});
-  const Scratch<double, 1> room((d + 1) * matrix_lanes), offset(d);
+  const Scratch<double, 1> room((d + 1) * lanes), offset(d);
   const Scratch<double, 2> loss(d, d), together(d, d), gain(d, d);
   const Blocks blocks(d, {d, d});
   for (Index n = 0; n < count; ++n) {
@@ -230,7 +230,7 @@ inline void condition(const Numbers& mean, const Table& covariance, const Number
   }
   // With P_xx + R = U' U the blocks beside it become Y = U'^-1 P_x. and y = U'^-1 offset.
   expect_factor(factorise(blocks.rows(), d));
-  const Scratch<double, 1> room((d + 1) * matrix_lanes);
+  const Scratch<double, 1> room((d + 1) * lanes);
   multiply<double>(blocks.transposed(1), blocks.matrix(1), rows_of(left.data, n), n, d, n,
                    room.view().data);
   multiply<double>(blocks.transposed(1), blocks.matrix(2), rows_of(moved.data, 1), n, d, 1,

@@ -19,7 +19,7 @@ inline void free_covariances(const Array<const double, 4>& hessians, const Numbe
   expect_shape("free", free, {n, d});
   expect_shape("covariances", covariances, {n, d, d});
   expect_shape("log_determinants", log_determinants, {n});
-  const Index width = matrices::padded(d);
+  const Index width = in_whole_lanes(d);
   Scratch<double, 2> sum(d, d), room(d, width), other(d, width);
   const matrices::Rows rows{room.view().data, width}, inverse{other.view().data, width};
   for (Index k = 0; k < n; ++k) {
@@ -90,7 +90,7 @@ inline void determined(const Numbers& weights, const Tables& covariances,
   for (Index k = 0; k < n; ++k) {
     for (Index c = 0; c < cues; ++c) {
       // Both are symmetric.
-      const double trace = matrices::inner_product(covariances[k].data, hessians[k][c].data, d * d);
+      const double trace = dot(covariances[k].data, hessians[k][c].data, d * d);
       amounts[c] += weights[k] * trace;
     }
   }
