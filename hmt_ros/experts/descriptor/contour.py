@@ -221,16 +221,11 @@ def centred_view(blob: PersonBlob, camera: Camera, level: Array = UPRIGHT) -> By
     reach = float(np.abs(seen[:, :2] / np.maximum(seen[:, 2:], 0.1)).max())
     focal = 0.5 * FILLED * SIDE / reach
     centre = 0.5 * (SIDE - 1)
-    u, v = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
-    rays = np.stack([(u - centre) / focal, (v - centre) / focal, np.ones_like(u, float)], -1)
-    pixels = camera.project(product(rays, turn.T)).astype(np.float32)
-    pixels -= np.array([blob.left, blob.top], dtype=np.float32)
-    columns, rows = np.where(np.isfinite(pixels), pixels, -1e4).transpose(2, 0, 1)
-    drawn = cv2.remap(
-        blob.mask * np.uint8(255),
-        np.ascontiguousarray(columns, dtype=np.float32),
-        np.ascontiguousarray(rows, dtype=np.float32),
-        cv2.INTER_LINEAR,
-    )
+    across = (np.arange(SIDE) - centre) / focal
+    rays = np.array([x * across + y * across[:, None] + z for x, y, z in turn])
+    pixels, _ = camera.project_with_derivative(rays, derivative=False)
+    pixels = np.where(np.isfinite(pixels), pixels, -1e4).astype(np.float32)
+    columns, rows = pixels[0] - np.float32(blob.left), pixels[1] - np.float32(blob.top)
+    drawn = cv2.remap(blob.mask * np.uint8(255), columns, rows, cv2.INTER_LINEAR)
     result: Bytes = (drawn > 127).astype(np.uint8)
     return result if result.any() else blob.mask
