@@ -27,6 +27,7 @@ from hmt_ros.body.skeleton import Skeleton, sided_pairs
 from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product
+from hmt_ros.inference.logistic import probability_of
 
 # How a part of the flesh differs from that of the model, column by column: logarithms of factors on
 # the x and y radii, distances by which it exceeds the start and the end of its segment more than
@@ -368,7 +369,7 @@ class Symmetry:
 
     def after(self, log_odds: float, dt: float) -> float:
         """Log odds of the mapped pose dt seconds later."""
-        p = 1.0 / (1.0 + float(elementary.exp(-log_odds)))
+        p = float(probability_of(log_odds))
         p += self.probability(dt) * (1.0 - 2.0 * p)
         return float(elementary.log(p) - elementary.log1p(-p))
 

@@ -32,7 +32,7 @@ from hmt_ros.body.kinematics import Frames, forward, point_jacobians, point_posi
 from hmt_ros.body.skeleton import Skeleton, other_side
 from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.linear_algebra import product
+from hmt_ros.inference.linear_algebra import product, unit
 
 # Mean lean forwards of trunk and pelvis, and the deviations sideways and forwards or back, rad.
 # People differ: from hips to neck the clips lean from 9 degrees back to 9 forwards in the mean. The
@@ -226,11 +226,6 @@ def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
     sine, cosine = elementary.sin(lean), elementary.cos(lean)
     up, ahead = cosine * up - sine * ahead, cosine * ahead + sine * up
     return np.asarray(product([np.cross(ahead, up), ahead, up], columns[segment].T))
-
-
-def unit(vectors: Array) -> Array:
-    """Vectors (..., 3) of length 1."""
-    return np.asarray(vectors / np.sqrt((vectors * vectors).sum(-1, keepdims=True)))
 
 
 def _across(vector: Array, axis: Array) -> Array:

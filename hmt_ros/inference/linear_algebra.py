@@ -41,6 +41,11 @@ def length(vector: ArrayLike) -> float:
     return float(np.sqrt((vector * vector).sum()))
 
 
+def unit(vectors: Array) -> Array:
+    """Vectors (..., n) of length 1."""
+    return np.asarray(vectors / np.sqrt((vectors * vectors).sum(-1, keepdims=True)))
+
+
 def cholesky(matrix: ArrayLike) -> Array:
     """Lower triangular factor L of L L^T, from the lower triangle of a matrix (..., n, n)."""
     with _checked(_NOT_POSITIVE):
@@ -60,11 +65,6 @@ def solve_triangular(
     if transposed:
         factor, lower = np.swapaxes(factor, -1, -2), not lower
     return _solved(matrices.solve_lower if lower else matrices.solve_upper, factor, right)
-
-
-def solve_positive(factor: ArrayLike, right: ArrayLike) -> Array:
-    """X of L L^T X = B, for a lower factor L (..., n, n)."""
-    return solve_triangular(factor, solve_triangular(factor, right), transposed=True)
 
 
 def inverse(matrix: ArrayLike) -> Array:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import exponential, log_sum_exp, product, solve
+from hmt_ros.inference.logistic import probability_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,5 +86,5 @@ def update(p: ArrayLike, log_likelihoods: ArrayLike) -> Array:
 
 def of_log_odds(log_odds: ArrayLike) -> Array:
     """Probabilities (..., 2) of a chain of two states, by the log odds of the second one, nats."""
-    is_so = 0.5 * (1.0 + elementary.tanh(0.5 * np.asarray(log_odds, dtype=np.float64)))
+    is_so = probability_of(log_odds)
     return np.stack([1.0 - is_so, is_so], axis=-1)

@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import logsumexp
 
 from hmt_ros.core import elementary
 from hmt_ros.inference import linear_algebra
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.linear_algebra import product
+from hmt_ros.inference.linear_algebra import log_sum_exp, product
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +114,7 @@ class GaussianMixture:
         """log p(x), shape (N,), of points x (N, d)."""
         with np.errstate(divide='ignore'):
             log_weights = elementary.log(self.weights)
-        return np.asarray(logsumexp(self.component_log_densities(x) + log_weights, axis=1))
+        return np.asarray(log_sum_exp(self.component_log_densities(x) + log_weights))
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws n points, (n, d)."""

@@ -32,7 +32,6 @@ from hmt_ros.body.ground_terms import (
     masses,
     sole_points,
     soles,
-    unit,
 )
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import turned
@@ -41,7 +40,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.vertical_lines import Vertical, seen_vertical
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.error_model import seconds
-from hmt_ros.inference.linear_algebra import inverse, product, symmetric_eigen
+from hmt_ros.inference.linear_algebra import inverse, length, product, symmetric_eigen, unit
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.settings import (
@@ -106,12 +105,12 @@ def unit_vector(up: ArrayLike) -> Array:
         ValueError: another shape, or a length that is not 1 within 1 %.
     """
     vector = np.array(up, dtype=np.float64)
-    length = _length(vector) if vector.shape == IMAGE_UP.shape else np.nan
-    if not abs(length - 1.0) < 0.01:
+    size = length(vector) if vector.shape == IMAGE_UP.shape else np.nan
+    if not abs(size - 1.0) < 0.01:
         raise ValueError(
             f'up must be a unit vector (3,) against gravity in the camera frame, saw {vector}'
         )
-    result: Array = vector / length
+    result: Array = vector / size
     result.setflags(write=False)
     return result
 
@@ -195,7 +194,7 @@ class GroundEstimator:
     ) -> None:
         """Takes a newer direction (3,) against gravity, camera frame, and height of the camera."""
         before, vector = self.known.up, unit_vector(up)
-        self.turning = before is not None and _length(vector - before) > TURN_NOISE
+        self.turning = before is not None and length(vector - before) > TURN_NOISE
         height = self.known.camera_height if camera_height is None else camera_height
         self.known = KnownGround(vector, height, up_sigma)
         self._conclude()
@@ -234,8 +233,8 @@ class GroundEstimator:
         """Takes in which way up a detector sees the person, by names of our joints."""
         if self.known.up is not None:
             trunk = keypoints.trunk
-            length = max(_length(trunk), np.finfo(np.float64).eps)
-            self._by_keypoints += _dot(trunk, self.known.up[:2]) / length
+            size = max(length(trunk), np.finfo(np.float64).eps)
+            self._by_keypoints += _dot(trunk, self.known.up[:2]) / size
             self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
@@ -328,7 +327,7 @@ class GroundEstimator:
         self._levels.append((self._time, level))
         while self._levels[0][0] < self._time - LEVEL_TIME:
             self._levels.popleft()
-        self._distance = _length(place - up * _dot(up, place))
+        self._distance = length(place - up * _dot(up, place))
         self._conclude()
 
     def _said_by_person(self, cosine: float, dt: float) -> float:
@@ -341,8 +340,8 @@ class GroundEstimator:
 
     def _follow_axis(self, axis: Array, place: Array, resting: float, dt: float) -> None:
         """Moves the vertical by the mean axis (3,) of the body at a place (3,)."""
-        length = _length(axis)
-        if dt <= 0 or resting <= 0 or length == 0:
+        size = length(axis)
+        if dt <= 0 or resting <= 0 or size == 0:
             return
         ray = unit(place)
         along = np.outer(ray, ray)
@@ -350,7 +349,7 @@ class GroundEstimator:
         error = error * max(VERTICAL_TIME / (resting * dt), 1.0)
         covariance = self._covariance + UP_DRIFT**2 * dt * AXES
         gain = product(covariance, inverse(covariance + error))
-        mean = unit(self._mean + product(gain, axis / length - self._mean))
+        mean = unit(self._mean + product(gain, axis / size - self._mean))
         most = 2.0 * UP_SIGMA
         cosine = _dot(mean, IMAGE_UP)
         if elementary.arccos(min(max(cosine, -1.0), 1.0)) > most:
@@ -391,10 +390,6 @@ class GroundEstimator:
 def _dot(a: Array, b: Array) -> float:
     """Scalar product of vectors (N,)."""
     return float(product(a, b))
-
-
-def _length(vector: Array) -> float:
-    return math.sqrt(_dot(vector, vector))
 
 
 def _quantile(rising: list[float], share: float) -> float:
