@@ -74,7 +74,7 @@ inline constexpr Index panel_columns = lanes;  // eliminated at a time
 
 // The numbers of a group, of which only `count` are there.
 HMT_INLINE void take(const double* from, Index count, Group<double>& to) {
-  double each[lanes] = {};
+  double each[group_size] = {};
   std::copy_n(from, count, each);
   to = matrices::group(each);
 }
@@ -84,13 +84,13 @@ HMT_INLINE void take(const double* from, Index count, Group<double>& to) {
 template <int R>
 HMT_INLINE void subtract_products(double* target, Index width, const double* from, Index stride,
                                   Index count, Index rows) {
-  for (Index i = 0; i < rows; i += lanes) {
-    const Index here = std::min(lanes, rows - i);
-    const bool whole = here == lanes && i > 0;
+  for (Index i = 0; i < rows; i += group_size) {
+    const Index here = std::min(group_size, rows - i);
+    const bool whole = here == group_size && i > 0;
     Group<double> sums[R];
     for (int r = 0; r < R; ++r) {
       double* column = target + r * width + i;
-      if (here == lanes) {
+      if (here == group_size) {
         sums[r] = matrices::group(column);
       } else {
         take(column, here, sums[r]);
@@ -106,7 +106,7 @@ HMT_INLINE void subtract_products(double* target, Index width, const double* fro
       if (whole) {
         matrices::group(column) = sums[r];
       } else {  // neither above the diagonal nor below the band
-        double each[lanes];
+        double each[group_size];
         matrices::group(each) = sums[r];
         for (Index b = i == 0 ? r : 0; b < here; ++b) column[b] = each[b];
       }
@@ -131,7 +131,7 @@ HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& roo
       const double pivot = row[k];
       if (!(pivot > 0.0 && pivot < infinity)) return first + k;
       const double root = std::sqrt(pivot), inverse = 1.0 / root;
-      for (Index b = 0; b < stride; b += lanes) matrices::group(row + b) *= inverse;
+      for (Index b = 0; b < stride; b += group_size) matrices::group(row + b) *= inverse;
       row[k] = root;
       for (Index p = k + 1; p < count; ++p) {
         matrices::subtract(room.data + p * stride, row[p], row, 0, stride);
@@ -171,7 +171,7 @@ HMT_WIDE inline void solve_band_lower(const Matrix& columns, const Matrix& x) {
       double* to = x.data + s * total + c;
       const double own = to[0] /= column[0];
       Index b = 1;
-      for (; b + lanes <= last; b += lanes) {
+      for (; b + group_size <= last; b += group_size) {
         matrices::group(to + b) -= own * *reinterpret_cast<const Group<double>*>(column + b);
       }
       for (; b < last; ++b) to[b] -= own * column[b];

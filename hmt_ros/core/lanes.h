@@ -26,25 +26,30 @@ inline double sum_of(const double* x, Index count) {
   return sum_lanes(sums);
 }
 
-// Numbers in groups of 64 bytes, whatever the processor has.
+// Numbers in groups of 32 bytes: compilers split larger ones badly where registers are not as wide.
 template <class T>
 struct Lanes {
-  typedef T Group __attribute__((vector_size(64), aligned(alignof(T)), may_alias));
-  static constexpr Index count = 64 / sizeof(T);
+  typedef T Group __attribute__((vector_size(32), aligned(alignof(T)), may_alias));
+  static constexpr Index count = 32 / sizeof(T);
 };
 template <class T>
 using Group = typename Lanes<T>::Group;
+inline constexpr Index group_size = Lanes<double>::count;
 
-// Sum of x[i] y[i] over i < n: of partial sums by i % count, which are added in pairs, and then,
-// one after the other, of the products that are left beyond whole groups.
+// Sum of x[i] y[i] over i < n: of partial sums by i % (2 count), which are added in pairs, and
+// then, one after the other, of the products that are left beyond whole pairs of groups.
 template <class T>
 HMT_INLINE T dot(const T* x, const T* y, Index n) {
   constexpr Index count = Lanes<T>::count;
-  Group<T> sums{};
+  Group<T> sums{}, others{};
   Index i = 0;
-  for (; i + count <= n; i += count) {
-    sums += *reinterpret_cast<const Group<T>*>(x + i) * *reinterpret_cast<const Group<T>*>(y + i);
+  for (; i + 2 * count <= n; i += 2 * count) {
+    const auto* left = reinterpret_cast<const Group<T>*>(x + i);
+    const auto* right = reinterpret_cast<const Group<T>*>(y + i);
+    sums += left[0] * right[0];
+    others += left[1] * right[1];
   }
+  sums += others;
   for (Index half = count / 2; half > 0; half /= 2) {
     for (Index k = 0; k < half; ++k) sums[k] += sums[k + half];
   }

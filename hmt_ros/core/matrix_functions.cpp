@@ -239,7 +239,7 @@ void svd_loop(char** pointers, const Index* counts, const Index* strides, void*)
 template <class T>
 void product_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Index m = counts[1], inner = counts[2], n = counts[3];
-  Scratch<T, 1> room((inner + 1) * Lanes<T>::count);
+  Scratch<T, 1> room((inner + 1) * 2 * Lanes<T>::count);
   const Index* own = strides + 3;
   for (Index i = 0; i < counts[0]; ++i) {
     const Strided<T> a{pointers[0] + i * strides[0], own[0], own[1]};

@@ -13,7 +13,7 @@ namespace hmt::matrices {
 
 HMT_INLINE Group<double>& group(double* row) { return *reinterpret_cast<Group<double>*>(row); }
 
-// Rows of numbers at distances that are a multiple of `lanes`.
+// Rows of numbers at distances that are a multiple of `group_size`.
 struct Rows {
   double* data;
   Index stride;
@@ -21,10 +21,10 @@ struct Rows {
 };
 
 HMT_INLINE void subtract(double* row, double factor, double* other, Index first, Index last) {
-  for (Index b = first; b < last; b += lanes) group(row + b) -= factor * group(other + b);
+  for (Index b = first; b < last; b += group_size) group(row + b) -= factor * group(other + b);
 }
 HMT_INLINE void divide(double* row, double divisor, Index first, Index last) {
-  for (Index b = first; b < last; b += lanes) group(row + b) /= divisor;
+  for (Index b = first; b < last; b += group_size) group(row + b) /= divisor;
 }
 
 // Cholesky factorisation, rows of the upper factor in place; reads and leaves right what is not
@@ -33,8 +33,9 @@ HMT_WIDE inline bool factorise(Rows u, Index n) {
   for (Index a = 0; a < n; ++a) {
     double* row = u[a];
     if (!(row[a] > 0.0)) return false;
-    divide(row, std::sqrt(row[a]), a / lanes * lanes, u.stride);
-    for (Index c = a + 1; c < n; ++c) subtract(u[c], row[c], row, c / lanes * lanes, u.stride);
+    divide(row, std::sqrt(row[a]), a / group_size * group_size, u.stride);
+    for (Index c = a + 1; c < n; ++c)
+      subtract(u[c], row[c], row, c / group_size * group_size, u.stride);
   }
   return true;
 }
@@ -49,10 +50,10 @@ HMT_WIDE inline double eliminate(Rows u, Index n) {
       if (std::abs(u[i][j]) > std::abs(u[largest][j])) largest = i;
     }
     double* row = u[j];
-    const Index first = j / lanes * lanes;
+    const Index first = j / group_size * group_size;
     if (largest != j) {
       sign = -sign;
-      for (Index b = first; b < u.stride; b += lanes) {
+      for (Index b = first; b < u.stride; b += group_size) {
         const Group<double> other = group(row + b);
         group(row + b) = group(u[largest] + b);
         group(u[largest] + b) = other;
@@ -96,11 +97,11 @@ HMT_WIDE inline bool invert_positive(Rows u, Index n, Rows room, double& log_det
     log_determinant += elementary::log(row[a]);
     const double root = std::sqrt(row[a]);
     const Index filled = in_whole_lanes(a + 1);
-    divide(row, root, a / lanes * lanes, u.stride);
+    divide(row, root, a / group_size * group_size, u.stride);
     divide(own, root, 0, filled);
     for (Index c = a + 1; c < n; ++c) {
       subtract(room[c], row[c], own, 0, filled);
-      subtract(u[c], row[c], row, c / lanes * lanes, u.stride);
+      subtract(u[c], row[c], row, c / group_size * group_size, u.stride);
     }
   }
   for (Index a = 0; a < n; ++a) {
@@ -114,7 +115,7 @@ HMT_WIDE inline bool invert_positive(Rows u, Index n, Rows room, double& log_det
 
 // Turns two rows by an angle.
 HMT_INLINE void rotate(double* p, double* q, double cosine, double sine, Index width) {
-  for (Index b = 0; b < width; b += lanes) {
+  for (Index b = 0; b < width; b += group_size) {
     const Group<double> old = group(p + b);
     group(p + b) = cosine * old - sine * group(q + b);
     group(q + b) = sine * old + cosine * group(q + b);
@@ -129,7 +130,7 @@ HMT_WIDE inline void make_tridiagonal(Rows a, Index n, double* diagonal, double*
                                       double* scales, double* work) {
   for (Index k = 0; k + 1 < n; ++k) {
     double* v = a[k];
-    const Index first = (k + 1) / lanes * lanes;
+    const Index first = (k + 1) / group_size * group_size;
     diagonal[k] = v[k];
     std::fill(v + first, v + k + 1, 0.0);
     const double square = dot(v + first, v + first, a.stride - first);
@@ -281,23 +282,23 @@ template <class T, int G>
 HMT_INLINE void multiply_columns(Strided<T> a, const T* b, Index b_stride, Index m, Index inner,
                                  Strided<T> result, Index column, Index columns) {
   Index i = 0;
-  if constexpr (G == 1) {
+  if constexpr (G == 2) {
     for (; i + 6 <= m; i += 6) {
-      multiply_rows<T, 6, 1>(a, i, b, b_stride, inner, result, column, columns);
+      multiply_rows<T, 6, 2>(a, i, b, b_stride, inner, result, column, columns);
     }
     for (; i + 2 <= m; i += 2) {
-      multiply_rows<T, 2, 1>(a, i, b, b_stride, inner, result, column, columns);
+      multiply_rows<T, 2, 2>(a, i, b, b_stride, inner, result, column, columns);
     }
   }
   for (; i < m; ++i) multiply_rows<T, 1, G>(a, i, b, b_stride, inner, result, column, columns);
 }
 
-// Matrix product (m, inner) (inner, n); `room` for inner groups of numbers. The sums of a single
+// Matrix product (m, inner) (inner, n); `room` for inner pairs of groups. The sums of a single
 // column are those of `dot`.
 template <class T>
 HMT_WIDE void multiply(Strided<T> a, Strided<T> b, Strided<T> result, Index m, Index inner, Index n,
                        T* room) {
-  constexpr Index count = Lanes<T>::count;
+  constexpr Index count = 2 * Lanes<T>::count;
   if (n == 1) {
     T* other = room + inner;
     for (Index k = 0; k < inner; ++k) room[k] = b(k, 0);
@@ -315,10 +316,10 @@ HMT_WIDE void multiply(Strided<T> a, Strided<T> b, Strided<T> result, Index m, I
   const Index stride = b.row / Index(sizeof(T));
   Index column = 0;
   for (; together && m < 6 && column + 4 * count <= n; column += 4 * count) {
-    multiply_columns<T, 4>(a, &b(0, column), stride, m, inner, result, column, 4 * count);
+    multiply_columns<T, 8>(a, &b(0, column), stride, m, inner, result, column, 4 * count);
   }
   for (; together && column + count <= n; column += count) {
-    multiply_columns<T, 1>(a, &b(0, column), stride, m, inner, result, column, count);
+    multiply_columns<T, 2>(a, &b(0, column), stride, m, inner, result, column, count);
   }
   for (; column < n; column += count) {
     const Index columns = std::min(count, n - column);
@@ -326,7 +327,7 @@ HMT_WIDE void multiply(Strided<T> a, Strided<T> b, Strided<T> result, Index m, I
       for (Index j = 0; j < columns; ++j) room[k * count + j] = b(k, column + j);
       for (Index j = columns; j < count; ++j) room[k * count + j] = T(0);
     }
-    multiply_columns<T, 1>(a, room, count, m, inner, result, column, columns);
+    multiply_columns<T, 2>(a, room, count, m, inner, result, column, columns);
   }
 }
 
