@@ -38,7 +38,7 @@ class Limbs(NamedTuple):
         segments, parents, mounts, mounted, lengths, first_dofs, own, lower, upper, sides: those of
             `ChainLinks`, filled up to the largest limb.
         joint_segments, joint_offsets: (C, J), (C, J, 3) of the joints that a limb moves.
-        siblings: (C,) the limb of the other side; -1: there is none.
+        siblings: (C,) the limb of the other side; -1 for a limb without one.
     """
 
     links: NDArray[np.int64]

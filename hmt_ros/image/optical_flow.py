@@ -3,8 +3,8 @@
     E(x) = w / Q sum_q rho(|u_q(x) - p_q - f(p_q)| / (sigma + 0.15 |f(p_q)|))
 
 Q points of the surface were seen at pixels p_q of the image before; the pose x moves them to
-u_q(x), and f is the flow (`core/flow.h`). Predictions follow it; it is no evidence about which mode
-is right, since each compares points of its own.
+u_q(x), and f is the flow (`core/flow.h`). Predictions follow the flow. It does not
+compare modes, because each mode has its own points.
 """
 
 from __future__ import annotations

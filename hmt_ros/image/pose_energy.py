@@ -70,8 +70,8 @@ class Compiled(NamedTuple):
         model, inputs: of the terms of the image.
         image, contour: whether one of these is on, and whether one that is on needs the contour.
         keypoints, prior, overlaps, ground, flow: of the other terms.
-        centres, precisions: (R, f), (R, f, f) of the motion, a row a problem or one for all; no
-            rows: there is none.
+        centres, precisions: (R, f), (R, f, f) of the motion, a row a problem or one for all;
+            (0, f), (0, f, f) without a motion.
         tails: its degrees of freedom; 0: it is Gaussian.
     """
 

@@ -101,12 +101,12 @@ class _At:
 
 
 class LineSearch:
-    """A step along a direction, of which values and slopes are told one by one.
+    """A line search: `advance` takes the value and the slope at each step that it asks for.
 
     Attributes:
         step: the next step to evaluate, or the one that was found.
         found: whether it meets the conditions.
-        ended: whether there is no more to evaluate.
+        ended: whether the search is over.
         count: evaluations.
     """
 

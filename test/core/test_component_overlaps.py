@@ -126,5 +126,12 @@ def test_numbers_out_of_range_are_refused(name, value):
 
 
 def test_no_numbers_are_survived():
-    for name in ('samples', 'log_weights', 'inflation', 'bands'):
-        evaluate(mixture(**{name: np.full_like(mixture()[name], np.nan)}))
+    found = {
+        name: evaluate(mixture(**{name: np.full_like(mixture()[name], np.nan)}))['log_density']
+        for name in ('samples', 'log_weights', 'inflation', 'bands')
+    }
+    assert not np.isfinite(found['log_weights']).any()
+    # The density of the component itself is known without the others.
+    assert np.isfinite(found['samples']).all()
+    assert np.array_equal(found['samples'], found['bands'])
+    assert np.array_equal(found['samples'], found['inflation'])

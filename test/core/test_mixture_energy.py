@@ -104,6 +104,8 @@ def test_numbers_out_of_range_are_refused(name, value):
 
 def test_no_numbers_and_no_poses_are_survived():
     for name in ('poses', 'log_scales', 'means', 'whiteners', 'precisions'):
-        evaluate(sequence(**{name: np.full_like(sequence()[name], np.nan)}))
+        found = evaluate(sequence(**{name: np.full_like(sequence()[name], np.nan)}))
+        parts = [found[x] for x in ('value', 'gradient', 'hessian')]
+        assert not all(np.isfinite(part).all() for part in parts)
     none = {name: sequence()[name][:0] for name in ('poses', 'times', 'value', 'gradient')}
-    evaluate(sequence(**none, hessian=np.empty((0, D, D))))
+    assert len(evaluate(sequence(**none, hessian=np.empty((0, D, D))))['value']) == 0

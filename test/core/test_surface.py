@@ -150,7 +150,9 @@ def test_a_body_without_flesh():
     flesh.append(np.zeros((0, 2)))
     columns, origins = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))
     none = np.zeros(0, np.bool_)
-    trace_contour(tuple(flesh), none, lens_of(CAMERA), columns, origins, empty_contour(0))
+    contour = empty_contour(0)
+    trace_contour(tuple(flesh), none, lens_of(CAMERA), columns, origins, contour)
+    assert len(contour.points) == 0
 
 
 @pytest.mark.parametrize(

@@ -75,13 +75,15 @@ def test_frames_and_outlines_without_sense(model, inputs, frames, value):
     for which in range(2):
         wrong = [array.copy() for array in frames]
         wrong[which][..., 0] = value
-        recorded(model, inputs, wrong)
+        assert (recorded(model, inputs, wrong)[:, 0, 0] >= 0).all()
     coverage = inputs[0]._replace(outline=inputs[0].outline._replace(
         pixels=np.full((SAMPLES, 2), value)
     ))  # fmt: skip
-    recorded(model, (coverage, *inputs[1:]), frames)
+    # Edges and depths are counted as before.
+    assert (recorded(model, (coverage, *inputs[1:]), frames)[:, 0, 0] > 0).all()
     term = Weighting(10.0, value, value, value, value)
-    recorded(model, tuple(x._replace(term=term) for x in inputs), frames)
+    found = recorded(model, tuple(x._replace(term=term) for x in inputs), frames)
+    assert (found[:, 0, 0] >= 0).all()
 
 
 def test_maps_are_as_large_as_bilinear_values_need(model, inputs, frames):

@@ -44,7 +44,7 @@ struct Lifted {
   Tables depths;        // (2, C, J) along the ray, m, as the sides are called and exchanged
   Tables precisions;    // (2, C, J) square roots, 1/m
   Places readings;      // (E,) 0 or 1: how an exchange of sides reads the mixture
-  double weight;        // factor on the energy; 0: there is no mixture
+  double weight;        // factor on the energy; 0 without a mixture
   double scale;         // of the kernel, in standard deviations
 
   Index joints() const { return segments.size(); }

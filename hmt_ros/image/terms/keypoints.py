@@ -221,7 +221,7 @@ class Lifted(NamedTuple):
             exchanged.
         precisions: (2, C, J) square roots, 1/m.
         readings: (E,) 0 or 1: how an exchange of sides reads the mixture.
-        weight: factor on the energy; 0: there is no mixture.
+        weight: factor on the energy; 0 without a mixture.
         scale: of the kernel, in standard deviations; it bounds the energy of a joint.
     """
 
