@@ -114,7 +114,7 @@ class Scratch {
   Array<T, N> view_;
 };
 
-// As numba and Python compare: the first where neither is smaller, and where one is no number.
+// As Python compares: the first where neither is smaller, and where one is no number.
 inline double least(double a, double b) { return b < a ? b : a; }
 inline double most(double a, double b) { return b > a ? b : a; }
 inline double between(double x, double low, double high) { return least(most(x, low), high); }
