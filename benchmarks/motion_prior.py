@@ -94,8 +94,20 @@ def scores(surprises: list[tuple[Array, Array]]) -> dict[str, float]:
 
 
 def measure(folder: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
-    """Scores by interval and model, over the motions of a folder; None: the development motions."""
-    folder = folder or SHARED / 'mocap' / 'dev'
+    """Scores by interval and model.
+
+    Args:
+        folder: of motions; None: the development motions.
+        quick: a few poses of one motion.
+
+    Raises:
+        FileNotFoundError: the development data is not there.
+        ValueError: the folder has no motions.
+    """
+    if folder is None:
+        folder = SHARED / 'mocap' / 'dev'
+        if not folder.is_dir():
+            raise FileNotFoundError(f'{folder} is absent (set HMT_SHARED)')
     body: Body = load_body('human37')
     motions = []
     for path in motion_files(folder)[: 1 if quick else None]:

@@ -52,6 +52,9 @@ _USUAL_RATE = 30.0
 # Time without an image after which a device counts as gone, s.
 _PATIENCE = 5.0
 _GLANCE, _CONNECTING = 0.05, 0.5
+# Time within which a node that is active is found among the subscribers, s: participants announce
+# themselves every 3 s.
+_SUBSCRIBING = 5.0
 # Time after which a node that is not active yet is asked, and named, again, s.
 _AGAIN = 10.0
 
@@ -209,6 +212,13 @@ def _await_active(node: Any, names: list[str], stopped: threading.Event) -> None
         stopped.wait(_GLANCE)
 
 
+def _await_subscriber(node: Any, images: Any, stopped: threading.Event, patience: float) -> None:
+    """Returns when somebody subscribes to the images, after this many seconds, or when stopped."""
+    end = time.monotonic() + patience
+    while not images.get_subscription_count() and not stopped.is_set() and time.monotonic() < end:
+        rclpy.spin_once(node, timeout_sec=_GLANCE)
+
+
 def _show(
     node: Any,
     video: Video,
@@ -224,10 +234,10 @@ def _show(
     if video.is_file and wait_for:
         node.get_logger().info(f'{given.video} starts when active: {", ".join(wait_for)}')
         _await_active(node, wait_for, stopped)
+        _await_subscriber(node, images, stopped, _SUBSCRIBING)
     elif video.is_file and not images.get_subscription_count():
         node.get_logger().info(f'{given.video} starts when somebody subscribes to {images.topic}')
-        while not images.get_subscription_count() and not stopped.is_set():
-            rclpy.spin_once(node, timeout_sec=_GLANCE)
+        _await_subscriber(node, images, stopped, math.inf)
     if video.is_file:
         # The other side may not know yet that it is connected.
         stopped.wait(_CONNECTING)
