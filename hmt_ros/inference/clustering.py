@@ -52,6 +52,17 @@ def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
     return np.array(chosen)
 
 
+def smallest_columns(values: Array, count: int) -> Index:
+    """Columns (N, count), rising, of the smallest values (N, M) of each row.
+
+    Of equal values the first count: which numpy's own selection takes depends on the processor.
+    """
+    last = np.partition(values, count - 1, axis=1)[:, count - 1, None]
+    below, tied = values < last, values == last
+    tied &= tied.cumsum(1) <= count - below.sum(1, keepdims=True)
+    return np.nonzero(below | tied)[1].reshape(-1, count)
+
+
 def squared_distances(a: Array, b: Array) -> Array:
     """Squared distances (N, M) between points (N, p) and (M, p)."""
     result: Array = (a * a).sum(1)[:, None] - product(b, 2.0 * a.T).T + (b * b).sum(1)
