@@ -50,6 +50,7 @@ from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.inference.random_numbers import standard_normals
 
 # Times of a window relative to now, s, and how far an image may be from each.
 TIMES = np.array([0.0, -0.067, -0.15, -0.3, -0.5, -0.8, 0.067, 0.15, 0.3, 0.5, 0.8])
@@ -360,7 +361,7 @@ class Lifter:
 
     def save(self, path: str | Path) -> Path:
         """Writes the lifter into an .npz file, with its notes as the card; returns its path."""
-        drawn = np.random.default_rng(0).normal(size=INPUTS)
+        drawn = standard_normals(np.random.default_rng(0), (INPUTS,))
         example = self.network.mean + self.network.scale * drawn
         return write_model(path, self, self.from_arrays, self.notes, example)
 

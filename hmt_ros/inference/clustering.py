@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product
@@ -25,6 +24,8 @@ def k_means(
     Returns:
         centres (K, p) and labels (N,). A cluster that loses all its points keeps its centre.
     """
+    from scipy.cluster.vq import kmeans2
+
     seeds = points[spread_points(points, count, rng)]
     with warnings.catch_warnings():
         warnings.simplefilter('ignore', UserWarning)  # a cluster without points
