@@ -253,10 +253,10 @@ def unfolded_share(camera: Camera) -> float:
     """
     x, y = (np.array([-0.5, n - 0.5]) for n in (camera.width, camera.height))
     a, b = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-    corners = np.hypot(a, b).reshape(-1, 1).clip(min=1e-9)
+    corners = elementary.hypot(a, b).reshape(-1, 1).clip(min=1e-9)
     ideal = CHECKED * np.stack([a, b]).reshape(2, -1, 1) / corners
     with np.errstate(all='ignore'):  # a rational model has poles, which lie outside
-        radius = np.hypot(*camera.distort(*ideal)[0])
+        radius = elementary.hypot(*camera.distort(*ideal)[0])
         slope = np.diff(radius) / np.diff(CHECKED)
     # A fold may lead back into the image from outside, which matters to no pixel.
     reached = np.maximum.accumulate(radius, axis=1)[:, :-1]
@@ -274,9 +274,9 @@ def roll(ups: ArrayLike) -> Array:
             (`STEEP`), and zeros, tell of no roll.
     """
     x, y, _ = np.moveaxis(np.asarray(ups, dtype=np.float64), -1, 0)
-    length = np.hypot(x, y)
+    length = elementary.hypot(x, y)
     x, y = np.where(length > STEEP, (x, y), np.reshape((0.0, -1.0), (2, *(1,) * np.ndim(length))))
-    sine, cosine = np.stack([x, -y]) / np.hypot(x, y)
+    sine, cosine = np.stack([x, -y]) / elementary.hypot(x, y)
     result = np.zeros((*np.shape(x), 3, 3))
     result[..., 0, 0] = result[..., 1, 1] = cosine
     result[..., 0, 1], result[..., 1, 0], result[..., 2, 2] = -sine, sine, 1.0
