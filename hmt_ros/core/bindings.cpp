@@ -90,7 +90,7 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "fill_torso_flips", fill_torso_flips, "tree torso poses result parents");
   bind(m, "fill_configurations", fill_configurations,
        "tree limbs modes found found_counts flipped price apart result");
-  bind(m, "place_alone", place_alone, "limbs found poses");
+  bind(m, "place_alone", place_alone, "limbs found poses rows");
   bind(m, "combine", combine,
        "limbs modes found energies log_weights trunk_weights share count poses parents values");
 

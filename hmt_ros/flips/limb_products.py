@@ -224,12 +224,16 @@ class LimbProducts:
         return LimbProducts(self.body, self.modes, kept, exchanged)
 
     @property
-    def alone(self) -> Array:
-        """Poses (R, d) to evaluate: each trunk with its pose, then with each configuration."""
+    def alone(self) -> tuple[Array, Index]:
+        """Poses (P, d) to evaluate: each trunk with its pose, then with each other configuration.
+
+        Rows (R,) are the poses of each trunk, then of each of its configurations.
+        """
         found = self.configurations
-        poses = np.repeat(found.trunks, 1 + found.counts.sum(1), axis=0)
-        place_alone(limbs_of(self.body.skeleton), found, poses)
-        return poses
+        count = len(found.trunks) + int(found.counts.sum())
+        poses, rows = np.empty((count, self.body.dimension)), np.empty(count, dtype=np.intp)
+        different = place_alone(limbs_of(self.body.skeleton), found, poses, rows)
+        return poses[:different], rows
 
     def best(
         self,
@@ -247,7 +251,7 @@ class LimbProducts:
         penalties, minus the log weight of the mode.
 
         Args:
-            energies: (R,) of the poses `alone`.
+            energies: (R,) of the rows of the poses `alone`.
             exchange, flip: prices of limbs that change places, and of a flipped torso, nats.
             share: of the energy that counts.
         """

@@ -132,15 +132,17 @@ def test_configurations_need_arguments_that_fit():
 def test_poses_alone_and_products_need_arguments_that_fit():
     modes, limbs = poses(), limbs_of(SKELETON)
     of_modes = products(modes)
-    found, alone = of_modes.configurations, of_modes.alone
-    named = {'limbs': limbs, 'found': found, 'poses': alone}
-    assert_arguments_are_checked(place_alone, named, 'poses', free='found.penalties', unread=UNREAD)
+    found, (_, rows) = of_modes.configurations, of_modes.alone
+    named = {'limbs': limbs, 'found': found, 'poses': np.empty((len(rows), D)), 'rows': rows}
+    assert_arguments_are_checked(
+        place_alone, named, 'poses rows', free='found.penalties', unread=UNREAD + ' rows'
+    )
     trunks, count = len(found.trunks), 3
     named = {
         'limbs': limbs,
         'modes': modes,
         'found': found,
-        'energies': np.zeros(len(alone)),
+        'energies': np.zeros(len(rows)),
         'log_weights': np.zeros(2),
         'trunk_weights': np.zeros(trunks),
         'share': 0.5,

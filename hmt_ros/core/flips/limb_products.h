@@ -338,21 +338,33 @@ inline Index fill_configurations(const Placing& tree, const Limbs& limbs, const 
   return exchanged;
 }
 
-// Puts each configuration into its row of poses (R, d), which has the pose of its trunk.
-inline void place_alone(const Limbs& limbs, const Configurations& found, const Matrix& poses) {
+// Fills poses (R, d) with each trunk, and with each configuration that its trunk does not have;
+// returns how many there are. Rows (R,) become the pose of each trunk, then of its configurations.
+inline Index place_alone(const Limbs& limbs, const Configurations& found, const Matrix& poses,
+                         const Array<Index, 1>& rows) {
   expect_configurations("found", found, limbs, poses.size(1));
   expect_shape("poses", poses, {poses_alone(found), -1});
-  Index row = 0;
+  expect_shape("rows", rows, {poses.size()});
+  Index row = 0, count = 0;
   for (Index t = 0; t < found.size(); ++t) {
-    ++row;
+    const Index trunk = count++;
+    poses[trunk].copy_from(found.trunks[t]);
+    rows[row++] = trunk;
     for (Index c = 0; c < limbs.size(); ++c) {
-      for (Index i = 0; i < found.counts(t, c); ++i, ++row) {
+      for (Index i = 0; i < found.counts(t, c); ++i) {
+        bool same = true;
+        const Vector pose = poses[count];
+        pose.copy_from(found.trunks[t]);
         for (Index j = 0; j < limbs.dofs[c]; ++j) {
-          poses(row, limbs.own(c, j)) = found.angles(t, c, i, j);
+          double& own = pose[limbs.own(c, j)];
+          same &= own == found.angles(t, c, i, j);
+          own = found.angles(t, c, i, j);
         }
+        rows[row++] = same ? trunk : count++;
       }
     }
   }
+  return count;
 }
 
 // The choices of one entry a list with the least sums, the least first, list by list: each entry of

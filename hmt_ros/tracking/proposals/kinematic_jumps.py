@@ -125,10 +125,10 @@ def jumped_poses(
             apart=SAME_LIMB_DISTANCE,
             most=plan.alternatives,
         ).at_most(left)
-        alone = products.alone
-        left -= len(alone)
+        alone, rows = products.alone
+        left -= len(rows)
         best = products.best(
-            posterior.values(alone, observation),
+            posterior.values(alone, observation)[rows],
             sources.log_weights[group],
             exchange=price['exchange'],
             flip=price['trunk_flip'],
