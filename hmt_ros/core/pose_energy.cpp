@@ -210,6 +210,7 @@ void check(Index first, Index last, const Terms& terms, const Numbers& point, co
   if (terms.centres.size() > 0) expect_shape("terms.centres", terms.centres, {-1, f});
   expect_shape("status", status, {n});
   expect_shape("iterations", iterations, {n});
+  check_poses(terms.inputs, n);
 }
 
 }  // namespace

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -118,9 +118,10 @@ class ImageLikelihood:
             explained: as for `ObservedImage`.
             exchanges, share, lifted_share: as for `keypoint_term`.
         """
-        image = ObservedImage(self, observation, explained)
-        keypoints, s = observation.keypoints, self.settings.keypoints
-        if keypoints is None or s.weight == 0:
+        image = observed(self, observation)
+        if explained is not None:
+            image = ObservedImage(self, observation, explained)
+        if observation.keypoints is None or self.settings.keypoints.weight == 0:
             return (image,)
         return (image, self.keypoint_term(observation, exchanges, share, lifted_share))
 
@@ -139,12 +140,16 @@ class ImageLikelihood:
             lifted_share: the same of the energy of lifted poses.
         """
         assert observation.keypoints is not None
-        exchanges = usual_exchanges() if exchanges is None else exchanges
+        settings = self.settings.keypoints
+        if exchanges is None:
+            exchanges = usual_exchanges()
+        if share != 1.0:
+            settings = replace(settings, weight=share * settings.weight)
         return KeypointTerm(
             self.body.skeleton,
             self.camera,
             observation.keypoints,
-            replace(self.settings.keypoints, weight=share * self.settings.keypoints.weight),
+            settings,
             observation.magnification,
             exchanges,
             None if observation.beliefs is None else observation.beliefs.keypoints,
@@ -173,37 +178,14 @@ class ImageLikelihood:
             first number of row 0.
         """
         n = frames.count
-        inputs = self.inputs(observation, n, None)
+        image = observed(self, observation)
         outline = observation.outline
         samples = 0 if outline is None else len(outline.pixels)
         most = 1 + 6 * len(self.model.flesh.ring_parts) + 2 * samples
         result = np.zeros((n, most, RECORDED))
-        if any(x.term.weight > 0 for x in inputs):
-            record_residuals(self.model, inputs, *frames.by_pose(), result)
+        if image.compiled['image']:
+            record_residuals(self.model, image.compiled['inputs'], *frames.by_pose(), result)
         return result
-
-    def inputs(
-        self, observation: Observation, poses: int, explained: Array | None
-    ) -> tuple[Any, ...]:
-        """The inputs of all terms, for so many poses."""
-        beliefs = observation.beliefs
-        request = Request(poses, explained)
-        result = []
-        for term in TERMS:
-            s: TermSettings = getattr(self.settings, term.name)
-            evidence = observation.evidence.get(term.name)
-            weight = 0.0 if evidence is None else float(s.weight)
-            if beliefs is not None:
-                weight *= beliefs.of_term(term.name)
-            weighting = Weighting(
-                weight,
-                float(s.sigma),
-                float(s.scale),
-                float(observation.magnification),
-                float(s.growth),
-            )
-            result.append(term.inputs(weighting, evidence, request))
-        return tuple(result)
 
     @cached_property
     def model(self) -> Model:
@@ -235,6 +217,46 @@ class ObservedImage:
     likelihood: ImageLikelihood
     observation: Observation
     explained: Array | None = None
+
+    @cached_property
+    def compiled(self) -> dict[str, Any]:
+        """What compiled code reads of them: members of `pose_energy.Compiled`."""
+        inputs = self.inputs(0)
+        running = [term for term, one in zip(TERMS, inputs, strict=True) if one.term.weight > 0]
+        return {
+            'model': self.likelihood.model,
+            'inputs': inputs,
+            'image': bool(running),
+            'contour': any(term.needs_contour for term in running),
+        }
+
+    def inputs(self, poses: int) -> tuple[Any, ...]:
+        """The inputs of all terms, with room for the results of so many poses."""
+        observation, beliefs = self.observation, self.observation.beliefs
+        request = Request(poses, self.explained)
+        result = []
+        for term in TERMS:
+            s: TermSettings = getattr(self.likelihood.settings, term.name)
+            evidence = observation.evidence.get(term.name)
+            weight = 0.0 if evidence is None else float(s.weight)
+            if beliefs is not None:
+                weight *= beliefs.of_term(term.name)
+            weighting = Weighting(
+                weight,
+                float(s.sigma),
+                float(s.scale),
+                float(observation.magnification),
+                float(s.growth),
+            )
+            result.append(term.inputs(weighting, evidence, request))
+        return tuple(result)
+
+
+# An image is compared with many sets of poses.
+@lru_cache(maxsize=4)
+def observed(likelihood: ImageLikelihood, observation: Observation) -> ObservedImage:
+    """The image terms of an observation, the same at each call."""
+    return ObservedImage(likelihood, observation)
 
 
 def _selected(parts: Sequence[int] | None, count: int) -> NDArray[np.bool_]:

@@ -26,13 +26,13 @@ from hmt_ros.body.pose_prior import AnglePrior, MixturePrior, PriorModel
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.body.self_intersection import Overlaps, SelfIntersection
 from hmt_ros.core import solve
-from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage
+from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage, observed
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import NO_MAP
 from hmt_ros.image.terms.keypoints import KeypointInputs, Keypoints, KeypointTerm
-from hmt_ros.image.terms.registry import TERMS, Model
+from hmt_ros.image.terms.registry import Model
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, add_energies
@@ -177,6 +177,10 @@ class PoseEnergy:
         """
         return self._evaluated(x, rows, derivatives, apart=False)[0]
 
+    def values(self, x: Array) -> Array:
+        """The energies (n,) alone; pose i belongs to problem i. See `energy`."""
+        return self.energy(x, derivatives=Derivatives.NONE).value
+
     def by_cue(self, x: Array, *, derivatives: bool = True) -> ByCue:
         """The energy at poses x (n, d), cue by cue; pose i belongs to problem i.
 
@@ -283,7 +287,9 @@ class PoseEnergy:
         energy = np.empty(n), np.empty((asked, f)), np.empty((asked, f, f))
         parts = np.empty((values, 3)), np.empty((asked if apart else 0, 3, f, f))
         status, iterations = np.empty(n, dtype=np.int8), np.zeros(n, dtype=np.int32)
-        compiled = self._compiled(n)
+        compiled = self._compiled
+        if apart:
+            compiled = compiled._replace(inputs=self._image.inputs(n))
 
         def work(first: int, last: int) -> None:
             solve(
@@ -350,22 +356,15 @@ class PoseEnergy:
             result.append(found)
         return result
 
-    def _compiled(self, count: int) -> Compiled:
-        """The terms as compiled code reads them, for so many poses."""
-        image = self._known.get('image') or ObservedImage(self.likelihood, NOTHING_SEEN)
-        inputs = image.likelihood.inputs(image.observation, count, image.explained)
-        running = [term for term, one in zip(TERMS, inputs, strict=True) if one.term.weight > 0]
-        return self._rest._replace(
-            model=image.likelihood.model,
-            inputs=inputs,
-            image=bool(running),
-            contour=any(term.needs_contour for term in running),
-        )
+    @property
+    def _image(self) -> ObservedImage:
+        return self._known.get('image') or observed(self.likelihood, NOTHING_SEEN)
 
     @cached_property
-    def _rest(self) -> Compiled:
-        """Inputs of compiled code besides the terms of the image."""
+    def _compiled(self) -> Compiled:
+        """The terms as compiled code reads them; they return their energies alone."""
         found = {name: term.compiled for name, term in self._known.items() if name != 'image'}
+        found |= self._image.compiled
         if self.motion is not None:
             found |= zip(('centres', 'precisions', 'tails'), _expected(self.motion), strict=True)
         elif self.point is not None:
@@ -381,11 +380,14 @@ def _expected(motion: Quadratic | Student) -> tuple[Array, Array, float]:
         precisions = np.diag(precisions)
     if precisions.ndim == 2:
         precisions = precisions[None]
-    rows, f = max(len(centres), len(precisions)), centres.shape[1]
+    if len(centres) != len(precisions):
+        rows, f = max(len(centres), len(precisions)), centres.shape[1]
+        centres = np.broadcast_to(centres, (rows, f))
+        precisions = np.broadcast_to(precisions, (rows, f, f))
     tails = motion.degrees_of_freedom if isinstance(motion, Student) else 0.0
     return (
-        np.ascontiguousarray(np.broadcast_to(centres, (rows, f)), dtype=np.float64),
-        np.ascontiguousarray(np.broadcast_to(precisions, (rows, f, f)), dtype=np.float64),
+        np.ascontiguousarray(centres, dtype=np.float64),
+        np.ascontiguousarray(precisions, dtype=np.float64),
         float(tails),
     )
 

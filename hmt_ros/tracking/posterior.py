@@ -22,10 +22,10 @@ from hmt_ros.body.ground_terms import GroundTerm, without_root_lean
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.pose_energy import PoseEnergy
+from hmt_ros.image.pose_energy import CompiledTerm, PoseEnergy
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.bounded_newton import Minimum, resting
-from hmt_ros.inference.energy import Derivatives, Energy, Quadratic
+from hmt_ros.inference.energy import Energy, Quadratic
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.tracking.classes import known_exchanges
@@ -135,18 +135,34 @@ class Posterior:
             result[chain] = of_limb, replace(self.likelihood, parts=rest, occluders=rest)
         return result
 
-    def of_image(self, observation: Observation, exchanges: Array | None = None) -> PoseEnergy:
-        """The energy without the motion prior; its evaluations are counted.
+    def of_image(
+        self,
+        observation: Observation,
+        exchanges: Array | None = None,
+        motion: Quadratic | None = None,
+    ) -> PoseEnergy:
+        """The energy; its evaluations are counted.
 
         Args:
             observation: of the image.
             exchanges: log probabilities (N, E) of exchanges of sides before it, NaN where they are
                 unknown; None: all are.
+            motion: prior of the motion; None: without it.
         """
+        terms = self._terms(observation, exchanges)
+        return PoseEnergy(self.likelihood, terms, motion, counted=self.spent.append)
+
+    def _terms(
+        self,
+        observation: Observation,
+        exchanges: Array | None = None,
+        share: float = 1.0,
+        lifted_share: float = 1.0,
+    ) -> tuple[CompiledTerm | FrameTerm, ...]:
+        """All terms; arguments as for `of_image` and `ImageLikelihood.keypoint_term`."""
         exchanges = None if exchanges is None else known_exchanges(exchanges)
-        seen = self.likelihood.seen(observation, exchanges=exchanges)
-        terms = (*seen, *self.likelihood.priors, *self.known)
-        return PoseEnergy(self.likelihood, terms, counted=self.spent.append)
+        seen = self.likelihood.seen(observation, None, exchanges, share, lifted_share)
+        return (*seen, *self.likelihood.priors, *self.known)
 
     @property
     def known(self) -> tuple[FrameTerm | GroundTerm, ...]:
@@ -166,8 +182,7 @@ class Posterior:
         exchanges: Array | None = None,
     ) -> PoseEnergy:
         """With a Gaussian prior of precisions (N, d, d) around centres (N, d)."""
-        image = self.of_image(observation, exchanges)
-        return replace(image, motion=Quadratic(centres, precisions))
+        return self.of_image(observation, exchanges, Quadratic(centres, precisions))
 
     def placing(self, observation: Observation) -> PoseEnergy | None:
         """The prior and the squares of the distances from keypoints; None: there are none.
@@ -179,11 +194,6 @@ class Posterior:
         robust = self.likelihood.keypoint_term(observation, None)
         squares = replace(robust, settings=replace(robust.settings, scale=np.inf))
         return PoseEnergy(self.likelihood, (squares, self.likelihood.pose_prior))
-
-    def values(self, poses: Array, observation: Observation) -> Array:
-        """Energies (N,) of poses (N, d), by image alone."""
-        image = self.of_image(observation)
-        return image.energy(poses, np.arange(len(poses)), derivatives=Derivatives.NONE).value
 
     def minimise(self, term: PoseEnergy, poses: Array, iterations: int) -> Minimum:
         """Minima from poses (N, d) within the limits of the body."""
@@ -202,8 +212,7 @@ class Posterior:
         last = self._last_fit
         if last is not None and last[0] is poses and last[1] is observation and last[2] == share:
             return last[3]
-        seen_terms = self.likelihood.seen(observation, lifted_share=share)
-        terms = (*seen_terms, *self.likelihood.priors, *self.known)
+        terms = self._terms(observation, lifted_share=share)
         found = PoseEnergy(self.likelihood, terms).by_cue(poses)
         gradient, hessian = found.energy.derivatives()
         free = ~resting(poses, gradient, self.body.lower, self.body.upper)
@@ -234,13 +243,7 @@ class Posterior:
         """
         self.spent.append(len(poses))
         share = {name: errors.share(dt) for name, errors in ERRORS.items()}
-        seen = self.likelihood.seen(
-            observation,
-            exchanges=known_exchanges(exchanges),
-            share=share['keypoints'],
-            lifted_share=share['lifted'],
-        )
-        terms = (*seen, *self.likelihood.priors, *self.known)
+        terms = self._terms(observation, exchanges, share['keypoints'], share['lifted'])
         values = PoseEnergy(self.likelihood, terms).by_cue(poses, derivatives=False).values
         return np.asarray(product(values, np.array([share['image'], 1.0, share['prior']])))
 

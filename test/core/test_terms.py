@@ -101,7 +101,7 @@ def test_maps_are_as_large_as_bilinear_values_need(model, inputs, frames):
 def test_samples_and_poses_must_fit(model, inputs, frames):
     coverage, *others = inputs
     for change, message in (
-        ({'costs': coverage.costs[:1].copy()}, 'costs: wanted a row for each pose'),
+        ({'costs': coverage.costs[:1].copy()}, 'costs: wanted no row, or one for each pose'),
         ({'costs': coverage.costs[:, 1:].copy()}, 'costs: wanted shape'),
         ({'explained': np.zeros((3, SAMPLES))}, 'explained: wanted one row'),
         ({'explained': np.zeros((1, SAMPLES + 1))}, 'explained: wanted shape'),

@@ -34,16 +34,16 @@ struct CoverageInputs {
   Weighting term;
   Outline outline;
   Table explained;  // (X, M) maximum energy of samples; a row a pose, or one row for all
-  Matrix costs;     // (N, M) result: energy of each sample
+  Matrix costs;     // (N, M) result: energy of each sample; no rows: it is not wanted
 
   void check() const {
-    const Index rows = explained.size();
     expect_shape("costs", costs, {-1, outline.count()});
     expect_shape("explained", explained, {-1, outline.count()});
-    expect(rows == 1 || rows == costs.size(), "explained", "one row, or one for each pose");
   }
   void check_poses(Index poses) const {
-    expect(costs.size() >= poses, "costs", "a row for each pose");
+    const Index rows = costs.size(), known = explained.size();
+    expect(rows == 0 || rows >= poses, "costs", "no row, or one for each pose");
+    expect(known == 1 || known == poses, "explained", "one row, or one for each pose");
   }
 };
 
@@ -121,7 +121,10 @@ HMT_WIDE inline double add_term(const PoseView& view, const CoverageInputs& inpu
   const Index count = outline.count(), whole = in_whole_lanes(count);
   const double share = term.weight / double(count), per_scale = 1.0 / (term.scale * term.scale);
   const double* explained = inputs.explained[inputs.explained.size() > 1 ? view.number : 0].data;
-  double* costs = inputs.costs[view.number].data;
+  const Matrix rows = view.rows(8, whole);
+  rows.fill(0.0);
+  double* value = rows[7].data;
+  double* costs = inputs.costs.size() > 0 ? inputs.costs[view.number].data : value;
   Scratch<Index, 1> use(contour.count + 1), nearest(count);
   const Index used = matched_points(contour, use.view().data);
   double energy = 0.0;
@@ -133,11 +136,8 @@ HMT_WIDE inline double add_term(const PoseView& view, const CoverageInputs& inpu
     return energy;
   }
   match_outline(outline, contour, use.view().data, used, nearest.view().data);
-  const Matrix rows = view.rows(8, whole);
-  rows.fill(0.0);
   double *du = rows[0].data, *dv = rows[1].data, *nx = rows[2].data, *ny = rows[3].data;
   double *inverse = rows[4].data, *across = rows[5].data, *beyond = rows[6].data;
-  double* value = rows[7].data;
   for (Index m = 0; m < count; ++m) {
     const Index i = nearest[m];
     du[m] = contour.u[i] - outline.pixels(m, 0);

@@ -104,7 +104,7 @@ class Request:
     """Arguments of a call, the same for all terms.
 
     Attributes:
-        poses: number of poses, N.
+        poses: number of poses whose results beside the energy are wanted, N; 0: they are not.
         explained: (N, M) or (1, M) maximum energy of each sample of the outline, because something
             else explains it; None: unlimited.
     """

@@ -12,7 +12,7 @@ landmarks of the other side. Depths of a detector count by the slopes of bones.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -291,7 +291,7 @@ class KeypointTerm:
     beliefs: Array | None = None
     lifted_share: float = 1.0
 
-    @property
+    @cached_property
     def compiled(self) -> KeypointInputs:
         """The term as compiled code reads it."""
         exchanges = np.zeros((1, 1)) if self.exchanges is None else self.exchanges
@@ -389,7 +389,7 @@ def _measured(
     own = np.zeros((len(joints), 3)) if counted.offsets is None else counted.offsets
     offsets = skeleton.joint_offsets[joints] + np.stack([own, own * MIRROR], axis=1)
     segments = skeleton.joint_segments[joints].astype(np.int64)
-    groups = np.array([group_of(skeleton, i) for i in segments[:, 0]], dtype=np.int64)
+    groups = groups_of(skeleton)[segments[:, 0]]
     points = Points(segments, offsets, counted.pixels, whiteners, groups)
     return MeasuredKeypoints(joints, points, _lifted(skeleton, keypoints.lifted, sigma))
 
@@ -447,9 +447,10 @@ def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lift
     )
 
 
-def group_of(skeleton: Skeleton, segment: int) -> int:
-    """Group that landmarks on a segment are exchanged with."""
+@lru_cache(maxsize=16)
+def groups_of(skeleton: Skeleton) -> Index:
+    """Groups (S,) that landmarks on the segments are exchanged with."""
+    result = np.full(len(skeleton.parents), CENTRE, dtype=np.int64)
     for chain, segments in skeleton.chains.items():
-        if segment in segments:
-            return {'arm': ARMS, 'leg': LEGS}.get(chain.rpartition('_')[2], CENTRE)
-    return CENTRE
+        result[list(segments)] = {'arm': ARMS, 'leg': LEGS}.get(chain.rpartition('_')[2], CENTRE)
+    return result

@@ -52,7 +52,7 @@ class CoverageInputs(NamedTuple):
         term: weighting.
         outline: samples.
         explained: (X, M) maximum energy of samples; a row a pose, or one row for all.
-        costs: (N, M) result: energy of each sample.
+        costs: (N, M) result: energy of each sample; (0, M): it is not wanted.
     """
 
     term: Weighting

@@ -23,10 +23,10 @@ from hmt_ros.flips.limb_products import LimbProducts
 from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
-from hmt_ros.image.terms.keypoints import group_of
+from hmt_ros.image.terms.keypoints import groups_of
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
-from hmt_ros.inference.energy import Derivatives, Student
+from hmt_ros.inference.energy import Student
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_algebra import cholesky, inverse, product
 from hmt_ros.inference.random_numbers import standard_normals
@@ -74,8 +74,7 @@ def find_limb(
     terms = (*seen, posterior.likelihood.pose_prior, *posterior.known)
     motion = Student(pose[own], inverse(block), LIMB_TAILS)
     term = PoseEnergy(of_limb, terms, motion, pose, own)
-    value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
-    best = samples[np.argsort(value, kind='stable')[: plan.refined]]
+    best = samples[np.argsort(term.values(samples), kind='stable')[: plan.refined]]
     posterior.spent.append(len(samples) + plan.refined * s.iterations)
     return term.minimise(best, max_iterations=s.iterations, tolerance=0.05).x
 
@@ -110,6 +109,7 @@ def jumped_poses(
     share = ERRORS['image'].share(search.dt)
     price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
     everything: list[tuple[Array, Index, Array]] = []
+    image = posterior.of_image(observation)
     prior = search.rated(base.x, base.value)
     groups = _groups(body, base)
     for group in groups[: plan.groups]:
@@ -128,7 +128,7 @@ def jumped_poses(
         alone, rows = products.alone
         left -= len(rows)
         best = products.best(
-            posterior.values(alone, observation)[rows],
+            image.values(alone)[rows],
             sources.log_weights[group],
             exchange=price['exchange'],
             flip=price['trunk_flip'],
@@ -139,7 +139,7 @@ def jumped_poses(
     others = np.array([k for group in groups[plan.groups :] for k in group], dtype=np.intp)
     if len(others):
         poses = base.x[others]
-        everything.append((poses, others, posterior.values(poses, observation)))
+        everything.append((poses, others, image.values(poses)))
     poses, members, energies = (np.concatenate(parts) for parts in zip(*everything, strict=True))
     kept = search.best(poses, energies)
     poses, members = poses[kept], members[kept]
@@ -175,7 +175,7 @@ def limbs_not_shown(posterior: Posterior, observation: Observation, surprising: 
     seen = {name for name, known in zip(keypoints.names, keypoints.seen, strict=True) if known}
 
     def shown(limb: str) -> bool:
-        group = group_of(skeleton, skeleton.chains[limb][0])
+        group = groups_of(skeleton)[skeleton.chains[limb][0]]
         if beliefs is not None and beliefs.keypoints[group] < 0.5:
             return False
         joints = (skeleton.joint_names[j] for j in skeleton.chain_joints[limb])

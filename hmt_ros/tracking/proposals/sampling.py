@@ -91,6 +91,6 @@ def _sampled(
     drawn = draw(body, sources.expected, search.states.searched, each, s.sample_scale, rng)
     poses = np.concatenate([base.x, drawn.reshape(-1, body.dimension)])
     rows = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
-    kept = search.best(poses, posterior.values(poses, search.observation))
+    kept = search.best(poses, posterior.of_image(search.observation).values(poses))
     still = np.zeros((len(kept), body.dimension), dtype=np.bool_)
     return sources.proposed(rows[kept], poses[kept], still)
