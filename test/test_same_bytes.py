@@ -223,3 +223,52 @@ print(json.dumps({
     **digests_of('reach', 12, **known('reach'), with_smoother=False),
 }))
 """
+
+# What each switch takes away of a processor's; together they stand for one of 2008. The core looks
+# at the processor itself: `test/core` compares the versions of its functions.
+SWITCHES = {
+    'C library': {
+        'GLIBC_TUNABLES': 'glibc.cpu.hwcaps=-AVX2,-AVX2_Usable,-FMA,-FMA_Usable,-FMA4,-AVX,-AVX512F'
+        ',-AVX512VL,-AVX512DQ,-ERMS'
+    },
+    'BLAS': {'OPENBLAS_CORETYPE': 'Nehalem'},
+    'numpy': {'NPY_DISABLE_CPU_FEATURES': 'X86_V3 X86_V4 AVX512_ICL'},
+    'OpenCV': {
+        'OPENCV_CPU_DISABLE': 'AVX512-SKX,AVX2,FP16,AVX,SSE4.2,SSE4.1',
+        'OPENCV_IPP': 'sse42',
+    },
+}
+VERSIONS = {'numpy': '2.4.6', 'OpenCV': '5.0.0'}
+# With these versions; one digest of what each clip's nodes publish.
+DIGESTS: dict[str, str] = {}
+
+
+def digests_of_run(folder, **switches):
+    """A digest for each topic that the nodes publish on the clips, by clip and topic."""
+    folder.mkdir()
+    done = subprocess.run(
+        [sys.executable, '-c', RUN, str(ROOT / 'bags'), str(folder)],
+        env=os.environ | {'PYTHONPATH': str(ROOT)} | switches,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.fixture(scope='module')
+def usual_digests(tmp_path_factory):
+    return digests_of_run(tmp_path_factory.mktemp('usual') / 'run')
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='other libraries, with other switches')
+@pytest.mark.parametrize('names', [*([x] for x in SWITCHES), [*SWITCHES]], ids=' and '.join)
+def test_a_run_gives_the_same_bytes_with_the_code_of_another_processor(
+    tmp_path, usual_digests, names
+):
+    switches = {name: value for x in names for name, value in SWITCHES[x].items()}
+    found = digests_of_run(tmp_path / 'run', **switches)
+    assert found.keys() == usual_digests.keys()
+    assert [x for x in usual_digests if found[x] != usual_digests[x]] == []
