@@ -37,6 +37,7 @@ NEAR = 0.01  # least depth of a point that has an image, m
 # Least part of the vertical across the optical axis by which a camera has a roll.
 STEEP = 0.1
 STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
+CLOSE = 1e-14  # error of a ray at which the inversion ends, of the tangent
 # Tangents at which a distortion is checked, and the largest factor by which a lens magnifies more
 # farther out: calibrations of real lenses reach 2.5, at the corners of wide images.
 _TURNS = 0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2
@@ -182,6 +183,9 @@ class Camera:
             for _ in range(20):
                 value, inner = self.distort(ab[0], ab[1])
                 error = value - target
+                error[:, np.abs(error).max(0) < CLOSE] = 0.0
+                if not error.any():
+                    break
                 det = inner[0][0] * inner[1][1] - inner[0][1] * inner[1][0]
                 det = np.where(np.abs(det) > 1e-9, det, 1.0)
                 step = np.stack(
