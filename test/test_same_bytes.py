@@ -242,11 +242,12 @@ SWITCHES = {
         'OPENCV_IPP': 'sse42',
     },
 }
-# Digests of some topics, and the versions that they hold for.
+# Digests of some topics, and the versions that they hold for. Whoever means to change results puts
+# here what the test finds.
 VERSIONS = {'numpy': '2.4.6', 'cv2': '5.0.0'}
 DIGESTS = {
     'keypoints/pose_mixture': 'b11d36dc97c25c40',
-    'keypoints/smoothed_pose_mixture': '19b025df3f235cd2',
+    'keypoints/smoothed_pose_mixture': 'dd7ce36581e17021',
     'anybody/pose_mixture': 'fa8fa48f7fbca28f',
     'images/pose_mixture': '97da8f3ee1af5da4',
 }
