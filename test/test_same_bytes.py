@@ -34,7 +34,6 @@ EXEMPT = {
 BESIDE = {
     'hmt_ros/experts/gates.py': {'_Softmax', 'first', 'learned'},
     'hmt_ros/experts/neighbour_models.py': {'fit'},
-    'hmt_ros/inference/clustering.py': {'k_means'},
     'hmt_ros/inference/random_numbers.py': {'standard_normals'},
     'msg_tools/messages/message_error.py': {'check_covariances'},
 }

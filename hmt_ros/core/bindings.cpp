@@ -40,9 +40,9 @@ PYBIND11_MODULE(_compiled, m) {
   py::register_exception<Misfit>(m, "Misfit", PyExc_ValueError);
 
   auto elementary = m.def_submodule("elementary", "Elementary functions, as numpy's.");
-  bind_elementary_functions(elementary);
+  bind_elementary_functions({elementary.ptr(), ufunc_interface()});
   auto matrices = m.def_submodule("matrices", "What hmt_ros.inference.linear_algebra calls.");
-  bind_matrix_functions(matrices);
+  bind_matrix_functions({matrices.ptr(), ufunc_interface()});
 
   // body
   bind(m, "place_poses", place_poses, "tree poses columns origins axes dof_origins");

@@ -341,7 +341,7 @@ void log_sum_exp_loop(char** pointers, const Index* counts, const Index* strides
 
 }  // namespace
 
-void bind_matrix_functions(py::module_& m) {
+void bind_matrix_functions(const UfuncModule& m) {
   bind_matrix_function(m, "cholesky", {cholesky_loop}, "(n,n)->(n,n)", 1, 1,
                        "Lower Cholesky factor.");
   bind_matrix_function(m, "solve", {solve_loop<0>}, "(n,n),(n,m)->(n,m)", 2, 1,
