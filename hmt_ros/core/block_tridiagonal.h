@@ -207,4 +207,53 @@ HMT_WIDE inline void multiply_band_transposed(const Matrix& columns, const Matri
   }
 }
 
+// The block at `place` on the diagonal of P^-1, (n, n), given the one after it; that of the last
+// place needs none. With the blocks B below L in this column, G = B L^-1 and C of the block after,
+//
+//     result = (L L')^-1 + G' C G = L'^-1 L^-1 + G' (C G)
+inline void invert_block(const Matrix& columns, Index place, const Table& after,
+                         const Matrix& result) {
+  using namespace matrices;
+  const Index n = result.size(), width = columns.size(1) - 1, first = place * n;
+  expect_shape("result", result, {n, n});
+  expect(columns.size(1) > 0, "columns", "a diagonal");
+  expect(n > 0 && columns.size() % n == 0, "columns", "whole blocks");
+  expect(place >= 0 && first < columns.size(), "place", "that of a block");
+  const bool last = first + n == columns.size();
+  expect_shape("after", after, {last ? 0 : n, n});
+  const Index side = in_whole_lanes(n), rows = last ? n : 2 * n;
+  const Scratch<double, 2> own(n, 2 * side), below(n, side), left(rows, side), right(rows, side);
+  const Scratch<double, 1> room((rows + 1) * lanes);
+  for (Index b = 0; b < n; ++b) {
+    const double* column = columns[first + b].data;
+    for (Index a = b; a < n && a - b <= width; ++a) own(a, b) = column[a - b];
+    for (Index a = 0; !last && a < n && n + a - b <= width; ++a) below(a, b) = column[n + a - b];
+    own(b, side + b) = 1.0;
+  }
+  solve_lower({own[0].data, 2 * side}, n, side);
+  const auto matrix = [](double* data, Index stride, bool turned = false) {
+    const Index down = stride * Index(sizeof(double)), across = sizeof(double);
+    char* bytes = reinterpret_cast<char*>(data);
+    return turned ? Strided<double>{bytes, across, down} : Strided<double>{bytes, down, across};
+  };
+  for (Index a = 0; a < n; ++a) {
+    std::copy_n(own[a].data + side, n, left[a].data);
+    std::copy_n(own[a].data + side, n, right[a].data);
+  }
+  if (!last) {
+    double *gain = left[n].data, *carried = right[n].data;
+    multiply<double>(matrix(below[0].data, side), matrix(left[0].data, side), matrix(gain, side), n,
+                     n, n, room.view().data);
+    multiply<double>(matrix(const_cast<double*>(after.data), n), matrix(gain, side),
+                     matrix(carried, side), n, n, n, room.view().data);
+  }
+  multiply<double>(matrix(left[0].data, side, true), matrix(right[0].data, side),
+                   matrix(result.data, n), n, rows, n, room.view().data);
+  for (Index a = 0; a < n; ++a) {
+    for (Index b = 0; b < a; ++b) {
+      result(a, b) = result(b, a) = 0.5 * (result(a, b) + result(b, a));
+    }
+  }
+}
+
 }  // namespace hmt
