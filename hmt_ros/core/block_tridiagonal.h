@@ -115,12 +115,13 @@ HMT_INLINE void subtract_products(double* target, Index width, const double* fro
 }
 
 // Returns how many columns have a pivot that is positive and finite: all, or the matrix is not
-// positive definite.
-HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& room) {
+// positive definite. Columns of a block of n end with the next block: what is below is 0.
+HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& room, Index n) {
   const Index total = columns.size(), width = columns.size(1) - 1, stride = room.size(1);
   for (Index first = 0; first < total; first += panel_columns) {
     const Index count = std::min(panel_columns, total - first);
-    const Index rows = std::min(width + count, total - first);
+    const Index end = std::min(total, ((first + count - 1) / n + 2) * n);
+    const Index rows = std::min(width + count, end - first);
     for (Index k = 0; k < count; ++k) {
       double* row = room.data + k * stride;
       std::fill_n(row, stride, 0.0);
@@ -148,11 +149,14 @@ HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& roo
   }
   return total;
 }
-inline Index factorise_band(const Matrix& columns) {
-  expect(columns.size(1) > 0, "columns", "a diagonal");
+inline Index factorise_blocks(const Matrix& columns, Index n) {
   const Index longest = in_whole_lanes(columns.size(1) + panel_columns);
   const Scratch<double, 2> room(panel_columns, longest + lanes);
-  return factorise_columns(columns, room.view());
+  return factorise_columns(columns, room.view(), n);
+}
+inline Index factorise_band(const Matrix& columns) {
+  expect(columns.size(1) > 0, "columns", "a diagonal");
+  return factorise_blocks(columns, std::max<Index>(columns.size(), 1));
 }
 
 inline void expect_vectors(const Matrix& columns, const Matrix& x) {

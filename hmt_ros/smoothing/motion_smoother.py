@@ -27,7 +27,13 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, NotPositiveDefiniteError
 from hmt_ros.inference.error_model import TOGETHER, CueErrors
-from hmt_ros.inference.linear_algebra import inverse, log_determinant, product, solve
+from hmt_ros.inference.linear_algebra import (
+    inverse,
+    log_determinant,
+    mean_distances,
+    product,
+    solve,
+)
 from hmt_ros.inference.linear_gaussian_dynamics import Couplings, LinearGaussianDynamics
 from hmt_ros.inference.mode_chain import Link, backward_weights, drawn_paths
 from hmt_ros.smoothing.motions import (
@@ -36,7 +42,6 @@ from hmt_ros.smoothing.motions import (
     MotionEvidence,
     evidence_of_motions,
     grouped,
-    mean_distances,
     path_distances,
 )
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
@@ -401,7 +406,7 @@ class MotionSmoother:
     def _away(self, states: Array, places: Array) -> Array:
         """Mean distances (T,) of the points of states (T, n) from others (T, P, 3), m."""
         poses = np.clip(states, *self.limits())[:, : self.dynamics.dimension]
-        return mean_distances(self.points_of(poses), places)
+        return np.asarray(mean_distances(self.points_of(poses), places))
 
     def advanced(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
         """What the first images of a window tell of the one after them.

@@ -111,7 +111,7 @@ inline Index condition_chain(const ChainPrior& prior, const Tables& precisions, 
       }
     }
   }
-  const Index done = factorise_band(columns);
+  const Index done = factorise_blocks(columns, n);
   if (done < times * n) return done;
   solve_band_lower(columns, right);
   solve_band_transposed(columns, right);
