@@ -37,6 +37,7 @@ NEAR = 0.01  # least depth of a point that has an image, m
 # Least part of the vertical across the optical axis by which a camera has a roll.
 STEEP = 0.1
 STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
+CLOSE = 1e-14  # error of a ray at which the inversion ends, of the tangent
 # Tangents at which a distortion is checked, and the largest factor by which a lens magnifies more
 # farther out: calibrations of real lenses reach 2.5, at the corners of wide images.
 _TURNS = 0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2
@@ -182,6 +183,9 @@ class Camera:
             for _ in range(20):
                 value, inner = self.distort(ab[0], ab[1])
                 error = value - target
+                error[:, np.abs(error).max(0) < CLOSE] = 0.0
+                if not error.any():
+                    break
                 det = inner[0][0] * inner[1][1] - inner[0][1] * inner[1][0]
                 det = np.where(np.abs(det) > 1e-9, det, 1.0)
                 step = np.stack(
@@ -249,10 +253,10 @@ def unfolded_share(camera: Camera) -> float:
     """
     x, y = (np.array([-0.5, n - 0.5]) for n in (camera.width, camera.height))
     a, b = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-    corners = np.hypot(a, b).reshape(-1, 1).clip(min=1e-9)
+    corners = elementary.hypot(a, b).reshape(-1, 1).clip(min=1e-9)
     ideal = CHECKED * np.stack([a, b]).reshape(2, -1, 1) / corners
     with np.errstate(all='ignore'):  # a rational model has poles, which lie outside
-        radius = np.hypot(*camera.distort(*ideal)[0])
+        radius = elementary.hypot(*camera.distort(*ideal)[0])
         slope = np.diff(radius) / np.diff(CHECKED)
     # A fold may lead back into the image from outside, which matters to no pixel.
     reached = np.maximum.accumulate(radius, axis=1)[:, :-1]
@@ -270,9 +274,9 @@ def roll(ups: ArrayLike) -> Array:
             (`STEEP`), and zeros, tell of no roll.
     """
     x, y, _ = np.moveaxis(np.asarray(ups, dtype=np.float64), -1, 0)
-    length = np.hypot(x, y)
+    length = elementary.hypot(x, y)
     x, y = np.where(length > STEEP, (x, y), np.reshape((0.0, -1.0), (2, *(1,) * np.ndim(length))))
-    sine, cosine = np.stack([x, -y]) / np.hypot(x, y)
+    sine, cosine = np.stack([x, -y]) / elementary.hypot(x, y)
     result = np.zeros((*np.shape(x), 3, 3))
     result[..., 0, 0] = result[..., 1, 1] = cosine
     result[..., 0, 1], result[..., 1, 0], result[..., 2, 2] = -sine, sine, 1.0

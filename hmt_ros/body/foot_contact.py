@@ -69,7 +69,7 @@ def _height_evidence(plane: FloorPlane, points: Array) -> Array:
     """Log odds (K, P) of rest by the heights of points (K, P, 3)."""
     if plane.height is None:
         return np.zeros(points.shape[:2])
-    sigma = np.hypot(REST_HIGH, plane.height_sigma)
+    sigma = elementary.hypot(REST_HIGH, plane.height_sigma)
     z = (product(points, plane.up) + plane.height) / sigma
     result: Array = -0.5 * z * z - elementary.log(np.sqrt(2.0 * np.pi) * sigma / LIFT)
     return result
@@ -85,7 +85,7 @@ def _motion_evidence(before: Array, points: Array, dt: float) -> Array:
     result = np.zeros(points.shape[:2])
     for square, axes, error in ((across, 2, REST_ACROSS), (along**2, 1, REST_ALONG)):
         rest = error * differs
-        free = np.hypot(rest, FREE_SPEED * dt)
+        free = elementary.hypot(rest, FREE_SPEED * dt)
         result += axes * elementary.log(free / rest) - 0.5 * square * (
             1.0 / (rest * rest) - 1.0 / (free * free)
         )

@@ -54,7 +54,7 @@ class AnglePrior:
             np.zeros((1, 0, 0)),
             np.zeros(0, dtype=np.int64),
             self.body.prior_mean,
-            self.body.prior_sigma**-2.0,
+            1.0 / self.body.prior_sigma**2,
             self.weight,
         )
 
@@ -80,12 +80,12 @@ class MixturePrior:
         n = whole.dimension
         log_det = -elementary.log(np.diagonal(mixture.whitening, axis1=1, axis2=2)).sum(1)
         log_weights = elementary.log(whole.weights)
-        rest = self.body.prior_sigma**-2.0
+        rest = 1.0 / self.body.prior_sigma**2
         rest[mixture.indices] = 0.0
         return PriorModel(
             mixture.whitening,
             product(mixture.whitening, whole.means[..., None])[..., 0],
-            log_weights - log_det - 0.5 * n * math.log(2.0 * math.pi) - mixture.highest,
+            log_weights - log_det - 0.5 * n * elementary.log(2.0 * math.pi) - mixture.highest,
             mixture.precisions,
             mixture.indices,
             self.body.prior_mean,

@@ -231,7 +231,7 @@ def _fit_arm(
     bend = np.cross(lower, upper)
     sine = length(bend)
     angles[f'{letter}_elbow'] = float(elementary.arctan2(sine, product(upper, lower)))
-    b = float(elementary.arctan2(np.hypot(upper[0], upper[1]), -upper[2]))
+    b = float(elementary.arctan2(elementary.hypot(upper[0], upper[1]), -upper[2]))
     hangs = elementary.sin(b) < _STRAIGHT
     a = before[names[0]] if hangs else float(elementary.arctan2(upper[0], s * upper[1]))
     c = before[names[2]]
@@ -259,7 +259,7 @@ def _fit_leg(
         # The knee bends backward: its axis is the y axis of the thigh, (-sin, cos cos, sin).
         y = bend / sine
         b = float(elementary.arcsin(np.clip(y[2], -1.0, 1.0)))
-        level = np.hypot(y[0], y[1]) > _STRAIGHT
+        level = elementary.hypot(y[0], y[1]) > _STRAIGHT
         a = float(elementary.arctan2(y[0], y[1])) if level else before[names[0]]
         turns = [(a, b), (a + np.pi, np.pi - b)]
     else:

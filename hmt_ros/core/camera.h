@@ -2,6 +2,7 @@
 #pragma once
 
 #include "arrays.h"
+#include "elementary.h"
 
 namespace hmt {
 
@@ -41,7 +42,7 @@ inline constexpr auto bent_by_polynomials = [](const auto& k, double a, double b
 };
 
 inline constexpr auto bent_by_angle = [](const auto& k, double a, double b) {
-  const double r = std::sqrt(a * a + b * b), theta = std::atan(r), t = theta * theta;
+  const double r = std::sqrt(a * a + b * b), theta = elementary::atan(r), t = theta * theta;
   const double bent = theta * (1.0 + t * (k[0] + t * (k[1] + t * (k[2] + t * k[3]))));
   const double d_bent =
       1.0 + t * (3.0 * k[0] + t * (5.0 * k[1] + t * (7.0 * k[2] + t * 9.0 * k[3])));

@@ -1,9 +1,17 @@
-// log sum exp(x).
+// log sum exp(x), and the terms of the sum.
 #pragma once
 
 #include "elementary.h"
 
 namespace hmt {
+
+// Replaces x by exp(x - largest) and returns the sum of these.
+HMT_WIDE inline double exponentials(double* x, double largest, Index count) {
+  for (Index i = 0; i < count; ++i) x[i] = elementary::exp(x[i] - largest);
+  double sum = 0.0;
+  for (Index i = 0; i < count; ++i) sum += x[i];
+  return sum;
+}
 
 // Of what lies in `x`, which is overwritten.
 HMT_WIDE inline double log_sum_exp(double* x, Index count) {
@@ -13,10 +21,7 @@ HMT_WIDE inline double log_sum_exp(double* x, Index count) {
     if (std::isnan(largest)) return nan;
   }
   if (std::isinf(largest)) return largest;
-  for (Index i = 0; i < count; ++i) x[i] = elementary::exp(x[i] - largest);
-  double sum = 0.0;
-  for (Index i = 0; i < count; ++i) sum += x[i];
-  return largest + elementary::log(sum);
+  return largest + elementary::log(exponentials(x, largest, count));
 }
 HMT_INLINE double log_add_exp(double a, double b) {
   if (a == b) return a + 0x1.62e42fefa39efp-1;  // log 2; also where both are infinite

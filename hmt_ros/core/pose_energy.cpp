@@ -1,5 +1,6 @@
 #include "pose_energy.h"
 
+#include "elementary.h"
 #include "wide.h"
 
 namespace hmt {
@@ -141,7 +142,7 @@ class PoseEnergy {
     for (Index i = 0; i < f; ++i) distance += pulled_[i] * (x[i] - centre[i]);
     double value = 0.5 * distance, shrinkage = 1.0;
     if (nu > 0.0) {
-      value = 0.5 * (nu + f) * std::log1p(distance / nu);
+      value = 0.5 * (nu + f) * elementary::log1p(distance / nu);
       shrinkage = (nu + f) / (nu + distance);
     }
     if (!wanted) return value;

@@ -9,6 +9,7 @@
 #pragma once
 
 #include "lanes.h"
+#include "log_sum_exp.h"
 #include "wide.h"
 
 namespace hmt {
@@ -112,12 +113,8 @@ HMT_WIDE inline double evaluate_prior(const PriorModel& model, const Numbers& po
     log[c] = component_log_density(model, c, best, room);
     best = most(best, log[c]);
   }
-  double total = 0.0;
-  for (Index c = 0; c < count; ++c) {
-    log[c] = std::exp(log[c] - best);
-    total += log[c];
-  }
-  double energy = -best - std::log(total);
+  const double total = exponentials(log.data, best, count);
+  double energy = -best - elementary::log(total);
   for (Index i = 0; i < d; ++i) {
     const double offset = pose[i] - model.means[i];
     energy += 0.5 * model.rest[i] * offset * offset;

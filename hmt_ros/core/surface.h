@@ -153,7 +153,7 @@ class ContourRoom {
 
 // sgn(x) |x|^exponent.
 inline double signed_power(double x, double exponent) {
-  return sign(x) * std::pow(std::abs(x), exponent);
+  return sign(x) * elementary::pow(std::abs(x), exponent);
 }
 
 // The point (3,) of a ring whose angle has this cosine and sine, and the normal (3,) there, camera
@@ -182,7 +182,7 @@ inline void ring_point(const Ring& ring, double c, double s, const double* axes,
 struct ContourCondition {
   double bx, by, uz, kx, ky, power;
   double operator()(double w) const {
-    const double c = std::cos(w), s = std::sin(w);
+    const auto [s, c] = elementary::sincos(w);
     const double turned = bx * signed_power(c, power) + by * signed_power(s, power);
     return 1.0 + turned - uz * (kx * c * c + ky * s * s);
   }
@@ -212,8 +212,9 @@ inline bool bracketed_roots(const ContourCondition& condition, double* cosines, 
         high = root;
         at_high = value;
       }
-      cosines[side] = std::cos(root);
-      sines[side] = std::sin(root);
+      const auto [sine, cosine] = elementary::sincos(root);
+      cosines[side] = cosine;
+      sines[side] = sine;
       found[side] = true;
     }
     before = at;

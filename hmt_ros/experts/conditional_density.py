@@ -36,6 +36,7 @@ from hmt_ros.experts.training_pairs import finite_matrix
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import cholesky, log_sum_exp, solve_triangular
+from hmt_ros.inference.random_numbers import standard_normals
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -216,7 +217,7 @@ class ConditionalDensity(ABC):
             card: what it was learned from, licence, method; JSON must be able to hold it.
         """
         self._check_learned()
-        example = np.random.default_rng(0).normal(size=self.n_inputs_)
+        example = standard_normals(np.random.default_rng(0), (self.n_inputs_,))
         return write_model(path, self, stored_model, card or {}, example)
 
     @classmethod

@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from hmt_ros.body.learned_file import (
     Arrays,
@@ -189,6 +188,8 @@ class _Softmax:
 
     def newton(self, weights: Array, precisions: Array, steps: int) -> Array:
         """Damped Newton steps; the ratio of true to predicted gain sets the damping."""
+        from scipy.linalg import cho_solve, cholesky
+
         shape = weights.shape
         prior = np.tile(precisions, shape[0])
         likelihood, gates = self.likelihood(weights)
@@ -224,6 +225,8 @@ class _Softmax:
 
     def laplace(self, weights: Array, precisions: Array) -> _SoftmaxFit:
         """The share of the bound, with a Laplace approximation at the weights."""
+        from scipy.linalg import cholesky, solve_triangular
+
         experts, count = weights.shape
         likelihood, gates = self.likelihood(weights)
         hessian = self.curvature(gates)

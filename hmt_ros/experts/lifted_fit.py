@@ -175,7 +175,7 @@ def _fitted(
     across[:, 0, 0] = across[:, 1, 1] = 1.0
     across[:, 0, 2], across[:, 1, 2] = -rays[..., 0].T, -rays[..., 1].T
     error = np.einsum('jikn,jkn->jin', across, forward(skeleton, poses).points(segments, local))
-    precision = np.where(confidences.T > 0, noise_of(confidences.T) ** -2.0, 0.0)
+    precision = np.where(confidences.T > 0, 1.0 / noise_of(confidences.T) ** 2, 0.0)
     precision /= (1.0 + (error**2).sum(1) * precision / KERNEL**2) ** 2
     prior = pose_prior(body, LEARNED, PRIOR_WEIGHT)
     ones, nothing = np.ones((len(joints), m)), np.zeros((count, 3, m))

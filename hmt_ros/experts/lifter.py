@@ -40,7 +40,7 @@ from hmt_ros.body.learned_file import (
     require,
     write_model,
 )
-from hmt_ros.core import fill_window_inputs, window_middles
+from hmt_ros.core import elementary, fill_window_inputs, window_middles
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.network_experts import Floats, Layers
 from hmt_ros.experts.pose_encoding import ray_rotations
@@ -50,6 +50,7 @@ from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.inference.random_numbers import standard_normals
 
 # Times of a window relative to now, s, and how far an image may be from each.
 TIMES = np.array([0.0, -0.067, -0.15, -0.3, -0.5, -0.8, 0.067, 0.15, 0.3, 0.5, 0.8])
@@ -130,7 +131,7 @@ def proportions(usual: Body, lengths: Mapping[str, float]) -> Array:
     own = usual.segment_lengths
     weight = np.array([own[name] for name in PROPORTIONED])
     ratio = np.array([max(lengths[name] / own[name], SHORTEST) for name in PROPORTIONED])
-    return np.asarray(np.log(ratio) - weight @ np.log(ratio) / weight.sum())
+    return np.asarray(elementary.log(ratio) - product(weight, elementary.log(ratio)) / weight.sum())
 
 
 def places_of(keypoints: Keypoints, scheme: str = AUTO) -> list[int]:
@@ -250,7 +251,7 @@ class Network(Layers):
         k = out.shape[1] // (1 + 6 * j)
         gates, means = out[:, :k], out[:, k : k * (1 + 3 * j)].reshape(n, k, j, 3)
         spreads = out[:, k * (1 + 3 * j) :].reshape(n, k, j, 3)
-        deviations = np.exp(np.clip(spreads + SPREAD, *SPREADS))
+        deviations = elementary.exp(np.clip(spreads + SPREAD, *SPREADS))
         return log_softmax(gates), MEANS * means + self.middle, deviations
 
 
@@ -356,11 +357,11 @@ class Lifter:
         """The mixture over joints, (3 J,), for the inputs (p,) of a window."""
         gates, means, deviations = (x[0] for x in self.network(given[None].astype(np.float32)))
         spread = deviations.reshape(len(gates), -1, 1) ** 2 * np.eye(3 * len(self.joints))
-        return GaussianMixture(np.exp(gates), means.reshape(len(gates), -1), spread)
+        return GaussianMixture(elementary.exp(gates), means.reshape(len(gates), -1), spread)
 
     def save(self, path: str | Path) -> Path:
         """Writes the lifter into an .npz file, with its notes as the card; returns its path."""
-        drawn = np.random.default_rng(0).normal(size=INPUTS)
+        drawn = standard_normals(np.random.default_rng(0), (INPUTS,))
         example = self.network.mean + self.network.scale * drawn
         return write_model(path, self, self.from_arrays, self.notes, example)
 
@@ -414,7 +415,7 @@ class KeypointHistory:
     def carry(self, rotation: Array) -> None:
         """Takes the history into the frame (rotation (3, 3)) of a camera that has turned."""
         for i, (stamp, rays, confidences) in enumerate(self._seen):
-            turned = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) @ rotation.T
+            turned = product(np.concatenate([rays, np.ones((len(rays), 1))], axis=1), rotation.T)
             turned = turned[:, :2] / np.maximum(turned[:, 2:], BEFORE)
             self._seen[i] = stamp, turned, confidences
 

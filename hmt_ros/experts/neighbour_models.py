@@ -29,6 +29,7 @@ from hmt_ros.core import elementary
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs, checked_pairs
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.clustering import smallest_columns
 from hmt_ros.inference.linear_algebra import product
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ class _NeighbourModel(ConditionalDensity):
         for i in range(0, len(points), BATCH):
             some = points[i : i + BATCH]
             squared = self._norms - product(self._scaled, 2.0 * some.T).T
-            index = np.sort(np.argpartition(squared, count - 1, axis=1)[:, :count], axis=1)
+            index = smallest_columns(squared, count)
             squared = np.take_along_axis(squared, index, axis=1) + (some * some).sum(1)[:, None]
             order = np.argsort(squared, axis=1, kind='stable')
             squared = np.take_along_axis(squared, order, axis=1)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.learned_file import Arrays, check_positive, require
+from hmt_ros.core import elementary
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.training_pairs import Standardisation
@@ -162,7 +163,7 @@ class NetworkExperts(ConditionalDensity):
         return Components(
             log_softmax(gates),
             means * of_targets.scale + of_targets.centre,
-            np.exp(2.0 * np.clip(widths, -WIDTHS, WIDTHS)),
+            elementary.exp(2.0 * np.clip(widths, -WIDTHS, WIDTHS)),
             self.noise_,
         )
 
@@ -177,7 +178,7 @@ class NetworkExperts(ConditionalDensity):
         """exp(-(d / 2 s)^2 / 2), (n,): d to the nearest cluster of inputs, s the spread of one."""
         seen = self._of_inputs.apply(self._checked(inputs))
         away = squared_distances(seen, self._centres).min(1)
-        return np.asarray(np.exp(-0.5 * away / (2.0 * self._spacing) ** 2))
+        return np.asarray(elementary.exp(-0.5 * away / (2.0 * self._spacing) ** 2))
 
     def _learned(self) -> Arrays:
         return {

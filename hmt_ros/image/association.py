@@ -65,7 +65,7 @@ class Sighting:
     @property
     def size(self) -> float:
         """Diagonal of the box, px; 1 at least."""
-        return max(float(np.hypot(*(self.corners[1] - self.corners[0]))), 1.0)
+        return max(float(elementary.hypot(*(self.corners[1] - self.corners[0]))), 1.0)
 
     def shifts_to(self, other: Sighting) -> Array:
         """Shifts (n, 2) of the common joints to another sighting; without any, of the middle."""
@@ -114,7 +114,7 @@ class ImageTrack:
     def cost(self, sighting: Sighting, stamp: int) -> float:
         """Distance of a sighting from where the person is expected, in sizes of the person."""
         off = self.sighting.shifts_to(sighting) - self.shift(stamp)
-        return float(np.median(np.hypot(*off.T))) / self.size
+        return float(np.median(elementary.hypot(*off.T))) / self.size
 
     def gate(self, stamp: int) -> float:
         """Cost from which a sighting is of somebody else."""

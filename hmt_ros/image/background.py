@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.core import gradient_lengths
+from hmt_ros.core import elementary, gradient_lengths
 from hmt_ros.image.pixel_backgrounds import (
     FOREGROUND,
     SHADOW,
@@ -443,5 +443,5 @@ def _correlation(
     inner = background[REACH:-REACH, REACH:-REACH]
     found = np.nan_to_num(cv2.matchTemplate(image, inner, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(found.argmax()), found.shape)
-    shift = float(np.hypot(row - REACH, column - REACH))
+    shift = float(elementary.hypot(row - REACH, column - REACH))
     return shift, float(found[row, column]), float(found[REACH, REACH])

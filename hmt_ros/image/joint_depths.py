@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
+from hmt_ros.core import elementary
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.depth import usable_depths
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -72,7 +73,7 @@ def joint_depths(body: Body, keypoints: Keypoints, depths: ImageMap | None) -> J
     radii = _radii(body)[joints] if len(shown) else np.zeros(0)
     skin = np.zeros(0) if depths is None else _depths_at(depths, keypoints.pixels[shown])
     known = skin > 0
-    sigma = np.hypot(0.5 * radii, DEPTH_SIGMA)
+    sigma = elementary.hypot(0.5 * radii, DEPTH_SIGMA)
     return JointDepths(joints[known], (skin + radii)[known], sigma[known])
 
 

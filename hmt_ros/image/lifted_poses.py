@@ -20,7 +20,7 @@ import numpy as np
 
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, other_side
-from hmt_ros.core import resize_bones
+from hmt_ros.core import elementary, resize_bones
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product
 
@@ -143,7 +143,7 @@ def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
         own, theirs = shared(first.joints, one.joints)
         means[rows, own] = one.resized(first)[:, theirs]
         deviations[rows, own] = one.deviations[:, theirs]
-    weights = np.concatenate([one.log_weights for one in opinions]) - np.log(len(opinions))
+    weights = np.concatenate([one.log_weights for one in opinions]) - elementary.log(len(opinions))
     return LiftedPoses(first.joints, weights, means, deviations, first.axes, first.lengths)
 
 
@@ -244,5 +244,5 @@ def middle_of_hips(skeleton: Skeleton) -> Array:
     frames = forward(skeleton, np.zeros((1, skeleton.dimension)))
     columns, origins = frames.by_pose()
     hips = frames.joints()[skeleton.joint_index(HIPS), :, 0]
-    result: Array = columns[0, 0] @ (hips.mean(0) - origins[0, 0])
+    result: Array = product(columns[0, 0], hips.mean(0) - origins[0, 0])
     return result

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.core import bin_colours, count_colours
+from hmt_ros.core import bin_colours, count_colours, elementary
 from hmt_ros.image.person_shape import counted
 from hmt_ros.inference.arrays import Array, Image, Mask
 
@@ -144,7 +144,7 @@ class Colours:
         on, off = (x / max(x.sum(), 1) for x in counts[1:])
         scene = counts.sum(0) / bins.size
         first = self._inside is None
-        gain = 1.0 if first else -math.expm1(-dt / MEMORY_TIME)
+        gain = 1.0 if first else -float(elementary.expm1(-dt / MEMORY_TIME))
         self._inside = on if self._inside is None else self._inside + gain * (on - self._inside)
         self._around = self._around + gain * (off - self._around)
         self._scene = self._scene + gain * (scene - self._scene)

@@ -250,7 +250,7 @@ class PoseEnergy:
             )
         inside: Array = np.minimum(np.maximum(self._checked(x), lower), upper)
         n, f = inside.shape
-        metric = np.full(f, np.asarray(step_scale, dtype=np.float64) ** -2.0)
+        metric = np.full(f, 1.0 / np.asarray(step_scale, dtype=np.float64) ** 2)
         descent = Descent(max_iterations, float(damping), float(tolerance), metric)
         energy, _, _, status, iterations = self._solved(inside, np.arange(n), limits, descent, 2)
         if self.counted is not None:

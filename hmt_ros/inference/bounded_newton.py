@@ -91,7 +91,7 @@ def minimise(
     lower, upper = (
         np.ascontiguousarray(np.broadcast_to(limit, (n, d))) for limit in (lower, upper)
     )
-    metric = np.full(d, np.asarray(step_scale, dtype=np.float64) ** -2.0)
+    metric = np.full(d, 1.0 / np.asarray(step_scale, dtype=np.float64) ** 2)
 
     everyone = np.arange(n)
     first = term.energy(x, everyone)
@@ -183,7 +183,8 @@ class TrustRegion:
         ratio = np.where(np.isfinite(decrease), decrease, -np.inf) / predicted
         better: NDArray[np.bool_] = ratio > LEAST_RATIO
         taken = rows[better]
-        factor = 1.0 - (2.0 * np.minimum(ratio[better], 2.0) - 1.0) ** 3
+        gain = 2.0 * np.minimum(ratio[better], 2.0) - 1.0
+        factor = 1.0 - gain * gain * gain
         self.damping[taken] *= np.maximum(self._least_factor, factor)
         self._growth[taken] = 2.0
         return better

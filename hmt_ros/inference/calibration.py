@@ -21,6 +21,7 @@ from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import cholesky, inverse, product
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.inference.random_numbers import standard_normals
 
 
 def levels_of(at_points: Array, at_samples: Array) -> Array:
@@ -39,7 +40,7 @@ def stratified_samples(mixture: GaussianMixture, count: int, rng: np.random.Gene
     cumulated = np.cumsum(mixture.normalised().weights)
     at = (np.arange(count) + rng.random()) / count
     owners = np.minimum(np.searchsorted(cumulated, at, side='right'), len(mixture) - 1)
-    result = rng.standard_normal((count, mixture.dimension))
+    result = standard_normals(rng, (count, mixture.dimension))
     factors = mixture.cholesky()
     for k in range(len(mixture)):
         mine = owners == k

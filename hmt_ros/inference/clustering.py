@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product
@@ -25,6 +24,8 @@ def k_means(
     Returns:
         centres (K, p) and labels (N,). A cluster that loses all its points keeps its centre.
     """
+    from scipy.cluster.vq import kmeans2
+
     seeds = points[spread_points(points, count, rng)]
     with warnings.catch_warnings():
         warnings.simplefilter('ignore', UserWarning)  # a cluster without points
@@ -50,6 +51,17 @@ def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
             break
         chosen.append(int(np.searchsorted(np.cumsum(distance), total * rng.random())))
     return np.array(chosen)
+
+
+def smallest_columns(values: Array, count: int) -> Index:
+    """Columns (N, count), rising, of the smallest values (N, M) of each row.
+
+    Of equal values the first count: which numpy's own selection takes depends on the processor.
+    """
+    last = np.partition(values, count - 1, axis=1)[:, count - 1, None]
+    below, tied = values < last, values == last
+    tied &= tied.cumsum(1) <= count - below.sum(1, keepdims=True)
+    return np.nonzero(below | tied)[1].reshape(-1, count)
 
 
 def squared_distances(a: Array, b: Array) -> Array:

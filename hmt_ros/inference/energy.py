@@ -15,7 +15,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import product
 
 
 class Derivatives(IntEnum):
@@ -134,7 +136,7 @@ class Quadratic:
         """See `EnergyTerm`."""
         if self.precisions.ndim == 1:
             offset = x - _of_rows(self.centres, rows)
-            value = 0.5 * (offset * offset) @ self.precisions
+            value = 0.5 * product(offset * offset, self.precisions)
             if not derivatives:
                 return Energy(value)
             shape = (*x.shape, x.shape[1])
@@ -170,7 +172,7 @@ class Student:
         nu, d = self.degrees_of_freedom, x.shape[1]
         offset, pulled, precisions = _pulls(self, x, rows)
         distance = (offset * pulled).sum(1)
-        value = 0.5 * (nu + d) * np.log1p(distance / nu)
+        value = 0.5 * (nu + d) * elementary.log1p(distance / nu)
         if not derivatives:
             return Energy(value)
         shrinkage = (nu + d) / (nu + distance)
@@ -182,7 +184,7 @@ def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Arr
     offset = x - _of_rows(term.centres, rows)
     if term.precisions.ndim == 2:
         shape = (*x.shape, x.shape[1])
-        return offset, offset @ term.precisions, np.broadcast_to(term.precisions, shape)
+        return offset, product(offset, term.precisions), np.broadcast_to(term.precisions, shape)
     precisions = term.precisions[rows]
     return offset, np.einsum('nij,nj->ni', precisions, offset), precisions
 

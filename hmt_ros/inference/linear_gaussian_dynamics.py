@@ -182,7 +182,7 @@ class LinearGaussianDynamics:
         drift, diffusion, precision = np.zeros((3, 2 * d, 2 * d))
         drift[:d, d:] = np.eye(d)
         diffusion[d:, d:] = white
-        precision[d:, d:] = np.diag(sigma**-2.0)
+        precision[d:, d:] = np.diag(1.0 / sigma**2)
         return cls(drift, diffusion, d, np.zeros(2 * d), precision, step)
 
     @property

@@ -19,6 +19,7 @@ from hmt_ros.core import elementary
 from hmt_ros.inference import linear_algebra
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import log_sum_exp, product
+from hmt_ros.inference.random_numbers import standard_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +120,7 @@ class GaussianMixture:
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws n points, (n, d)."""
         k = rng.choice(len(self), size=n, p=self.normalised().weights)
-        noise = rng.standard_normal((n, self.dimension))
+        noise = standard_normals(rng, (n, self.dimension))
         offsets = product(self.cholesky()[k], noise[..., None])[..., 0]
         return np.asarray(self.means[k] + offsets)
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body, Camera
+from hmt_ros.core import elementary
 from hmt_ros.experts.lifter import Lifter, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, Scheme
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -134,16 +135,16 @@ class ChosenPerson:
 def _size(keypoints: Keypoints) -> float:
     """Diagonal of the box around a person, px."""
     pixels = keypoints.pixels[keypoints.seen]
-    return float(np.hypot(*np.ptp(pixels, axis=0)))
+    return float(elementary.hypot(*np.ptp(pixels, axis=0)))
 
 
 def _distance(one: Keypoints, other: Keypoints) -> float:
     """Median distance of the landmarks that both have; else that of their middles, px."""
     both = one.seen & other.seen
     if both.any():
-        return float(np.median(np.hypot(*(one.pixels - other.pixels)[both].T)))
+        return float(np.median(elementary.hypot(*(one.pixels - other.pixels)[both].T)))
     middles = [each.pixels[each.seen].mean(0) for each in (one, other)]
-    return float(np.hypot(*(middles[0] - middles[1])))
+    return float(elementary.hypot(*(middles[0] - middles[1])))
 
 
 class DetectionReader:

@@ -4,10 +4,10 @@
     F(q) = E_q[log q(X) - log p(X, R)],    q = sum_i a_i N(M_i, s_i^2 S_i)                      (2)
 
 The distinct motions of a window start descents on (1) within limits, with one prior for all: that
-of the liveliest among them, where states begin anew if those of one do, with the feet held that
-rest in the heaviest. Of optima that are one motion the most probable is kept; (2) is over these.
-What it adapts is chosen on clips (docs/smoothing.md): the chain of the filter's modes weighs
-motions better than (2), so an optimum has the weight of the motions that came to it.
+of the liveliest among them, with the feet held that rest in the heaviest. Of optima that are one
+motion the most probable is kept; (2) is over these. What it adapts is chosen on clips
+(docs/smoothing.md): the chain of the filter's modes weighs motions better than (2), so an optimum
+has the weight of the motions that came to it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 from hmt_ros.smoothing.mixture_smoother import trajectory_mixture
-from hmt_ros.smoothing.motion_smoother import ANEW, MotionSmoother, SmoothedMotions
+from hmt_ros.smoothing.motion_smoother import MotionSmoother, SmoothedMotions
 from hmt_ros.smoothing.motions import SECOND_NS, grouped, path_distances
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import refine
@@ -64,9 +64,7 @@ def refined_on_images(
     d = motions.dimension
     chosen = _first_of_each(smoother, motions, motions.states, motions.weights, LEAST)[0]
     intervals = np.diff(motions.stamps_ns) / SECOND_NS
-    begins = found.begins[chosen, 1:].any(axis=0)
-    noise = np.where(begins, ANEW, found.liveliness[chosen].max())
-    prior = smoother.dynamics.prior(intervals, noise=noise)
+    prior = smoother.dynamics.prior(intervals, noise=found.liveliness[chosen].max())
     if smoother.resting is not None and len(intervals):
         first = chosen[0]
         covariances = found.evidence.covariances[first]

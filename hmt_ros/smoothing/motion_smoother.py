@@ -6,10 +6,9 @@
 z_t and R_t are the motion's modes in an image (`motions`), N(m_1, P_1) is the state predicted by
 the motions that its paths come from. l_t is how much livelier the motion is than the prior of
 people's motion: the least of 1, 4, 16, 64 with which the states stay with the modes whose motion
-they are. Where the modes before and after a time are farther apart than a body moves, the chain has
-gone over to another explanation, and the states begin anew. An image whose modes are far from both
-is wrong, and counts little. E is a parabola with a block-tridiagonal Hessian; states beyond limits
-are moved onto them.
+they are. An image whose modes are far from the states is wrong, and counts little. A motion whose
+past is far from all its modes begins without it. E is a parabola with a block-tridiagonal Hessian;
+states beyond limits are moved onto them.
 """
 
 from __future__ import annotations
@@ -53,11 +52,6 @@ PATHS = 96
 LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
 # Distance from which on the modes of an image are taken for wrong, m, and looks at that.
 WRONG, WRONG_PASSES = 0.15, 3
-# Speed of a body, seen from the pelvis, m/s, and what modes tremble by, m: beyond, states begin
-# anew, unless modes so many seconds further away deny it (three images at 30 Hz). Factor on the
-# noise there.
-FASTEST, TREMBLE, FLICKER = 3.0, 0.05, 0.11
-ANEW = 1e6
 # Distance from all motions from which on a mode is a stray, m.
 STRAY = 0.05
 # Least weight of a motion of more than one image, and of one whose resting feet are held.
@@ -154,7 +148,7 @@ class MotionStates(NamedTuple):
         log_joint: log p(X, R), images as Gaussians.
         liveliness: l.
         trust: (T,) share that each image counts with.
-        begins: (T,) whether the states begin anew at an image.
+        fresh: whether the motion begins without the past.
     """
 
     states: Array
@@ -162,7 +156,7 @@ class MotionStates(NamedTuple):
     log_joint: float
     liveliness: float
     trust: Array
-    begins: Mask
+    fresh: bool
 
 
 class SmoothedMotions(NamedTuple):
@@ -173,7 +167,7 @@ class SmoothedMotions(NamedTuple):
         shares: T arrays (K_t, M), probability that each mode belongs to each motion.
         evidence: of the images; wrong ones have larger covariances.
         liveliness: (M,) l.
-        begins: (M, T) whether the states begin anew at an image.
+        fresh: (M,) whether a motion begins without the past.
         first: of the past; None: nothing is known.
     """
 
@@ -181,7 +175,7 @@ class SmoothedMotions(NamedTuple):
     shares: list[Array]
     evidence: MotionEvidence
     liveliness: Array
-    begins: Mask
+    fresh: Mask
     first: FirstStates | None
 
 
@@ -284,8 +278,7 @@ class MotionSmoother:
         least = LEAST if len(images) > 1 else 0.0
         labels = grouped(weights, *distances, self.max_motions, least)
         counted = [image.counted for image in images]
-        known = None if self.points is None else points
-        evidence = evidence_of_motions(nodes, weights, labels, counted, known)
+        evidence = evidence_of_motions(nodes, weights, labels, counted)
         masses: Array = np.bincount(labels, weights).astype(np.float64)
         shares = [
             _shares(nodes[:, t], weights, labels, len(link.weights), masses)
@@ -319,8 +312,8 @@ class MotionSmoother:
         if self.points is not None:
             trajectories = self._with_weights_in_time(trajectories, images, shares)
         liveliness = np.array([one.liveliness for one in found])
-        begins = np.array([one.begins for one in found])
-        return SmoothedMotions(trajectories, shares, evidence, liveliness, begins, first)
+        fresh = np.array([one.fresh for one in found])
+        return SmoothedMotions(trajectories, shares, evidence, liveliness, fresh, first)
 
     def _with_weights_in_time(
         self, found: TrajectoryMixture, images: Sequence[WindowImage], shares: Sequence[Array]
@@ -364,20 +357,18 @@ class MotionSmoother:
         dynamics, d = self.dynamics, self.dynamics.dimension
         means, precisions = evidence.means[m], inverse(evidence.covariances[m])
         places, trust = self.points_of(means), np.ones(len(means))
-        begins = np.zeros(len(means), dtype=np.bool_)
-        if self.points is not None:
-            begins[1:] = _begins(places, intervals)
         at, known, least = dynamics.initial_mean, dynamics.initial_precision, LIVELIER[0]
-        if first is not None:
+        fresh = first is None
+        if first is not None and self.points is not None:
             before = self.points_of(first.means[m, :d])
-            begins[0] = self.points is not None and mean_distances(before, places).min() > WRONG
-            if not begins[0]:
-                at, known = first.means[m], inverse(first.covariances[m])
-                least = first.liveliness[m] / LIVELIER[1]
+            fresh = bool(mean_distances(before, places).min() > WRONG)
+        if first is not None and not fresh:
+            at, known = first.means[m], inverse(first.covariances[m])
+            least = first.liveliness[m] / LIVELIER[1]
         known = 0.5 * (known + known.T)
         pull_of_first = product(known, at)
         for liveliness in (x for x in LIVELIER if x >= least):
-            noise = np.where(begins[1:], ANEW, liveliness)
+            noise = np.full(len(intervals), liveliness)
             prior = ChainPrior(*couplings[:4], 1.0 / noise, known, pull_of_first)
             states, factor = _conditioned(prior, precisions, means)
             away = self._away(states, places)
@@ -401,7 +392,7 @@ class MotionSmoother:
             resting = self.resting.along(poses, evidence.covariances[m], intervals)
             if resting is not None:
                 states = _conditioned(prior, precisions, means, resting)[0]
-        return MotionStates(states, factor, float(gained - seen), liveliness, trust, begins)
+        return MotionStates(states, factor, float(gained - seen), liveliness, trust, fresh)
 
     def _away(self, states: Array, places: Array) -> Array:
         """Mean distances (T,) of the points of states (T, n) from others (T, P, 3), m."""
@@ -421,10 +412,8 @@ class MotionSmoother:
         stamps = found.trajectories.stamps_ns
         assert stamps is not None
         times = [*stamps[:count], after.stamp_ns]
-        begins = found.begins.copy()
         if found.first is None:
-            begins[:, 0] = True
-            means = np.zeros((len(begins), dynamics.state_dimension))
+            means = np.zeros((len(found.fresh), dynamics.state_dimension))
             covariances = dynamics.states(evidence.covariances[:, 0])
         else:
             means, covariances = found.first.means, found.first.covariances
@@ -434,10 +423,10 @@ class MotionSmoother:
             gains = gains.swapaxes(1, 2)
             means = means + product(gains, (seen - means[:, :d])[:, :, None])[:, :, 0]
             covariances = covariances - product(gains, covariances[:, :d])
-            anew = begins[:, t]
-            means[anew] = dynamics.initial_mean
-            means[anew, :d] = seen[anew]
-            covariances[anew] = dynamics.states(spread[anew])
+            if t == 0:
+                means[found.fresh] = dynamics.initial_mean
+                means[found.fresh, :d] = seen[found.fresh]
+                covariances[found.fresh] = dynamics.states(spread[found.fresh])
             interval = (times[t + 1] - times[t]) / SECOND_NS
             means, covariances = dynamics.predict(means, covariances, interval)
             livelier = found.liveliness[:, None, None] - 1.0
@@ -458,25 +447,6 @@ def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Arr
     np.add.at(result, (nodes, labels), weights)
     result[~result.any(1)] = masses
     return np.asarray(result / result.sum(1, keepdims=True))
-
-
-def _begins(places: Array, intervals: Array) -> Mask:
-    """Where, (T-1,), modes (T, P, 3) have gone over to another explanation since the image before.
-
-    Those shortly before are out of reach of those shortly after.
-    """
-    seconds = np.concatenate([[0.0], np.cumsum(intervals)])
-    result = np.ones(len(intervals), dtype=np.bool_)
-    for apart in range(1, len(places)):
-        gaps = seconds[apart:] - seconds[:-apart]
-        near = mean_distances(places[apart:], places[:-apart]) <= TREMBLE + FASTEST * gaps
-        spans = [slice(a, a + len(gaps)) for a in range(apart)]
-        short = [gaps - intervals[span] <= FLICKER for span in spans]
-        if not np.any(short):
-            break
-        for span, some in zip(spans, short, strict=True):
-            result[span][near & some] = False
-    return result
 
 
 def _conditioned(

@@ -24,6 +24,7 @@ from hmt_ros.inference.block_tridiagonal import (
     BlockTridiagonal,
 )
 from hmt_ros.inference.linear_algebra import log_sum_exp
+from hmt_ros.inference.random_numbers import standard_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +146,7 @@ class TrajectoryMixture:
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws trajectories (n, T, d), projected onto the limits."""
         owners = rng.choice(len(self), size=n, p=self.weights / self.weights.sum())
-        noise = rng.standard_normal((n, *self.states.shape[1:]))
+        noise = standard_normals(rng, (n, *self.states.shape[1:]))
         result = np.empty((n, self.times, self.dimension))
         for i in np.unique(owners):
             mine = owners == i

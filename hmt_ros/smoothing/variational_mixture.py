@@ -43,6 +43,7 @@ from hmt_ros.inference.gaussian_pairs import pair_distances
 from hmt_ros.inference.lbfgs import descent
 from hmt_ros.inference.linear_algebra import log_sum_exp, product
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
+from hmt_ros.inference.random_numbers import standard_normals
 from hmt_ros.inference.threads import together
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
@@ -150,7 +151,7 @@ def minimise_free_energy(
 
 def antithetic(rng: np.random.Generator, components: int, samples: int, size: int) -> Array:
     """White noise (M, S, D) in pairs z, -z."""
-    half = rng.standard_normal((components, samples // 2, 1, size))
+    half = standard_normals(rng, (components, samples // 2, 1, size))
     return np.concatenate([half, -half], axis=2).reshape(components, samples, size)
 
 

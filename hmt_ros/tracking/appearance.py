@@ -20,6 +20,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import NEAR, Camera
 from hmt_ros.body.keep_out import RUNNING_SPEED
+from hmt_ros.core import elementary
 from hmt_ros.image.person_colours import LEARNING_INTERVAL, MEMORY_TIME, Colours, Motion
 from hmt_ros.image.person_shape import (
     Piece,
@@ -152,7 +153,7 @@ class Appearance:
     def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
         """Learns from an image in which the person is at a pose (d,); `silhouetted` came before."""
         dt = 0.0 if self._model is None else seconds(stamp - self._stamp)
-        gain = -math.expm1(-dt / MEMORY_TIME)
+        gain = -float(elementary.expm1(-dt / MEMORY_TIME))
         self._model = model = covered(body, camera, pose, raster_step(camera.height))
         self._depth, self._stamp = max(float(pose[2]), NEAR), stamp
         self._magnification = camera.magnification(self._depth) / raster_step(camera.height)

@@ -34,6 +34,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera, log_prior_of_distance
 from hmt_ros.body.mirror import reverse_depth
+from hmt_ros.core import elementary
 from hmt_ros.experts.lifted_fit import KNOWN_SIZE, poses_of
 from hmt_ros.experts.lifter import landmark_rays
 from hmt_ros.image.joint_depths import depths_of, moved_to_depth
@@ -62,7 +63,7 @@ from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOME
 
 # What a prediction is sure of by itself, nats: in the first image nothing else has spoken.
 AT_ONCE = 1.5 * CLEAR.nats
-PRESENT_LOG_ODDS = math.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY))
+PRESENT_LOG_ODDS = float(elementary.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY)))
 # Share of the best poses from keypoints whose reversals in depth are searched, too.
 REVERSED = MAX_STARTS // 4
 

@@ -23,6 +23,7 @@ from hmt_ros.body.camera_pose import CameraPose
 from hmt_ros.body.mirror import propagated, turn_jacobians, turned
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds
+from hmt_ros.inference.linear_algebra import product
 from hmt_ros.tracking.classes import ways
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
@@ -46,7 +47,7 @@ class CameraMotion:
         if before.equals(now):
             return None
         back = now.rotation.T
-        return cls(back @ before.rotation, back @ (before.position - now.position))
+        return cls(product(back, before.rotation), product(back, before.position - now.position))
 
     def points(self, points: Array) -> Array:
         """Points (..., 3) that stand still, m."""
@@ -54,7 +55,7 @@ class CameraMotion:
 
     def directions(self, directions: Array) -> Array:
         """Directions (..., 3) that stand still."""
-        result: Array = directions @ self.rotation.T
+        result: Array = product(directions, self.rotation.T)
         return result
 
     def poses(self, body: Body, poses: Array) -> Array:
@@ -100,7 +101,7 @@ class CameraMotion:
             back=ways(body, joints, joints[0]),
             expected=self.poses(body, modes.expected),
             soles=self.points(modes.soles),
-            velocities=(jacobians @ modes.velocities[..., None])[..., 0],
+            velocities=product(jacobians, modes.velocities[..., None])[..., 0],
             covariances=propagated(jacobians, modes.covariances),
             filtered=propagated(jacobians, modes.filtered),
             state_covariances=propagated(states, modes.state_covariances),

@@ -19,6 +19,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.body.postures import postures_of
+from hmt_ros.core import elementary
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface_points import SurfacePoints, seen_points
 from hmt_ros.image.unseen_limbs import UnseenLimbs
@@ -142,7 +143,7 @@ class MixtureFilter:
         log_weights, precisions = np.zeros(len(poses)), np.zeros((*poses.shape, poses.shape[1]))
         if start.expected is not None:
             with np.errstate(divide='ignore'):
-                log_weights = np.log(start.expected.normalised().weights)
+                log_weights = elementary.log(start.expected.normalised().weights)
             precisions = inverse(start.expected.covariances)
         seen = observation
         if start.clicked is not None:
@@ -338,7 +339,7 @@ class MixtureFilter:
     def _publish(self, modes: Modes) -> None:
         """Makes the modes that are published, and what they come from in the image before."""
         before, self._sources = self._sources, np.arange(len(modes))
-        weights = np.exp(self.published.log_weights)
+        weights = elementary.exp(self.published.log_weights)
         unseen = self.limbs.of_dofs(self.body)
         if unseen.any():
             spread, self._sources, postures = postures_of(self.body).spread(modes.mixture, unseen)
@@ -346,7 +347,7 @@ class MixtureFilter:
                 modes[self._sources],
                 poses=spread.means,
                 covariances=spread.covariances,
-                log_weights=np.log(spread.weights),
+                log_weights=elementary.log(spread.weights),
                 identities=modes.identities[self._sources] + (postures << POSTURE_BITS),
             )
         if modes.origins.shape[1]:
@@ -391,7 +392,7 @@ class MixtureFilter:
         if observation.outline is None and observation.keypoints is None:
             return False
         best = slice(SHAPE_MODES)
-        poses, weights = self.modes.poses, np.exp(self.modes.log_weights[best])
+        poses, weights = self.modes.poses, elementary.exp(self.modes.log_weights[best])
         gradients, covariances = self.posterior.fit(poses, observation).given_way()
         body = self.shape.update(
             self.posterior.likelihood,

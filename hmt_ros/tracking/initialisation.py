@@ -22,6 +22,7 @@ from hmt_ros.body.camera import AXES, Camera
 from hmt_ros.body.ground_terms import without_root_lean
 from hmt_ros.body.kinematics import directed_derivatives, forward, joint_length_jacobians
 from hmt_ros.body.model_file import held
+from hmt_ros.core import elementary
 from hmt_ros.flips.interpretation_tree import distinct_poses, enumerate_flips
 from hmt_ros.image.joint_depths import MIN_JOINTS, JointDepths, joint_depths
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
@@ -36,6 +37,7 @@ from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction, Quadratic
+from hmt_ros.inference.linear_algebra import inverse, product
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.misfit import of_depth
@@ -105,11 +107,11 @@ def start_from_keypoints(
     best = np.argsort(fits.value, kind='stable')[:3]
     if not np.isfinite(fits.value[best[0]]):
         raise ValueError(NO_POSE)
-    weights = np.exp(-(fits.value[best] - fits.value[best[0]]))
+    weights = elementary.exp(-(fits.value[best] - fits.value[best[0]]))
     d = body.dimension
-    lengths = (weights / weights.sum()) @ fits.x[best, d:]
+    lengths = product(weights / weights.sum(), fits.x[best, d:])
     own = sized.with_segment_lengths(dict(zip(body.skeleton.length_names, lengths, strict=True)))
-    spread = np.linalg.inv(fits.hessian[best[0]])[d:, d:]
+    spread = inverse(fits.hessian[best[0]])[d:, d:]
     own = replace(own, length_covariance=0.5 * (spread + spread.T))
     poses = _with_flips(own, camera, keypoints, upright, depths, fits.x[:, :d])
     if depths is not None:
@@ -221,7 +223,7 @@ def check_box(box: Box, camera: Camera) -> None:
 
 def _level_rays(body: Body, camera: Camera, pixels: Array) -> Array:
     """Rays (N, 2), x / z and y / z along the axes of the body's level, of pixels (N, 2)."""
-    rays = camera.rays(pixels) @ body.level
+    rays = product(camera.rays(pixels), body.level)
     return np.asarray(rays[:, :2] / rays[:, 2:])
 
 
@@ -231,12 +233,12 @@ def _poses_between(body: Body, low: Array, high: Array) -> Array:
     result = np.tile(body.prior_mean, (HEADINGS, 1))
     result[:, :3] = 0.0
     result[:, body.dof_names.index('root_z')] = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
-    heights = (body.joint_positions(result) @ body.level)[..., 1]
+    heights = product(body.joint_positions(result), body.level)[..., 1]
     top, bottom = heights.min(1), heights.max(1)
     depth = (bottom - top) / max(high[1] - low[1], np.finfo(np.float64).eps)
     result[:, :3] = depth[:, None] * np.append(middle, 1.0)
     result[:, 1] -= 0.5 * (top + bottom)
-    result[:, :3] = result[:, :3] @ body.level.T
+    result[:, :3] = product(result[:, :3], body.level.T)
     return np.clip(result, body.lower, body.upper)
 
 
@@ -263,8 +265,8 @@ def _sized(body: Body, subject: Subject) -> Body:
 def _is_a_stature(body: Body, lengths: Array) -> bool:
     """Whether lengths (L,) make a stature that people have."""
     rates = body.stature_rates
-    change = float(rates @ (lengths - body.skeleton.lengths))
-    variance = float(rates @ body.length_covariance @ rates) + STATURE_SIGMA**2
+    change = float(product(rates, lengths - body.skeleton.lengths))
+    variance = float(product(product(rates, body.length_covariance), rates)) + STATURE_SIGMA**2
     return abs(change) <= GATE_SIGMAS * math.sqrt(variance)
 
 
@@ -282,12 +284,12 @@ def _fit_with_lengths(
     term = KeypointTerm(skeleton, camera, replace(keypoints, positions=None), LEAST_SQUARES)
     residuals = 2 * int(keypoints.seen.sum())
     sigma = body.length_sigma
-    length_precision = np.asarray(np.linalg.inv(body.length_covariance), dtype=np.float64)
+    length_precision = inverse(body.length_covariance)
     leaning, lean = body, None
     if upright is not None:
         leaning = without_root_lean(body)
         lean = PoseEnergy(ImageLikelihood(body, camera), (upright.term(body),))
-    prior_precision = leaning.prior_sigma**-2.0
+    prior_precision = 1.0 / leaning.prior_sigma**2
     default = skeleton.lengths
 
     of_angles = Quadratic(body.prior_mean, prior_precision)
@@ -320,10 +322,10 @@ def _fit_with_lengths(
                 ],
                 axis=1,
             )
-            value[i] = 0.5 * error @ error + cost.sum()
-            gradient[i] = np.concatenate([error, pull]) @ jacobian
+            value[i] = 0.5 * (error * error).sum() + cost.sum()
+            gradient[i] = product(np.concatenate([error, pull]), jacobian)
             curvature = np.concatenate([np.ones(len(error)), curvature])
-            hessian[i] = (jacobian * curvature[:, None]).T @ jacobian
+            hessian[i] = product((jacobian * curvature[:, None]).T, jacobian)
         for own_term in (lean, of_angles):
             if own_term is not None:
                 found = own_term.energy(poses, rows)
@@ -333,7 +335,7 @@ def _fit_with_lengths(
                 hessian[:, :d, :d] += curvature
         change = lengths - default
         value += 0.5 * np.einsum('nl,lm,nm->n', change, length_precision, change)
-        gradient[:, d:] += change @ length_precision
+        gradient[:, d:] += product(change, length_precision)
         hessian[:, d:, d:] += length_precision
         return value, gradient, hessian
 

@@ -21,6 +21,7 @@ import numpy as np
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.error_model import ERRORS
+from hmt_ros.inference.linear_algebra import product, solve
 from hmt_ros.inference.motion_states import PredictedStates
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, Optimised, PosePrediction
 from hmt_ros.tracking.posterior import Posterior
@@ -101,5 +102,5 @@ def is_surprising(moved: Array, precision: Array, hessian: Array) -> bool:
         precision: (d, d) of the prediction.
         hessian: (d, d) of the energy, motion prior included, at the optimum.
     """
-    expected = len(moved) - np.trace(np.linalg.solve(hessian, precision))
-    return bool(moved @ precision @ moved > SURPRISING_RATIO * max(expected, 1.0))
+    expected = len(moved) - np.trace(solve(hessian, precision))
+    return bool(product(product(moved, precision), moved) > SURPRISING_RATIO * max(expected, 1.0))

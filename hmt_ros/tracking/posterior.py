@@ -35,7 +35,7 @@ from hmt_ros.tracking.settings import LIMIT_SIGMA, MAX_SIGMA, MINIMUM_TOLERANCE,
 # Share of Hessians that are no sums.
 ALONE = np.ones(1)
 # Precisions of a variable that rests on a limit, and of one that nothing is known of.
-PRECISIONS = LIMIT_SIGMA**-2.0, MAX_SIGMA**-2.0
+PRECISIONS = 1.0 / LIMIT_SIGMA**2, 1.0 / MAX_SIGMA**2
 
 
 @dataclass(frozen=True, eq=False)

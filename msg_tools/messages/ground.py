@@ -47,7 +47,7 @@ class GroundState:
     def __post_init__(self) -> None:
         up = numbers(self.up, (3,), 'ground: up')
         check_finite(up, 'ground: up')
-        if abs(float(np.linalg.norm(up)) - 1.0) > _TOLERANCE:
+        if abs(float(np.linalg.norm(up, axis=0)) - 1.0) > _TOLERANCE:
             raise MessageError(f'ground: up is {up.tolist()}, wanted a vector of length 1')
         if self.height is not None and not math.isfinite(self.height):
             raise MessageError(f'ground: height is {self.height}, wanted a number, or NaN')

@@ -15,6 +15,7 @@ import numpy as np
 from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import ReferenceHuman
 from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.inference.linear_algebra import product
 from msg_tools.messages.detections import SKELETON_2D
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
@@ -116,7 +117,7 @@ def skeleton_message(
     near = _AGREE * float(np.ptp(rows[np.isfinite(rows)])) if np.isfinite(rows).any() else 0.0
     apart = np.nan_to_num(np.linalg.norm(pixels - pixels[shown], axis=2), nan=np.inf)
     places = pixels[shown] / (camera.width, camera.height)
-    confidences = np.minimum(weights @ (apart <= near), 1.0)
+    confidences = np.minimum(product(weights, apart <= near), 1.0)
     inside = ((places >= 0) & (places <= 1)).all(1)
     values = np.where(inside[:, None], np.column_stack([places, confidences]), 0.0)
     return messages.create(
@@ -136,13 +137,13 @@ def landmarks_in_space(
     """
     marks = schemes()['skeleton2d'].landmarks
     names, rotations, _ = human.links()
-    head = human.rotation @ rotations[names.index('head')] @ _OF_HEAD
+    head = product(product(human.rotation, rotations[names.index('head')]), _OF_HEAD)
     result = np.full((len(positions), len(marks), 3), np.nan)
     for i, mark in enumerate(marks):
         if mark.joint in joint_names:
             result[:, i] = positions[:, list(joint_names).index(mark.joint)]
             if mark.joint == 'head':
-                result[:, i] += head @ mark.offset
+                result[:, i] += product(head, mark.offset)
     return result
 
 

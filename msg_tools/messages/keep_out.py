@@ -180,7 +180,7 @@ def _pieces(content: KeepOut) -> list[tuple[int, tuple[float, float], Array, Arr
     upright = np.array([0.0, 0.0, 0.0, 1.0])
     for start, end, radius in zip(content.starts, content.ends, content.radii, strict=True):
         axis = end - start
-        length = float(np.linalg.norm(axis))
+        length = float(np.linalg.norm(axis, axis=0))
         result.append((_SPHERE, (float(radius), 0.0), start, upright))
         if length < _POINT:
             continue
@@ -194,4 +194,4 @@ def _turn_to(axis: Array) -> Array:
     """Quaternion (4,) x, y, z, w that turns z to a unit vector (3,)."""
     x, y, z = axis.tolist()
     turn = np.array([-y, x, 0.0, 1.0 + z]) if z > -0.999999 else np.array([1.0, 0.0, 0.0, 0.0])
-    return np.asarray(turn / np.linalg.norm(turn))
+    return np.asarray(turn / np.linalg.norm(turn, axis=0))

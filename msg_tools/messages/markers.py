@@ -270,10 +270,10 @@ def _floor(messages: MessageFactory, header: Any, plane: Array, over: Array) -> 
     """The square under a point (3,)."""
     up, height = plane[:3], plane[3]
     across = np.eye(3)[np.argmin(np.abs(up))]
-    x = across - (across @ up) * up
-    x /= np.linalg.norm(x)
+    x = across - (across * up).sum() * up
+    x /= np.linalg.norm(x, axis=0)
     rotation = np.stack([x, np.cross(up, x), up], axis=1)
-    place = over - (over @ up + height + _THICK / 2) * up
+    place = over - ((over * up).sum() + height + _THICK / 2) * up
     return _marker(
         messages,
         header,

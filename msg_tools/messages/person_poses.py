@@ -15,12 +15,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_rotation_dofs
+from hmt_ros.body.rotations import rotation_vectors
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.linear_algebra import product
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_error import Array, MessageError, check_finite
 from msg_tools.messages.message_types import MessageFactory
@@ -50,9 +51,9 @@ class PersonPose(NamedTuple):
         both = np.zeros((6, 6))
         both[:3, :3] = both[3:, 3:] = rotation
         return PersonPose(
-            rotation @ self.position + translation,
-            rotation @ self.rotation,
-            both @ self.covariance @ both.T,
+            product(rotation, self.position) + translation,
+            product(rotation, self.rotation),
+            product(product(both, self.covariance), both.T),
         )
 
 
@@ -67,15 +68,15 @@ def person_pose(body: Body, mixture: GaussianMixture) -> PersonPose:
     root = root_rotation_dofs(body.skeleton)
     frames = forward(body.skeleton, mixture.means)
     places = frames.origins[0].T
-    turns = frames.columns[0].transpose(2, 1, 0) @ _PERSON_IN_PELVIS
+    turns = product(frames.columns[0].transpose(2, 1, 0), _PERSON_IN_PELVIS)
     # How place and rotation of the root move with its degrees of freedom.
     jacobians = np.zeros((len(mixture), 6, body.dimension))
     jacobians[:, :3, :3] = frames.axes[:3].transpose(2, 1, 0)
     jacobians[:, 3:, root] = frames.axes[root].transpose(2, 1, 0)
     best = int(np.argmax(mixture.weights))
-    away = Rotation.from_matrix(turns @ turns[best].T).as_rotvec()
+    away = rotation_vectors(product(turns, turns[best].T))
     errors = np.concatenate([places - places[best], away], axis=1)
-    own = jacobians @ mixture.covariances @ jacobians.swapaxes(1, 2)
+    own = product(product(jacobians, mixture.covariances), jacobians.swapaxes(1, 2))
     weights = mixture.weights / mixture.weights.sum()
     covariance = np.einsum('k,kij->ij', weights, own + errors[:, :, None] * errors[:, None, :])
     return PersonPose(places[best], turns[best], 0.5 * (covariance + covariance.T))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body
 from hmt_ros.body.mirror import relevelled
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.linear_algebra import product
 from msg_tools.messages.headers import header_message, time_message, time_ns
 from msg_tools.messages.message_error import (
     Array,
@@ -330,8 +331,8 @@ def _joint_covariances(body: Body, jacobians: Array, covariances: Array) -> Arra
         covariances: (K, d, d) of the poses.
     """
     k, joints, _, d = jacobians.shape
-    rows = (jacobians.reshape(k, 3 * joints, d) @ covariances).reshape(jacobians.shape)
-    result = rows @ jacobians.swapaxes(2, 3)
+    rows = product(jacobians.reshape(k, 3 * joints, d), covariances).reshape(jacobians.shape)
+    result = product(rows, jacobians.swapaxes(2, 3))
     own = np.square(body.joint_errors)[:, None, None] * np.eye(3)
     return np.asarray(0.5 * (result + result.swapaxes(2, 3)) + own, dtype=np.float64)
 

@@ -21,7 +21,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_ros.body.kinematics import Frames
+from hmt_ros.body.rotations import rotations_of
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.core import elementary
+from hmt_ros.inference.linear_algebra import product
 from msg_tools.messages.message_error import Array, MessageError
 
 # URDF wants limits with every joint that has a range; these stand for none.
@@ -123,7 +126,7 @@ def link_frames(
     turned = frames.rotations()[index]
     origins = np.ascontiguousarray(frames.origins[:, :, index])
     # The inverse of a rotation: a turn by -q about its axis, which it does not move itself.
-    back = _rotations(frames.axes[:, :, index], -q)
+    back = rotations_of(-q[:, None] * frames.axes[:, :, index])
     names: list[str] = []
     rotations: list[Array] = []
     places: list[Array] = []
@@ -139,12 +142,12 @@ def link_frames(
             dof = own[position]
             if position == len(own) - 1 and turns:
                 # The last rotation ends in the segment itself.
-                rotation = back[dof] @ rotation
+                rotation = product(back[dof], rotation)
                 continue
             link = f'{name}.{skeleton.dof_names[dof]}'
             if skeleton.dof_is_rotation[dof]:
                 chain.append((link, rotation, place))
-                rotation = back[dof] @ rotation
+                rotation = product(back[dof], rotation)
             else:
                 chain.append((link, unturned, place))
                 place = place - q[dof] * frames.axes[dof, :, index]
@@ -155,16 +158,6 @@ def link_frames(
     return names, np.array(rotations), np.array(places)
 
 
-def _rotations(axes: Array, angles: Array) -> Array:
-    """Rotations (N, 3, 3) about unit vectors (N, 3) by angles (N,), rad; Rodrigues' formula."""
-    x, y, z = axes.T
-    zero = np.zeros(len(axes))
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    sine, versine = np.sin(angles)[:, None, None], (1 - np.cos(angles))[:, None, None]
-    result: Array = np.eye(3) + sine * cross + versine * (cross @ cross)
-    return result
-
-
 def add_limit(joint: ET.Element, lower: float, upper: float) -> None:
     """Limits a joint, m or rad."""
     bounds = {'lower': repr(lower), 'upper': repr(upper)}
@@ -173,12 +166,12 @@ def add_limit(joint: ET.Element, lower: float, upper: float) -> None:
 
 def add_rod(link: ET.Element, end: Array, radius: float) -> None:
     """Shows a rod in a link, from its origin to an end (3,), m; none where they are one point."""
-    length = float(np.linalg.norm(end))
+    length = float(np.linalg.norm(end, axis=0))
     if length < 1e-6:
         return
     # A cylinder of URDF lies along z: pitch and yaw turn z into the direction of the rod.
     x, y, z = (end / length).tolist()
-    angles = [0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)]
+    angles = [0.0, float(elementary.arctan2(math.hypot(x, y), z)), float(elementary.arctan2(y, x))]
     visual = ET.SubElement(link, 'visual')
     ET.SubElement(visual, 'origin', xyz=xml_numbers(end / 2), rpy=xml_numbers(angles))
     geometry = ET.SubElement(visual, 'geometry')
@@ -188,10 +181,10 @@ def add_rod(link: ET.Element, end: Array, radius: float) -> None:
 def roll_pitch_yaw(rotation: ArrayLike) -> Array:
     """Angles (3,) of R = Rz(yaw) Ry(pitch) Rx(roll), exact also where pitch is a right angle."""
     r = np.asarray(rotation, dtype=np.float64)
-    yaw = math.atan2(r[1, 0], r[0, 0])
-    s, c = math.sin(yaw), math.cos(yaw)
-    pitch = math.atan2(-r[2, 0], c * r[0, 0] + s * r[1, 0])
-    roll = math.atan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
+    yaw = float(elementary.arctan2(r[1, 0], r[0, 0]))
+    s, c = float(elementary.sin(yaw)), float(elementary.cos(yaw))
+    pitch = float(elementary.arctan2(-r[2, 0], c * r[0, 0] + s * r[1, 0]))
+    roll = float(elementary.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1]))
     return np.array([roll, pitch, yaw])
 
 

@@ -2,7 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmt_ros.inference.clustering import k_means, spread_points, squared_distances
+from hmt_ros.inference.clustering import (
+    k_means,
+    smallest_columns,
+    spread_points,
+    squared_distances,
+)
 
 
 def test_clusters_of_separate_groups_are_found() -> None:
@@ -42,3 +47,10 @@ def test_spread_points_take_equal_points_once() -> None:
     chosen = spread_points(points, 40, rng)
     assert len(chosen) == 6
     assert len(np.unique(points[chosen], axis=0)) == 6
+
+
+def test_the_smallest_columns_are_the_first_of_equal_ones() -> None:
+    values = np.random.default_rng(2).integers(0, 6, size=(50, 20)).astype(float)
+    for count in (1, 7, 20):
+        wanted = np.sort(np.argsort(values, axis=1, kind='stable')[:, :count], axis=1)
+        np.testing.assert_array_equal(smallest_columns(values, count), wanted)

@@ -142,7 +142,9 @@ class World:
     def spin_until(self, done, what='it'):
         end = time.monotonic() + PATIENCE
         while not done():
-            assert time.monotonic() < end, f'waited in vain for {what}'
+            if time.monotonic() > end:
+                said = '\n'.join(self.warnings())
+                pytest.fail(f'waited in vain for {what}; the node has warned:\n{said}')
             self.executor.spin_once(timeout_sec=0.05)
 
     def start(self):

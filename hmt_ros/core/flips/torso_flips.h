@@ -1,6 +1,7 @@
 // Flips of the torso in depth (KJS 3); see hmt_ros/flips/torso_flips.py.
 #pragma once
 
+#include "../elementary.h"
 #include "../kinematics.h"
 
 namespace hmt {
@@ -131,9 +132,9 @@ class TorsoFlips {
     // R = mount' [x y z]; its elements that tell the angles about z, y and x.
     const double xx = dot(mount[0], x), yx = dot(mount[1], x), zx = dot(mount[2], x);
     const double zy = dot(mount[2], y), zz = dot(mount[2], z);
-    const bool first = set(torso_.root[0], std::atan2(yx, xx), pose);
-    const bool second = set(torso_.root[1], -std::asin(between(zx, -1.0, 1.0)), pose);
-    const bool third = set(torso_.root[2], std::atan2(zy, zz), pose);
+    const bool first = set(torso_.root[0], elementary::atan2(yx, xx), pose);
+    const bool second = set(torso_.root[1], -elementary::asin(between(zx, -1.0, 1.0)), pose);
+    const bool third = set(torso_.root[2], elementary::atan2(zy, zz), pose);
     return first && second && third;
   }
 
@@ -154,15 +155,15 @@ class TorsoFlips {
         v[j] -= tree_.mounts(segment, i, j) * dot(above[i].data, direction);
       }
     }
-    const bool first = set(own[0], std::atan2(-v[1], v[2]), pose);
-    const bool second = set(own[1], std::asin(between(v[0], -1.0, 1.0)), pose);
+    const bool first = set(own[0], elementary::atan2(-v[1], v[2]), pose);
+    const bool second = set(own[1], elementary::asin(between(v[0], -1.0, 1.0)), pose);
     if (own.size() == 2) return first && second;
     const double twist = pose[own[2]];
     pose[own[2]] = 0.0;
     place_segment(tree_, segment, pose, columns_, origins_, axes_, dof_origins_);
     pose[own[2]] = twist;
     const Matrix axis = columns_[segment];
-    const double c = std::atan2(dot(axis[1].data, shoulders), dot(axis[0].data, shoulders));
+    const double c = elementary::atan2(dot(axis[1].data, shoulders), dot(axis[0].data, shoulders));
     const bool third = set(own[2], c, pose);
     return first && second && third;
   }

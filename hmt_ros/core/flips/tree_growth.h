@@ -13,6 +13,7 @@
 #pragma once
 
 #include "../arrays.h"
+#include "../elementary.h"
 
 namespace hmt {
 
@@ -177,7 +178,7 @@ class TreeGrowth {
     double* frame = frames_[k + 1].data;
     for (int i = 0; i < 3; ++i) v[i] = dot(frame + 3 * i, z);
     if (dofs == 1) {
-      const double e = std::acos(between(v[2], -1.0, 1.0));
+      const double e = elementary::acos(between(v[2], -1.0, 1.0));
       // Until here the twist of the spherical joint was left out of the frame.
       const bool fits = choose(chain, k, at - 1, at, e, -e, v[0], -v[1]);
       if (inner && fits) {
@@ -186,7 +187,7 @@ class TreeGrowth {
       }
       return fits;
     }
-    const double b = std::asin(between(v[0], -1.0, 1.0));
+    const double b = elementary::asin(between(v[0], -1.0, 1.0));
     const bool fits = choose(chain, k, at, at + 1, b, pi - b, -v[1], v[2]);
     if (inner && fits) {
       turn_about(frame, found_[at], 0);
@@ -231,7 +232,7 @@ class TreeGrowth {
       const auto [b, b_fits] =
           into_limits(solution == 0 ? one : two, chain.lower[j], chain.upper[j], given_[j]);
       if (!b_fits) continue;
-      const double toward = free ? given_[i] : std::atan2(side * y, side * x);
+      const double toward = free ? given_[i] : elementary::atan2(side * y, side * x);
       const auto [a, a_fits] = into_limits(toward, chain.lower[i], chain.upper[i], given_[i]);
       const double cost = square(a - given_[i]) + square(b - given_[j]);
       if (a_fits && cost < best) {
@@ -247,7 +248,7 @@ class TreeGrowth {
   // Turns a frame (3, 3) about one of its own axes.
   static void turn_about(double* frame, double angle, int axis) {
     double *first = frame + 3 * ((axis + 1) % 3), *second = frame + 3 * ((axis + 2) % 3);
-    const double cosine = std::cos(angle), sine = std::sin(angle);
+    const auto [sine, cosine] = elementary::sincos(angle);
     for (int x = 0; x < 3; ++x) {
       const double a = first[x], b = second[x];
       first[x] = cosine * a + sine * b;

@@ -7,6 +7,7 @@
 // component no longer counts.
 #pragma once
 
+#include "../elementary.h"
 #include "../lanes.h"
 #include "../wide.h"
 
@@ -108,10 +109,10 @@ HMT_WIDE inline void add_component_overlaps(
     }
     double density = 0.0;
     for (Index j = 0; j < components; ++j) {
-      logs[j] = logs[j] > best - negligible_overlap ? std::exp(logs[j] - best) : 0.0;
+      logs[j] = logs[j] > best - negligible_overlap ? elementary::exp(logs[j] - best) : 0.0;
       density += logs[j];
     }
-    log_density[s] = best + std::log(density);
+    log_density[s] = best + elementary::log(density);
     if (!derivatives) continue;
     double* slope = gradient[s].data;
     std::fill(slope, slope + total, 0.0);

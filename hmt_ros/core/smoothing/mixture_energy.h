@@ -1,6 +1,7 @@
 // -log of mixtures p(r_t | x) = sum_k w_k N(x; m_k, S_k); see hmt_ros/smoothing/likelihood.py.
 #pragma once
 
+#include "../elementary.h"
 #include "../lanes.h"
 #include "../wide.h"
 
@@ -79,10 +80,10 @@ HMT_WIDE inline void add_mixture_energy(const Table& poses, const Places& times,
     }
     double total = 0.0;
     for (Index k = 0; k < count; ++k) {
-      logs[k] = logs[k] > best - negligible_mode ? std::exp(logs[k] - best) : 0.0;
+      logs[k] = logs[k] > best - negligible_mode ? elementary::exp(logs[k] - best) : 0.0;
       total += logs[k];
     }
-    value[i] = -(best + std::log(total));
+    value[i] = -(best + elementary::log(total));
     double* slope = gradient[i].data;
     std::fill(slope, slope + d, 0.0);
     for (Index k = 0; k < count; ++k) {

@@ -8,6 +8,7 @@
 // normal and its ray.
 #pragma once
 
+#include "../elementary.h"
 #include "../pose_view.h"
 #include "../sampling.h"
 
@@ -15,7 +16,7 @@ namespace hmt {
 
 // Angle around a ring between the part that faces the camera and a point, rad.
 inline constexpr double aside = pi / 4.0;
-inline const double aside_cosine = std::cos(aside), aside_sine = std::sin(aside);
+inline const double aside_cosine = elementary::cos(aside), aside_sine = elementary::sin(aside);
 // Points whose normal is further from the ray than this are not compared, as a cosine.
 inline constexpr double least_cosine = 0.3;
 // Neighbouring depths that differ by more, as a share of the depth, lie on two surfaces.

@@ -4,6 +4,7 @@
 //     rho(r) = (nu + k) / 2 log(1 + r^2 / nu),     k the dimension of r
 #pragma once
 
+#include "../elementary.h"
 #include "../kinematics.h"
 #include "../residuals.h"
 
@@ -44,7 +45,7 @@ struct Student {
 };
 
 inline Student student(double squared, double tails, double dimension) {
-  return {0.5 * (tails + dimension) * std::log1p(squared / tails),
+  return {0.5 * (tails + dimension) * elementary::log1p(squared / tails),
           (tails + dimension) / (tails + squared)};
 }
 

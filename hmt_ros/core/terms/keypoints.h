@@ -7,6 +7,7 @@
 #pragma once
 
 #include "../camera.h"
+#include "../log_sum_exp.h"
 #include "../residuals.h"
 
 namespace hmt {
@@ -200,7 +201,7 @@ inline void lifted_energies(const Lifted& lifted, const Tables& columns, const T
   for (int e = 0; e < 2; ++e) {
     const Vector shares = room.responsibilities[e];
     room.by_joint.fill(0.0);
-    double top = -infinity, mass = 0.0;
+    double top = -infinity;
     for (Index c = 0; c < lifted.components(); ++c) {
       const double *precision = lifted.precisions[e][c].data, *depth = lifted.depths[e][c].data;
       double* costs = room.by_joint[0].data;
@@ -213,12 +214,9 @@ inline void lifted_energies(const Lifted& lifted, const Tables& columns, const T
       shares[c] = total;
       top = most(top, total);
     }
-    for (double& share : shares) {
-      share = std::exp(share - top);
-      mass += share;
-    }
+    const double mass = exponentials(shares.data, top, shares.size());
     for (double& share : shares) share /= mass;
-    energies[e] = -top - std::log(mass);
+    energies[e] = -top - elementary::log(mass);
   }
 }
 
@@ -287,8 +285,8 @@ inline double weigh_exchanges(const KeypointInputs& inputs, const Numbers& log_p
     result[e] = total;
     top = most(top, total);
   }
-  for (double log : result) mass += std::exp(log - top);
-  const double total = top + std::log(mass);
+  for (double log : result) mass += elementary::exp(log - top);
+  const double total = top + elementary::log(mass);
   for (double& log : result) log -= total;
   return -total;
 }
@@ -372,7 +370,7 @@ HMT_WIDE inline double add_keypoints(const KeypointInputs& inputs, const Numbers
   double readings[2] = {0.0, 0.0};
   room.shares.fill(0.0);
   for (Index e = 0; e < inputs.exchanges(); ++e) {
-    const double probability = std::exp(posterior[e]);
+    const double probability = elementary::exp(posterior[e]);
     readings[inputs.lifted.readings[e]] += probability;
     for (Index g = 0; g < inputs.groups(); ++g) {
       room.shares(g, inputs.exchanged(e, g)) += probability;

@@ -37,7 +37,7 @@ from hmt_ros.body.learned_file import require
 from hmt_ros.core import elementary
 from hmt_ros.experts.descriptor.contour import person_blob, sample_contour
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.clustering import squared_distances
+from hmt_ros.inference.clustering import smallest_columns, squared_distances
 from hmt_ros.inference.linear_algebra import product
 
 Bytes = NDArray[np.uint8]
@@ -98,7 +98,7 @@ class ShapeContextCodebook:
         """Votes (C,) of contexts (N, 60): a histogram that sums to 1."""
         squared = squared_distances(np.sqrt(contexts), self.centres)
         votes = min(VOTES, len(self.centres))
-        nearest = np.sort(np.argpartition(squared, votes - 1, axis=1)[:, :votes], axis=1)
+        nearest = smallest_columns(squared, votes)
         distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1))
         weight = 1.0 / np.maximum(distance, LEAST_DISTANCE)
         weight /= weight.sum(1, keepdims=True)

@@ -22,7 +22,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.skeleton import Skeleton, other_side
-from hmt_ros.core import exchange_posteriors, keypoint_errors, record_keypoints
+from hmt_ros.core import elementary, exchange_posteriors, keypoint_errors, record_keypoints
 from hmt_ros.image.keypoint_schemes import (
     MIRROR,
     landmarks_of,
@@ -34,6 +34,7 @@ from hmt_ros.image.surface import Lens, lens_of
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.residuals import RECORDED, Tree, tree_of
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.linear_algebra import cholesky, inverse
 
 KEYPOINTS = TermSettings(0.5, 1.0, 3.0)
 # Assumed height of the visible part of a person whose distance is unknown, m.
@@ -170,7 +171,7 @@ class Keypoints:
         noise = None
         if unknown.any():
             by_confidence = noise_of(known.confidences)
-            noise = np.where(unknown, np.hypot(by_confidence, sigma), sigma)
+            noise = np.where(unknown, elementary.hypot(by_confidence, sigma), sigma)
         renamed = replace(
             known,
             names=tuple(names[i] for i in kept),
@@ -403,8 +404,8 @@ def _whitened(keypoints: Keypoints, sigma: float, magnification: float) -> tuple
         blur = (sigma * (magnification or k.magnification()) * k.noise) ** 2
         covariances = covariances + blur[:, None, None] * np.eye(2)
         confidences = np.ones_like(confidences)
-    precision = np.linalg.inv(covariances) * confidences
-    return k, np.ascontiguousarray(np.linalg.cholesky(precision).transpose(0, 2, 1))
+    precision = inverse(covariances) * confidences
+    return k, np.ascontiguousarray(cholesky(precision).transpose(0, 2, 1))
 
 
 NOT_LIFTED = Lifted(
@@ -437,7 +438,7 @@ def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lift
         skeleton.joint_offsets[joints],
         middle_of_hips(skeleton),
         np.ascontiguousarray(poses.axes[2]),
-        poses.log_weights - np.log(deviations[0]).sum(1),
+        poses.log_weights - elementary.log(deviations[0]).sum(1),
         np.ascontiguousarray(depths),
         np.ascontiguousarray(1.0 / deviations),
         EXCHANGED.min(1),

@@ -28,6 +28,8 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Derivatives, Student
 from hmt_ros.inference.error_model import ERRORS
+from hmt_ros.inference.linear_algebra import cholesky, inverse, product
+from hmt_ros.inference.random_numbers import standard_normals
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
@@ -70,7 +72,7 @@ def find_limb(
     explained = others.by_cue(pose[None], derivatives=False).outline_costs
     seen = of_limb.seen(observation, explained=explained)
     terms = (*seen, posterior.likelihood.pose_prior, *posterior.known)
-    motion = Student(pose[own], np.asarray(np.linalg.inv(block)), LIMB_TAILS)
+    motion = Student(pose[own], inverse(block), LIMB_TAILS)
     term = PoseEnergy(of_limb, terms, motion, pose, own)
     value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
     best = samples[np.argsort(value, kind='stable')[: plan.refined]]
@@ -88,8 +90,8 @@ def _drawn(
     rng: np.random.Generator,
 ) -> Array:
     """N samples from the mode, from it stretched, and from the body's prior: a third each."""
-    noise = rng.standard_normal((n, len(own)))
-    near = noise @ np.linalg.cholesky(block).T
+    noise = standard_normals(rng, (n, len(own)))
+    near: Array = product(noise, cholesky(block).T)
     near[n // 3 :] *= stretch
     result = angles + near
     wide = body.prior_mean[own] + PRIOR_STRETCH * body.prior_sigma[own] * noise

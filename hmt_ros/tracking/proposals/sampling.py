@@ -11,8 +11,11 @@ from collections.abc import Callable
 import numpy as np
 
 from hmt_ros.body.body import Body
+from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
+from hmt_ros.inference.linear_algebra import cholesky, log_determinant
+from hmt_ros.inference.random_numbers import standard_normals
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
 
@@ -33,7 +36,7 @@ def spherical_samples(
         rng: source of randomness.
     """
     d = means.shape[1]
-    radius = np.exp(np.linalg.slogdet(covariances)[1] / (2 * d))
+    radius = elementary.exp(log_determinant(covariances) / (2 * d))
     noise = _noise((len(means), count, d), scale, rng)
     samples: Array = np.clip(means[:, None] + radius[:, None, None] * noise, body.lower, body.upper)
     return samples
@@ -43,7 +46,7 @@ def covariance_scaled_samples(
     body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
 ) -> Array:
     """Noise with the covariance of each mean, stretched; (K, count, d). Arguments as above."""
-    factors = np.linalg.cholesky(covariances)
+    factors = cholesky(covariances)
     noise = _noise((len(means), count, means.shape[1]), scale, rng)
     samples: Array = np.clip(
         means[:, None] + np.einsum('kij,knj->kni', factors, noise), body.lower, body.upper
@@ -53,10 +56,10 @@ def covariance_scaled_samples(
 
 def _noise(shape: tuple[int, ...], scale: float, rng: np.random.Generator) -> Array:
     """Gaussian noise times a scale, or multivariate Cauchy noise where the scale is 0."""
-    noise = rng.standard_normal(shape)
+    noise = standard_normals(rng, shape)
     if scale > 0:
         return scale * noise
-    heavy = np.sqrt(rng.chisquare(1, size=(*shape[:-1], 1)))
+    heavy = np.abs(standard_normals(rng, (*shape[:-1], 1)))
     return noise / np.maximum(heavy, np.finfo(np.float64).eps)
 
 

@@ -1,0 +1,225 @@
+"""The same bag gives the same bytes on every processor.
+
+Between image and message nothing may be called whose code is chosen by processor: BLAS and LAPACK,
+the elementary functions of numpy and of the C library, and some functions of OpenCV. The core
+stands for them.
+"""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Modules and folders off the way from image to message, and why.
+EXEMPT = {
+    'hmt_ros/app': 'commands: what they compute is read by people',
+    'hmt_ros/evaluation': 'scores and figures',
+    'hmt_ros/detectors': 'the network runs in a library that chooses by processor',
+    'hmt_ros/body/moving_skeleton.py': 'files of recorded motion',
+    'hmt_ros/experts/expectation_maximisation.py': 'learning',
+    'hmt_ros/experts/sparse_bayes.py': 'learning',
+    'hmt_ros/experts/training_pairs.py': 'learning',
+    'msg_tools/bags': 'bags of other programs',
+    'msg_tools/files': 'files',
+}
+# Classes and functions beside the way, in modules that are on it: what learns; what stands for
+# the rest, and a check of covariances, whose factors nobody uses.
+BESIDE = {
+    'hmt_ros/experts/gates.py': {'_Softmax', 'first', 'learned'},
+    'hmt_ros/experts/neighbour_models.py': {'fit'},
+    'hmt_ros/inference/clustering.py': {'k_means'},
+    'hmt_ros/inference/random_numbers.py': {'standard_normals'},
+    'msg_tools/messages/message_error.py': {'check_covariances'},
+}
+ELEMENTARY = {
+    *('exp', 'exp2', 'expm1', 'log', 'log2', 'log10', 'log1p', 'logaddexp', 'logaddexp2', 'power'),
+    *('sin', 'cos', 'tan', 'arcsin', 'arccos', 'arctan', 'arctan2', 'sinh', 'cosh', 'tanh', 'cbrt'),
+    *('asin', 'acos', 'atan', 'atan2', 'pow', 'erf', 'erfc', 'gamma', 'lgamma', 'float_power'),
+    *('arcsinh', 'arccosh', 'arctanh', 'asinh', 'acosh', 'atanh', 'sinc'),
+}
+OF_NUMPY = ELEMENTARY | {
+    *('matmul', 'dot', 'vdot', 'inner', 'tensordot', 'vecdot', 'convolve', 'correlate', 'cov'),
+    *('corrcoef', 'polyfit', 'hypot', 'argpartition'),
+}
+# Along an axis numpy adds squares itself.
+OF_LINALG = {'LinAlgError', 'norm'}
+OF_SCIPY = {'scipy.optimize'}  # the assignment of detections only adds and compares
+OF_OPENCV = {'warpAffine', 'warpPerspective', 'warpPolar', 'exp', 'log', 'pow', 'gemm', 'solve'}
+INTEGERS = {'BINS'}
+POWERS = {'2', '2.0', '0.5', '-1', '-1.0'}
+
+
+def is_in(module, names):
+    return any(module == name or module.startswith(f'{name}/') for name in names)
+
+
+def modules():
+    for package in ('hmt_ros', 'msg_tools'):
+        for path in sorted((ROOT / package).rglob('*.py')):
+            name = path.relative_to(ROOT).as_posix()
+            if not is_in(name, EXEMPT):
+                yield name
+
+
+def is_named_by_processor(name):
+    """Whether a dotted name is of a function whose code is chosen by processor."""
+    package, _, rest = name.partition('.')
+    if not re.fullmatch(r'[\w.]+', rest):
+        return False
+    known = {'np': OF_NUMPY, 'math': ELEMENTARY, 'cv2': OF_OPENCV}.get(package, set())
+    if rest.startswith('linalg.'):
+        return package == 'np' and rest.removeprefix('linalg.') not in OF_LINALG
+    return rest in known
+
+
+def is_called_by_processor(call):
+    """Whether a call's arguments choose code by processor, or leave the order of ties to it."""
+    name, given = ast.unparse(call.func), {keyword.arg for keyword in call.keywords}
+    method = name.rpartition('.')[2]
+    return (
+        (name == 'np.einsum' and 'optimize' in given)
+        or (name == 'np.linalg.norm' and 'axis' not in given and len(call.args) < 3)
+        or (method == 'argsort' and 'kind' not in given)
+        or (method in {'dot', 'standard_normal', 'normal', 'chisquare'} and '.' in name)
+        or (method == 'multivariate_normal')
+    )
+
+
+def is_power_by_processor(operation):
+    left = operation.left
+    whole = isinstance(left, ast.Constant) or ast.unparse(left) in INTEGERS
+    return not whole and ast.unparse(operation.right) not in POWERS
+
+
+def depends_on_processor(node):
+    if isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult):
+        return True
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
+        return is_power_by_processor(node)
+    if isinstance(node, ast.Attribute):  # not of what a call returns
+        return is_named_by_processor(ast.unparse(node))
+    if isinstance(node, ast.ImportFrom):
+        module = str(node.module)
+        return module in {'math', 'numpy.linalg'} or (
+            module.startswith('scipy') and module not in OF_SCIPY
+        )
+    return isinstance(node, ast.Call) and is_called_by_processor(node)
+
+
+def calls_by_processor(source, beside=frozenset()):
+    """Line and text of what depends on the processor, outside of the functions beside the way."""
+    found = []
+
+    def visit(node):
+        if getattr(node, 'name', None) in beside:
+            return
+        if depends_on_processor(node):
+            found.append((node.lineno, ast.unparse(node)))
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(ast.parse(source))
+    return found
+
+
+@pytest.mark.parametrize(
+    'source',
+    [
+        'a @ b',
+        'np.linalg.inv(a)',
+        'np.linalg.norm(a)',
+        'np.exp(a)',
+        'partial(np.logaddexp, a)',
+        'math.log(a)',
+        'a ** 3',
+        'a.argsort()',
+        'rng.standard_normal(3)',
+        'cv2.warpAffine(image, matrix, size)',
+        "np.einsum('i,i', a, b, optimize=True)",
+        'from scipy.linalg import cholesky',
+    ],
+)
+def test_what_depends_on_the_processor_is_found(source):
+    assert len(calls_by_processor(source)) == 1
+    assert calls_by_processor(f'def fit():\n    {source}', {'fit'}) == []
+
+
+def test_what_does_not_depend_on_the_processor_is_not_found():
+    same = 'np.linalg.norm(a, axis=1) * np.einsum("i,i", a, b) + math.sqrt(2**n) - a**2'
+    assert calls_by_processor(same) == []
+
+
+def test_nothing_on_the_way_from_image_to_message_depends_on_the_processor():
+    found = {
+        f'{name}:{line}': text
+        for name in modules()
+        for line, text in calls_by_processor(
+            (ROOT / name).read_text('utf-8'), BESIDE.get(name, frozenset())
+        )
+    }
+    assert found == {}
+
+
+def test_what_is_exempt_is_there_and_needs_it():
+    def needs(name):
+        path = ROOT / name
+        files = path.rglob('*.py') if path.is_dir() else [path]
+        return any(calls_by_processor(file.read_text('utf-8')) for file in files)
+
+    assert [x for x in (*EXEMPT, *BESIDE) if not needs(x)] == []
+
+
+def test_the_core_calls_no_elementary_function_of_the_c_library():
+    called = re.compile(rf'\b(?:std::|::)(?:{"|".join(sorted(ELEMENTARY | {"hypot"}))})[fl]?\(')
+    assert called.search('x = std::exp(y)')
+    assert not called.search('elementary::exp(y)')
+    found = [
+        f'{path.name}:{number}'
+        for path in sorted((ROOT / 'hmt_ros' / 'core').rglob('*.*'))
+        if path.suffix in {'.h', '.cpp'}
+        for number, line in enumerate(path.read_text('utf-8').splitlines(), 1)
+        if called.search(line.partition('//')[0].replace('elementary::', ''))
+    ]
+    assert found == []
+
+
+# Replays short clips and prints a digest of each topic that filter, predictor and smoother publish.
+RUN = r"""
+import hashlib, json, sys
+from pathlib import Path
+from hmt_ros.app.replay.one_bag import replay_bag
+from hmt_ros.app.replay.options import ReplayOptions
+from msg_tools import BagReader, BagWriter
+
+bags, folder = Path(sys.argv[1]), Path(sys.argv[2])
+
+def digests_of(name, count, **options):
+    source, clip = bags / name, folder / f'{name}_{len(list(folder.iterdir()))}'
+    with BagReader(source) as old, BagWriter(clip) as new:
+        images = 0
+        for stored in old.messages():
+            images += stored.topic == '/image/compressed'
+            if images > count:
+                break
+            new.write(stored.topic, stored.log_time_ns, stored.message)
+    result = clip.with_name(clip.name + '_result')
+    replay_bag(clip, result, ReplayOptions(quiet=True, **options), tell=lambda *_: None)
+    digests = {}
+    with BagReader(result) as bag:
+        for stored in bag.messages():
+            digests.setdefault(stored.topic, hashlib.sha256()).update(stored.data)
+    return {f'{clip.name}{topic}': found.hexdigest()[:16] for topic, found in digests.items()}
+
+def known(name, **options):
+    source = bags / name
+    return {'subject': source / 'subject.yaml', 'background': source / 'background.png', **options}
+
+print(json.dumps({
+    **digests_of('living_room', 12, **known('living_room')),
+    **digests_of('living_room', 12, bme='', with_smoother=False),
+    **digests_of('reach', 12, **known('reach'), with_smoother=False),
+}))
+"""
