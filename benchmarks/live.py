@@ -5,7 +5,8 @@ shows it to the real nodes at its rate, on the same machine; a third process lis
 the true joints with the noise of a detector, behind each image, or those of MediaPipe, which then
 computes beside the nodes. Latency is the time from when an image is due at the camera to the
 arrival of its pose_mixture; age is how much older a smoothed pose is, when it arrives, than the
-newest image. The clip of the dancer is replayed offline too, where every image is used.
+newest image. The clip of the dancer is replayed offline too, where every image is used. Where CPU
+time goes in replay and live is sampled, in runs of their own.
 
 Somebody who visits an empty scene: `keep_out` may not say NOBODY of an image with half of the
 joints or more in it, and has to say it from a second on after the last of them has left. Of several
@@ -51,6 +52,13 @@ from benchmarks.live_nodes import (
     start_nodes,
 )
 from benchmarks.nodes import PROFILE
+from benchmarks.sampling import (
+    PROFILE_FILE,
+    StackSampler,
+    profile_of,
+    profiles_as_text,
+    read_samples,
+)
 from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.replay import command as replay
 from hmt_ros.app.replay.live_node import LiveNode
@@ -72,6 +80,8 @@ POSTERIOR, SMOOTHED = 'pose_mixture', 'smoothed_pose_mixture'
 TOLD, LISTED = 'keep_out', 'people'
 # Options of a replay that leaves out the gravity of the bag.
 WITHOUT_GRAVITY = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
+# As `person_node` has them beside the filter.
+WITH_EXPERTS = ('--bme', '--set', 'bme.tracked_interval=0.2')
 START_SECONDS = 120.0  # until the person is tracked
 PATIENCE = 3.0  # s, after the last image
 # Of a visit: how long a state may be late, s, and the share of the joints that are somebody.
@@ -80,7 +90,8 @@ PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 OFFLINE = {'offline': 'offline, every image', 'upright': 'offline, gravity given'}
-STAGES = (*OFFLINE, *CASES)
+REPLAY = 'sampled replay'
+STAGES = (*OFFLINE, REPLAY, *CASES)
 
 
 def main(argv: list[str]) -> int:
@@ -112,6 +123,7 @@ def measure(
         stages = {
             'offline': lambda: offline(dance(), folder / 'offline', *WITHOUT_GRAVITY),
             'upright': lambda: offline(dance(), folder / 'upright'),
+            REPLAY: lambda: sampled_replay(dance(), folder / REPLAY),
         }
         for stage, case in CASES.items():
             stages[stage] = partial(_tried, folder, stage, case, seconds, runs, minutes)
@@ -120,15 +132,26 @@ def measure(
 
 def offline(clip: Path, target: Path, *given: str) -> dict[str, Any]:
     """The clip in lock step: every image, by the parameters of the nodes; its bag tells gravity."""
-    options = ['--background', str(clip / 'background.png'), '--quiet', *given]
     start = time.perf_counter()
-    run(replay.main, [str(clip), '-o', str(target), *options])
+    _replay(clip, target, *given)
     truth = read_truth(clip / 'truth.npz')
     return {
         'images': len(truth.joints),
         'seconds': time.perf_counter() - start,
         **_errors(target, truth),
     }
+
+
+def _replay(clip: Path, target: Path, *given: str) -> None:
+    options = ['--background', str(clip / 'background.png'), '--quiet', *given]
+    run(replay.main, [str(clip), '-o', str(target), *options])
+
+
+def sampled_replay(clip: Path, target: Path) -> dict[str, Any]:
+    """Where the time of a replay goes, with the experts beside filter and smoother."""
+    with StackSampler() as sampler:
+        _replay(clip, target, *WITHOUT_GRAVITY, *WITH_EXPERTS)
+    return {'profile': profile_of(sampler.samples(), len(_stamps(clip)))}
 
 
 def _errors(bag: Path, truth: Truth) -> dict[str, Any]:
@@ -152,10 +175,23 @@ def _tried(
         if case.detector:
             BlazePose()
         with patch.dict(os.environ, {PROFILES: str(PROFILE)}):
+            if case.sampled:
+                return sampled(clip, folder / stage, case, minutes)
             found = [live(clip, folder / f'{stage} {k}', case, minutes) for k in range(runs)]
     except (LiveNodeError, DetectorError) as error:
         return f'skipped: {error}'
     return median_of(found)
+
+
+def sampled(clip: Path, target: Path, case: Case, minutes: float | None) -> dict[str, Any]:
+    """Where the time of the nodes goes while the clip moves, for each image that is answered."""
+    file = target.with_suffix('.json')
+    with patch.dict(os.environ, {PROFILE_FILE: str(file)}):
+        found = live(clip, target, case, minutes)
+    first, last = (round(x) for x in found['clock_s'])
+    samples = [sample for sample in read_samples(file) if first <= sample.second < last]
+    cpu = sum(found['cpu_s'].values())
+    return {'profile': profile_of(samples, found['answered'], cpu)}
 
 
 def median_of(found: Sequence[Any]) -> Any:
@@ -206,13 +242,14 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
         topic = _topic_of(case)
         camera.spin(player, lambda: len(arrived[topic]) > 2, START_SECONDS)
         shift, start_ns = camera.begin(player)
-        before = [cpu_seconds(node) for node in processes]
+        before, began = [cpu_seconds(node) for node in processes], time.monotonic()
         received = _received(player, nodes[0])
         camera.spin(
             player, camera.ended, len(stamps) / rate + PATIENCE,
             every=lambda: memories.append(sum(memory(node, 'Pss_Anon') for node in processes)),
         )  # fmt: skip
         spent = [cpu_seconds(node) - past for node, past in zip(processes, before, strict=True)]
+        clock = began, time.monotonic()
         memory_mb = sum(memory(node) for node in processes)
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
@@ -234,6 +271,7 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
         'images': len(stamps),
         'lost': max(len(stamps) - received, 0),
         'answered': count,
+        'clock_s': clock,
         'camera_late_ms': 1e-6 * camera.latest_ns,
         'latency_ms': {
             what: float(np.percentile(latencies, p))
@@ -362,6 +400,11 @@ def _shifted(data: bytes, stamp_ns: int) -> bytes:
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """Tables for people: one person in view, a visit, several people."""
     found = {stage: result[stage] for stage in STAGES if stage in result}
+    profiles = {
+        'replay' if stage == REPLAY else CASES[stage].what: found.pop(stage)['profile']
+        for stage in list(found)
+        if 'profile' in found[stage]
+    }
     visits = {stage: found.pop(stage) for stage in list(found) if _clip_of(stage) == VISIT}
     crowds = {
         stage: found.pop(stage) for stage in list(found) if _clip_of(stage).startswith(PEOPLE)
@@ -379,6 +422,8 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     if crowds:
         columns = {'people told of': lambda x: f'{x["people"]:.2f}'}
         tables.append(_short_table('people', crowds, columns, markdown=markdown))
+    if profiles:
+        tables.append(profiles_as_text(profiles, markdown=markdown))
     return '\n\n'.join(tables)
 
 

@@ -41,6 +41,7 @@ class Case:
         smoothed: whether there is a smoother.
         keep_out: whether a robot listens to what it keeps out of.
         gravity: whether it is given.
+        sampled: whether the one process is, see `benchmarks.sampling`.
     """
 
     what: str
@@ -52,6 +53,7 @@ class Case:
     smoothed: bool = True
     keep_out: bool = False
     gravity: bool = False
+    sampled: bool = False
 
     @property
     def people(self) -> int:
@@ -78,6 +80,10 @@ CASES = {
     ),
     'together, detector': Case(
         'one process: images and MediaPipe', keypoints=True, detector=True, together=True
+    ),
+    'sampled': Case('live, images', together=True, sampled=True),
+    'sampled, keypoints': Case(
+        'live, images and keypoints', keypoints=True, together=True, sampled=True
     ),
     'large': Case('processes apart: 1280x720, 15 images a second', clip=LARGE),
     'visit': Case('one process: images', clip=VISIT, together=True, keep_out=True),
@@ -127,7 +133,8 @@ def start_nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> li
             chosen[BME] = replace(BmeParameters(), **images | used[BME])
     process = None
     if case.together:
-        process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', tuple(chosen))
+        module = 'benchmarks.sampled_nodes' if case.sampled else f'hmt_ros.nodes.{PERSON}'
+        process = NodeProcess(player, opened, PERSON, module, tuple(chosen))
     nodes = [
         LiveNode(
             player, opened, name, parameters, inputs={}, topics={}, within=process, write=_ignored

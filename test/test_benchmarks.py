@@ -1,12 +1,14 @@
 """Every benchmark runs, and has a page of results. Numbers are printed, never asserted."""
 
 import json
+import time
 from pathlib import Path
 
 import pytest
 
-from benchmarks import BENCHMARKS
+from benchmarks import BENCHMARKS, sampling
 from benchmarks.__main__ import main
+from msg_tools.messages.headers import stamp_in
 
 RESULTS = Path(__file__).resolve().parents[1] / 'benchmarks' / 'results'
 OF_NODES = ('live', 'nodes', 'soak')
@@ -42,3 +44,36 @@ def test_command_line(capsys):
     assert main(['flops']) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("benchmarks: no 'flops', wanted one of absence, bags, ")
+
+
+def test_time_is_told_by_node_by_stage_and_by_function():
+    step = ('hmt_ros/tracking/tracker.py', 'Tracker.step')
+    split = ('hmt_ros/image/background.py', 'BackgroundModel.split')
+    session = ('hmt_ros/sessions/smoother_session.py', 'SmootherSession._take')
+    samples = [
+        sampling.Sample(0, 'estimate', (split, step), 0.2),
+        sampling.Sample(0, 'estimate', (step,), 0.1),
+        sampling.Sample(1, 'estimate', (session,), 0.3),
+        sampling.Sample(1, 'MainThread', (), 0.4),
+    ]
+    found = sampling.profile_of(samples, 2, 1.2)
+    assert found['nodes'] == pytest.approx(
+        {'steps': 150.0, 'smoother': 150.0, 'executor of ROS': 200.0, 'DDS, and unsampled': 100.0}
+    )
+    assert found['stages'] == pytest.approx({'background': 100.0, 'other': 50.0})
+    assert found['functions'] == pytest.approx({':'.join(session): 150.0})
+    text = sampling.profiles_as_text({'replay': found})
+    assert text.count('\n\n') == 2
+    assert '600.00' in text
+
+
+def test_what_computes_is_sampled(tmp_path):
+    with sampling.StackSampler() as sampler:
+        spent = time.thread_time()
+        while time.thread_time() - spent < 0.2:
+            stamp_in(bytes(32))
+    file = tmp_path / 'samples.json'
+    sampling.write_samples(sampler.samples(), file)
+    found = [one for one in sampling.read_samples(file) if one.thread == 'MainThread']
+    assert sum(one.seconds for one in found) > 0.1
+    assert ('msg_tools/messages/headers.py', 'stamp_in') in {x for one in found for x in one.stack}

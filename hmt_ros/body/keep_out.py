@@ -161,14 +161,14 @@ def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float =
     little = beyond < LITTLE * radius
     radius, beyond = np.where(little, radius + beyond, radius), np.where(little, 0.0, beyond)
     steps = np.ceil(beyond / (0.5 * SPACING * radius)).astype(np.intp)
-    found = []
-    for k, b in np.ndindex(*radius.shape):
-        shifts = np.linspace(-beyond[k, b], beyond[k, b], steps[k, b] + 1)
-        shifts = shifts if len(shifts) > 1 else np.zeros(1)
-        at = places[k, b] + shifts[:, None, None] * deep[k, b]
-        found.append(np.concatenate([at.reshape(-1, 6), np.full((len(at), 1), radius[k, b])], 1))
-    table = np.concatenate(found)
-    return Capsules(table[:, :3], table[:, 3:6], table[:, 6]).without_held()
+    # Each part is there at steps + 1 places, from one end of its spread to the other.
+    counts = steps.reshape(-1) + 1
+    part = np.repeat(np.arange(len(counts)), counts)
+    number = np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)
+    far, last = beyond.reshape(-1)[part], steps.reshape(-1)[part]
+    shifts = np.where(number < last, number * (2.0 * far / np.maximum(last, 1)) - far, far)
+    at = places.reshape(-1, 2, 3)[part] + shifts[:, None, None] * deep.reshape(-1, 2, 3)[part]
+    return Capsules(at[:, 0], at[:, 1], radius.reshape(-1)[part]).without_held()
 
 
 @lru_cache(maxsize=16)

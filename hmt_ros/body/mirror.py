@@ -174,10 +174,13 @@ def clear_level(body: Body, pose: Array) -> Array:
         return best
     limits = root_rotation_dofs(body.skeleton)[1:]
     for turn in (np.eye(3), QUARTER, product(QUARTER, QUARTER), QUARTER.T):
-        angles = turned(body, pose[None], body.levelled(product(turn, body.level)))[0, limits]
+        level: Array = product(turn, body.level)
+        angles = turned(body, pose[None], body.levelled(level))[0, limits]
         share = float(np.abs(angles / body.upper[limits]).max())
+        if share < least and turn[0, 0] > 0.5:
+            return level
         if share < least:
-            best, least = product(turn, body.level), 0.0 if turn[0, 0] > 0.5 else share
+            best, least = level, share
     return best
 
 

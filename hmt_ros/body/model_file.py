@@ -95,6 +95,12 @@ def named_body(name: str) -> Body:
     known = model_names()
     if name not in known:
         raise FileNotFoundError(f'no body {name!r}: wanted one of {known}')
+    return _built(name)
+
+
+@cache
+def _built(name: str) -> Body:
+    """A body that ships; cached, as each change of the lengths in messages asks for it."""
     return load_body(name)
 
 

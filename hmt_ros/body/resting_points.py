@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,6 +38,25 @@ CHANGES = 2.0
 SLIP = 8e-5
 # A point whose probability to rest is lower is left free.
 LEAST = 1e-3
+
+
+class RestingTable(NamedTuple):
+    """The coordinates R of points that rest along a trajectory, linear in the pose near it.
+
+    Attributes:
+        jacobians: (T, R, d).
+        places: (T, R) of the pose 0, m.
+        weights: (T-1, R) r / (q dt).
+    """
+
+    jacobians: Array
+    places: Array
+    weights: Array
+
+    @classmethod
+    def none(cls, times: int, d: int) -> RestingTable:
+        """Nothing rests."""
+        return cls(np.empty((times, 0, d)), np.empty((times, 0)), np.empty((times - 1, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +80,24 @@ class RestingPoints:
             lambda poses: sole_points(body, poses), lambda poses: sole_jacobians(body, poses)
         )
 
+    def along(self, poses: Array, covariances: Array, intervals: Array) -> RestingTable | None:
+        """What rests along a trajectory; None: nothing.
+
+        Args:
+            poses: (T, d) at which rest is decided and points are linearised.
+            covariances: (T, d, d) of the poses.
+            intervals: (T-1,) s.
+        """
+        count, d = poses.shape
+        points, jacobians = self.points(poses), self.jacobians(poses)
+        rests = rest_probabilities(points, jacobians, covariances, intervals)
+        if not (rests >= LEAST).any():
+            return None
+        weights = np.where(rests >= LEAST, rests, 0.0) / (SLIP * intervals[:, None])
+        each = np.ascontiguousarray(jacobians.reshape(count, -1, d))
+        places = points.reshape(count, -1) - product(each, poses[:, :, None])[:, :, 0]
+        return RestingTable(each, places, np.repeat(weights, 3, axis=1))
+
     def held(
         self, prior: TrajectoryPrior, poses: Array, covariances: Array, intervals: Array
     ) -> TrajectoryPrior:
@@ -67,20 +105,15 @@ class RestingPoints:
 
         Args:
             prior: of the states, whose first d variables are the pose.
-            poses: (T, d) at which rest is decided and points are linearised.
+            poses, covariances, intervals: see `along`.
         """
-        count, d = poses.shape
-        points, jacobians = self.points(poses), self.jacobians(poses)
-        rests = rest_probabilities(points, jacobians, covariances, intervals)
-        if not (rests >= LEAST).any():
+        found, d = self.along(poses, covariances, intervals), poses.shape[1]
+        if found is None:
             return prior
-        weights = np.where(rests >= LEAST, rests, 0.0) / (SLIP * intervals[:, None])
-        weights = np.repeat(weights, 3, axis=1)[:, :, None]
-        each = jacobians.reshape(count, -1, d)
-        before, after = each[:-1], each[1:]
+        weights = found.weights[:, :, None]
+        before, after = found.jacobians[:-1], found.jacobians[1:]
         # p(x_{t+1}) - p(x_t) as a linear function of both poses.
-        places = points.reshape(count, -1, 1) - product(each, poses[:, :, None])
-        rest = weights * (places[1:] - places[:-1])
+        rest = weights * np.diff(found.places, axis=0)[:, :, None]
         diagonal, lower = prior.precision.diagonal.copy(), prior.precision.lower.copy()
         information = prior.information.copy()
         diagonal[:-1, :d, :d] += product(before.swapaxes(1, 2), weights * before)

@@ -21,6 +21,7 @@
 #include "selection.h"
 #include "shape.h"
 #include "shape_estimation.h"
+#include "smoothing/chain_states.h"
 #include "smoothing/component_overlaps.h"
 #include "smoothing/mixture_energy.h"
 #include "surface_points.h"
@@ -40,9 +41,9 @@ PYBIND11_MODULE(_compiled, m) {
   py::register_exception<Misfit>(m, "Misfit", PyExc_ValueError);
 
   auto elementary = m.def_submodule("elementary", "Elementary functions, as numpy's.");
-  bind_elementary_functions(elementary);
+  bind_elementary_functions({elementary.ptr(), ufunc_interface()});
   auto matrices = m.def_submodule("matrices", "What hmt_ros.inference.linear_algebra calls.");
-  bind_matrix_functions(matrices);
+  bind_matrix_functions({matrices.ptr(), ufunc_interface()});
 
   // body
   bind(m, "place_poses", place_poses, "tree poses columns origins axes dof_origins");
@@ -130,6 +131,7 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "determined", determined, "weights covariances hessians amounts");
 
   // smoothing
+  bind(m, "condition_chain", condition_chain, "prior precisions means resting columns states");
   bind(
       m, "add_component_overlaps", add_component_overlaps,
       "own samples noise log_weights log_scales means inflation bands near begin derivatives share "
@@ -166,4 +168,5 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "solve_band_lower", solve_band_lower, "columns x");
   bind(m, "solve_band_transposed", solve_band_transposed, "columns x");
   bind(m, "multiply_band_transposed", multiply_band_transposed, "columns x");
+  bind(m, "invert_block", invert_block, "columns place after result");
 }

@@ -115,12 +115,13 @@ HMT_INLINE void subtract_products(double* target, Index width, const double* fro
 }
 
 // Returns how many columns have a pivot that is positive and finite: all, or the matrix is not
-// positive definite.
-HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& room) {
+// positive definite. Columns of a block of n end with the next block: what is below is 0.
+HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& room, Index n) {
   const Index total = columns.size(), width = columns.size(1) - 1, stride = room.size(1);
   for (Index first = 0; first < total; first += panel_columns) {
     const Index count = std::min(panel_columns, total - first);
-    const Index rows = std::min(width + count, total - first);
+    const Index end = std::min(total, ((first + count - 1) / n + 2) * n);
+    const Index rows = std::min(width + count, end - first);
     for (Index k = 0; k < count; ++k) {
       double* row = room.data + k * stride;
       std::fill_n(row, stride, 0.0);
@@ -148,11 +149,14 @@ HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& roo
   }
   return total;
 }
-inline Index factorise_band(const Matrix& columns) {
-  expect(columns.size(1) > 0, "columns", "a diagonal");
+inline Index factorise_blocks(const Matrix& columns, Index n) {
   const Index longest = in_whole_lanes(columns.size(1) + panel_columns);
   const Scratch<double, 2> room(panel_columns, longest + lanes);
-  return factorise_columns(columns, room.view());
+  return factorise_columns(columns, room.view(), n);
+}
+inline Index factorise_band(const Matrix& columns) {
+  expect(columns.size(1) > 0, "columns", "a diagonal");
+  return factorise_blocks(columns, std::max<Index>(columns.size(), 1));
 }
 
 inline void expect_vectors(const Matrix& columns, const Matrix& x) {
@@ -203,6 +207,55 @@ HMT_WIDE inline void multiply_band_transposed(const Matrix& columns, const Matri
     for (Index s = 0; s < x.size(); ++s) {
       double* to = x.data + s * total + c;
       to[0] = dot<double>(column, to, last);
+    }
+  }
+}
+
+// The block at `place` on the diagonal of P^-1, (n, n), given the one after it; that of the last
+// place needs none. With the blocks B below L in this column, G = B L^-1 and C of the block after,
+//
+//     result = (L L')^-1 + G' C G = L'^-1 L^-1 + G' (C G)
+inline void invert_block(const Matrix& columns, Index place, const Table& after,
+                         const Matrix& result) {
+  using namespace matrices;
+  const Index n = result.size(), width = columns.size(1) - 1, first = place * n;
+  expect_shape("result", result, {n, n});
+  expect(columns.size(1) > 0, "columns", "a diagonal");
+  expect(n > 0 && columns.size() % n == 0, "columns", "whole blocks");
+  expect(place >= 0 && first < columns.size(), "place", "that of a block");
+  const bool last = first + n == columns.size();
+  expect_shape("after", after, {last ? 0 : n, n});
+  const Index side = in_whole_lanes(n), rows = last ? n : 2 * n;
+  const Scratch<double, 2> own(n, 2 * side), below(n, side), left(rows, side), right(rows, side);
+  const Scratch<double, 1> room((rows + 1) * lanes);
+  for (Index b = 0; b < n; ++b) {
+    const double* column = columns[first + b].data;
+    for (Index a = b; a < n && a - b <= width; ++a) own(a, b) = column[a - b];
+    for (Index a = 0; !last && a < n && n + a - b <= width; ++a) below(a, b) = column[n + a - b];
+    own(b, side + b) = 1.0;
+  }
+  solve_lower({own[0].data, 2 * side}, n, side);
+  const auto matrix = [](double* data, Index stride, bool turned = false) {
+    const Index down = stride * Index(sizeof(double)), across = sizeof(double);
+    char* bytes = reinterpret_cast<char*>(data);
+    return turned ? Strided<double>{bytes, across, down} : Strided<double>{bytes, down, across};
+  };
+  for (Index a = 0; a < n; ++a) {
+    std::copy_n(own[a].data + side, n, left[a].data);
+    std::copy_n(own[a].data + side, n, right[a].data);
+  }
+  if (!last) {
+    double *gain = left[n].data, *carried = right[n].data;
+    multiply<double>(matrix(below[0].data, side), matrix(left[0].data, side), matrix(gain, side), n,
+                     n, n, room.view().data);
+    multiply<double>(matrix(const_cast<double*>(after.data), n), matrix(gain, side),
+                     matrix(carried, side), n, n, n, room.view().data);
+  }
+  multiply<double>(matrix(left[0].data, side, true), matrix(right[0].data, side),
+                   matrix(result.data, n), n, rows, n, room.view().data);
+  for (Index a = 0; a < n; ++a) {
+    for (Index b = 0; b < a; ++b) {
+      result(a, b) = result(b, a) = 0.5 * (result(a, b) + result(b, a));
     }
   }
 }

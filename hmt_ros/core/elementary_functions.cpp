@@ -5,7 +5,7 @@
 
 namespace hmt {
 
-void bind_elementary_functions(py::module_& m) {
+void bind_elementary_functions(const UfuncModule& m) {
   using namespace elementary;
   bind_elementwise(m, "sin", map_angles<sin_near, elementary::sin>, "Sine of an angle, rad.");
   bind_elementwise(m, "cos", map_angles<cos_near, elementary::cos>, "Cosine of an angle, rad.");

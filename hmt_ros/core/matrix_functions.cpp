@@ -339,9 +339,44 @@ void log_sum_exp_loop(char** pointers, const Index* counts, const Index* strides
   report_only(0);
 }
 
+// (p,c),(p,c)->()
+void mean_distance_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Items items(pointers, counts, strides, 3);
+  const Index points = counts[1], coordinates = counts[2];
+  for (Index i = 0; i < items.size(); ++i) {
+    const Strided<double> one = items.matrix(0, i, 0), other = items.matrix(1, i, 2);
+    double total = 0.0;
+    for (Index p = 0; p < points; ++p) {
+      double sum = 0.0;
+      for (Index c = 0; c < coordinates; ++c) sum += square(one(p, c) - other(p, c));
+      total += std::sqrt(sum);
+    }
+    items.number(2, i)(0, 0) = total / double(points);
+  }
+  report_only(0);
+}
+
+// (n,k)->(n,n)
+void distances_loop(char** pointers, const Index* counts, const Index* strides, void*) {
+  const Items items(pointers, counts, strides, 2);
+  const Index n = counts[1], k = counts[2], width = in_whole_lanes(k);
+  const Scratch<double, 2> rows(n, width);
+  for (Index item = 0; item < items.size(); ++item) {
+    read(items.matrix(0, item, 0), n, k, {rows[0].data, width});
+    const Strided<double> result = items.matrix(1, item, 2);
+    for (Index i = 0; i < n; ++i) {
+      result(i, i) = 0.0;
+      for (Index j = 0; j < i; ++j) {
+        result(i, j) = result(j, i) = distance(rows[i].data, rows[j].data, width);
+      }
+    }
+  }
+  report_only(0);
+}
+
 }  // namespace
 
-void bind_matrix_functions(py::module_& m) {
+void bind_matrix_functions(const UfuncModule& m) {
   bind_matrix_function(m, "cholesky", {cholesky_loop}, "(n,n)->(n,n)", 1, 1,
                        "Lower Cholesky factor.");
   bind_matrix_function(m, "solve", {solve_loop<0>}, "(n,n),(n,m)->(n,m)", 2, 1,
@@ -362,6 +397,10 @@ void bind_matrix_functions(py::module_& m) {
                        "U, the singular values, falling, and V of a matrix with m >= n.");
   bind_matrix_function(m, "product", {product_loop<float>, product_loop<double>},
                        "(m?,k),(k,n?)->(m?,n?)", 2, 1, "Matrix product, as numpy.matmul.");
+  bind_matrix_function(m, "mean_distance", {mean_distance_loop}, "(p,c),(p,c)->()", 2, 1,
+                       "Mean distance of points from others.");
+  bind_matrix_function(m, "distances", {distances_loop}, "(n,k)->(n,n)", 1, 1,
+                       "Distances of rows from each other.");
   bind_matrix_function(m, "log_sum_exp", {log_sum_exp_loop}, "(n)->()", 1, 1,
                        "log sum exp(x) along the last axis, or along `axis`.");
 }

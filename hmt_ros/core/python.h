@@ -14,12 +14,17 @@ namespace hmt {
 
 namespace py = pybind11;
 
-// Where a value comes from, for errors: "placing.offsets". Its text is made only when needed.
+// Where a value comes from, for errors: "placing.offsets", "by_cue[1]". Its text is made only when
+// needed, from the names of the arguments and the tuples on the way.
 struct Name {
-  const char* text = "";
+  const char* text;
   const Name* outer = nullptr;
+  py::handle tuple = {};
+  std::size_t place = 0;
   [[gnu::noinline]] std::string full() const {
-    return outer ? outer->full() + (text[0] == '[' ? "" : ".") + text : std::string(text);
+    if (!outer) return text;
+    if (!py::hasattr(tuple, "_fields")) return outer->full() + "[" + std::to_string(place) + "]";
+    return outer->full() + "." + std::string(py::str(tuple.attr("_fields")[py::int_(place)]));
   }
 };
 
@@ -76,37 +81,54 @@ struct TupleOf<std::array<T, N>> : std::true_type {};
                        (written ? " that can be written" : "") + ", saw " + seen(value));
 }
 
+// The array of a kind that is wanted.
+[[gnu::noinline]] inline py::array expect_array(py::handle value, const Name& name, char kind,
+                                                int bytes, int axes, bool written) {
+  if (py::isinstance<py::array>(value)) {
+    auto array = py::reinterpret_borrow<py::array>(value);
+    const auto type = array.dtype();
+    const bool right = type.kind() == kind && type.itemsize() == bytes &&
+                       (type.byteorder() == '=' || type.byteorder() == '|');
+    if (right && array.ndim() == axes && (array.flags() & py::array::c_style) &&
+        (!written || array.writeable())) {
+      return array;
+    }
+  }
+  refuse_array(value, name, kind, bytes, axes, written);
+}
+
 template <class T, int N>
-[[gnu::noinline]] Array<T, N> load_array(py::handle value, const Name& name) {
+[[gnu::noinline, gnu::cold]] Array<T, N> load_array(py::handle value, const Name& name) {
   using Element = std::remove_const_t<T>;
   constexpr char kind = std::is_same_v<Element, bool>       ? 'b'
                         : std::is_floating_point_v<Element> ? 'f'
                         : std::is_unsigned_v<Element>       ? 'u'
                                                             : 'i';
-  if (py::isinstance<py::array>(value)) {
-    auto array = py::reinterpret_borrow<py::array>(value);
-    const auto type = array.dtype();
-    const bool right = type.kind() == kind && type.itemsize() == sizeof(Element) &&
-                       (type.byteorder() == '=' || type.byteorder() == '|');
-    if (right && array.ndim() == N && (array.flags() & py::array::c_style) &&
-        (std::is_const_v<T> || array.writeable())) {
-      Array<T, N> result;
-      result.data = static_cast<T*>(const_cast<void*>(array.data()));
-      for (int axis = 0; axis < N; ++axis) result.shape[axis] = array.shape(axis);
-      return result;
-    }
-  }
-  refuse_array(value, name, kind, int(sizeof(Element)), N, !std::is_const_v<T>);
+  const auto array = expect_array(value, name, kind, sizeof(Element), N, !std::is_const_v<T>);
+  Array<T, N> result;
+  result.data = static_cast<T*>(const_cast<void*>(array.data()));
+  std::copy_n(array.shape(), N, result.shape.begin());
+  return result;
 }
 
-template <class T, std::size_t... I>
-T load_members(py::handle value, const Name& name, std::index_sequence<I...>);
+// A member of a tuple, converted to the type of what it initialises.
+struct Member {
+  py::handle tuple;
+  std::size_t place;
+  const Name* outer;
+  template <class T>
+  operator T() const {
+    return load<T>(PyTuple_GET_ITEM(tuple.ptr(), place), Name{"", outer, tuple, place});
+  }
+};
 
 template <class T, std::size_t... I>
-T load_tuple(py::handle value, const Name& name, std::index_sequence<I...>) {
-  const std::string places[] = {std::string("[") + std::to_string(I) + "]" ...};
-  return T{load<std::tuple_element_t<I, T>>(PyTuple_GET_ITEM(value.ptr(), I),
-                                            Name{places[I].c_str(), &name})...};
+T load_members(py::handle value, const Name& name, std::index_sequence<I...>) {
+  if constexpr (TupleOf<T>::value) {
+    return T{static_cast<std::tuple_element_t<I, T>>(Member{value, I, &name})...};
+  } else {
+    return T{Member{value, I, &name}...};
+  }
 }
 
 [[gnu::noinline]] inline void expect_tuple(py::handle value, const Name& name,
@@ -117,22 +139,24 @@ T load_tuple(py::handle value, const Name& name, std::index_sequence<I...>) {
 }
 
 template <class T>
-[[gnu::noinline]] T load(py::handle value, const Name& name) {
+[[gnu::noinline, gnu::cold]] T load_number(py::handle value, const Name& name) {
+  if constexpr (std::is_same_v<T, bool>) {
+    const int truth = PyObject_IsTrue(value.ptr());
+    if (truth >= 0) return truth != 0;
+    PyErr_Clear();
+  } else {
+    py::detail::make_caster<T> caster;
+    if (caster.load(value, true)) return caster;
+  }
+  throw py::type_error(name.full() + ": wanted a number, saw " + seen(value));
+}
+
+template <class T>
+[[gnu::noinline, gnu::cold]] T load(py::handle value, const Name& name) {
   if constexpr (ArrayOf<T>::value) {
     return load_array<typename ArrayOf<T>::Element, ArrayOf<T>::axes>(value, name);
   } else if constexpr (std::is_arithmetic_v<T>) {
-    try {
-      if constexpr (std::is_same_v<T, bool>) {
-        const int truth = PyObject_IsTrue(value.ptr());
-        if (truth < 0) throw py::error_already_set();
-        return truth != 0;
-      } else {
-        return value.cast<T>();
-      }
-    } catch (const std::exception&) {
-      PyErr_Clear();
-      throw py::type_error(name.full() + ": wanted a number, saw " + seen(value));
-    }
+    return load_number<T>(value, name);
   } else {
     constexpr std::size_t members = [] {
       if constexpr (TupleOf<T>::value)
@@ -141,93 +165,89 @@ template <class T>
         return member_count<T>();
     }();
     expect_tuple(value, name, members);
-    if constexpr (TupleOf<T>::value) {
-      return load_tuple<T>(value, name, std::make_index_sequence<members>());
-    } else {
-      T result = load_members<T>(value, name, std::make_index_sequence<members>());
-      if constexpr (requires { result.check(); }) {
-        try {
-          result.check();
-        } catch (const Misfit& error) {
-          throw Misfit(name.full() + "." + error.what());
-        }
+    T result = load_members<T>(value, name, std::make_index_sequence<members>());
+    if constexpr (requires { result.check(); }) {
+      try {
+        result.check();
+      } catch (const Misfit& error) {
+        throw Misfit(name.full() + "." + error.what());
       }
-      return result;
     }
+    return result;
   }
 }
 
-// A member of a named tuple, converted to the type of the member that it initialises.
-struct Member {
-  py::handle tuple;
-  std::size_t index;
-  const Name* outer;
-  template <class T>
-  operator T() const {
-    try {
-      return load<T>(PyTuple_GET_ITEM(tuple.ptr(), index), Name{"", nullptr});
-    } catch (const py::builtin_exception& error) {
-      throw py::type_error(full(error.what()));
-    } catch (const Misfit& error) {
-      throw Misfit(full(error.what()));
-    }
-  }
-  std::string full(const std::string& rest) const {
-    std::string own = std::string("[") + std::to_string(index) + "]";
-    if (py::hasattr(tuple, "_fields")) {
-      own = "." + std::string(py::str(tuple.attr("_fields")[py::int_(index)]));
-    }
-    return outer->full() + own + rest;
-  }
+// A function that is bound: how it is called with so many arguments, and their names.
+struct Bound {
+  py::object (*call)(const Bound& bound, PyObject* const* arguments);
+  void (*function)();
+  const char* name;
+  std::vector<std::string> names;
 };
 
-template <class T, std::size_t... I>
-T load_members(py::handle value, const Name& name, std::index_sequence<I...>) {
-  return T{Member{value, I, &name}...};
+template <class Result, class... A, std::size_t... I>
+Result call_unlocked(Result (*function)(A...), const Bound& bound, PyObject* const* arguments,
+                     std::index_sequence<I...>) {
+  std::tuple<std::remove_cvref_t<A>...> loaded{
+      load<std::remove_cvref_t<A>>(arguments[I], Name{bound.names[I].c_str()})...};
+  py::gil_scoped_release unlocked;
+  return std::apply(function, loaded);
 }
 
-template <class Result, class... A, std::size_t... I>
-py::object call(Result (*function)(A...), const py::args& arguments, const std::string* names,
-                std::index_sequence<I...>) {
-  std::tuple<std::remove_cvref_t<A>...> loaded{
-      load<std::remove_cvref_t<A>>(arguments[I], Name{names[I].c_str(), nullptr})...};
+template <class Result, class... A>
+[[gnu::cold]] py::object call(const Bound& bound, PyObject* const* arguments) {
+  const auto function = reinterpret_cast<Result (*)(A...)>(bound.function);
+  constexpr auto places = std::index_sequence_for<A...>();
   if constexpr (std::is_void_v<Result>) {
-    py::gil_scoped_release unlocked;
-    std::apply(function, loaded);
+    call_unlocked(function, bound, arguments, places);
+    return py::none();
   } else {
-    Result result;
-    {
-      py::gil_scoped_release unlocked;
-      result = std::apply(function, loaded);
-    }
-    return py::cast(result);
+    return py::cast(call_unlocked(function, bound, arguments, places));
   }
-  return py::none();
+}
+
+// `names` has one for each argument, with spaces between.
+[[gnu::noinline]] inline void bind_by_names(py::module_& module, Bound bound, std::size_t wanted,
+                                            const char* names) {
+  for (const char* start = names; *start;) {
+    const char* end = start;
+    while (*end && *end != ' ') ++end;
+    bound.names.emplace_back(start, end);
+    start = *end ? end + 1 : end;
+  }
+  if (bound.names.size() != wanted) throw std::logic_error(std::string(bound.name) + ": names");
+  const std::string doc = std::string(bound.name) + "(" + names + ")";
+  const char* name = bound.name;
+  module.def(
+      name,
+      [bound = std::move(bound)](const py::args& arguments) {
+        if (arguments.size() != bound.names.size()) {
+          throw py::type_error(std::string(bound.name) + ": wanted " +
+                               std::to_string(bound.names.size()) + " arguments, saw " +
+                               std::to_string(arguments.size()));
+        }
+        return bound.call(bound, PySequence_Fast_ITEMS(arguments.ptr()));
+      },
+      doc.c_str());
 }
 
 // Binds a function of arrays, numbers and structs. `names` are those of its arguments, in order.
 // It runs without the interpreter's lock.
 template <class Result, class... A>
 void bind(py::module_& module, const char* name, Result (*function)(A...), const char* names) {
-  std::vector<std::string> split;
-  for (const char* start = names; *start;) {
-    const char* end = start;
-    while (*end && *end != ' ') ++end;
-    split.emplace_back(start, end);
-    start = *end ? end + 1 : end;
+  bind_by_names(module, {call<Result, A...>, reinterpret_cast<void (*)()>(function), name, {}},
+                sizeof...(A), names);
+}
+
+// The table of numpy's C interface that makes its functions.
+inline void** ufunc_interface() {
+  py::object module;
+  try {
+    module = py::module_::import("numpy._core._multiarray_umath");
+  } catch (py::error_already_set&) {  // before numpy 2
+    module = py::module_::import("numpy.core._multiarray_umath");
   }
-  if (split.size() != sizeof...(A)) throw std::logic_error(std::string(name) + ": names");
-  const std::string doc = std::string(name) + "(" + names + ")";
-  module.def(
-      name,
-      [function, split, name](const py::args& arguments) {
-        if (arguments.size() != sizeof...(A)) {
-          throw py::type_error(std::string(name) + ": wanted " + std::to_string(sizeof...(A)) +
-                               " arguments, saw " + std::to_string(arguments.size()));
-        }
-        return call(function, arguments, split.data(), std::index_sequence_for<A...>());
-      },
-      doc.c_str());
+  return static_cast<void**>(PyCapsule_GetPointer(module.attr("_UFUNC_API").ptr(), nullptr));
 }
 
 }  // namespace hmt

@@ -27,6 +27,16 @@ HMT_INLINE void divide(double* row, double divisor, Index first, Index last) {
   for (Index b = first; b < last; b += group_size) group(row + b) /= divisor;
 }
 
+// Distance of two rows of whole lanes.
+HMT_WIDE inline double distance(const double* one, const double* other, Index width) {
+  double sums[lanes] = {};
+  for (Index i = 0; i < width; i += lanes) {
+#pragma omp simd
+    for (int k = 0; k < lanes; ++k) sums[k] += square(one[i + k] - other[i + k]);
+  }
+  return std::sqrt(sum_lanes(sums));
+}
+
 // Cholesky factorisation, rows of the upper factor in place; reads and leaves right what is not
 // left of the diagonal. False for a matrix that is not positive definite.
 HMT_WIDE inline bool factorise(Rows u, Index n) {

@@ -1,11 +1,10 @@
 // Functions of numpy's kind (ufuncs), which broadcast, convert and loop as numpy's own.
 //
 // They are made by numpy's C interface, whose table a capsule holds, as pybind11 does for arrays:
-// so no headers of numpy are needed to build.
+// so no headers of numpy are needed to build, and none of pybind11, which are slow to compile.
 #pragma once
 
-#include <pybind11/numpy.h>
-#include <pybind11/pybind11.h>
+#include <Python.h>
 
 #include <cfenv>
 
@@ -13,11 +12,10 @@
 #include <xmmintrin.h>
 #endif
 
+#include "array_functions.h"
 #include "arrays.h"
 
 namespace hmt {
-
-namespace py = pybind11;
 
 // A loop of numpy: pointers to the first elements, the count, strides in bytes, and `data`.
 using UfuncLoop = void (*)(char** pointers, const Index* counts, const Index* strides, void* data);
@@ -97,18 +95,13 @@ void elementwise_loop(char** pointers, const Index* counts, const Index* strides
   report_only(exceptions);
 }
 
-inline void** ufunc_interface() {
-  py::object module;
-  try {
-    module = py::module_::import("numpy._core._multiarray_umath");
-  } catch (py::error_already_set&) {  // before numpy 2
-    module = py::module_::import("numpy.core._multiarray_umath");
-  }
-  return static_cast<void**>(PyCapsule_GetPointer(module.attr("_UFUNC_API").ptr(), nullptr));
+// Adds what numpy has made to a module.
+inline void add(const UfuncModule& module, const char* name, PyObject* made) {
+  if (!made || PyModule_AddObject(module.object, name, made) < 0) throw std::runtime_error(name);
 }
 
 template <int N>
-void bind_block(py::module_& module, const char* name, const Elementwise& function,
+void bind_block(const UfuncModule& module, const char* name, const Elementwise& function,
                 const char* doc) {
   static UfuncLoop loops[] = {elementwise_loop<float, N>, elementwise_loop<double, N>};
   static char types[2 * (N + 1)];
@@ -118,18 +111,17 @@ void bind_block(py::module_& module, const char* name, const Elementwise& functi
                              const char*, int);
   auto* kept = new Elementwise(function);  // as long as the module lives
   auto** data = new void*[2]{kept, kept};
-  const auto make = reinterpret_cast<Make>(ufunc_interface()[1]);
+  const auto make = reinterpret_cast<Make>(module.numpy[1]);
   constexpr int no_identity = -1;
-  module.attr(name) = py::reinterpret_steal<py::object>(
-      make(loops, data, types, 2, N, 1, no_identity, name, doc, 0));
+  add(module, name, make(loops, data, types, 2, N, 1, no_identity, name, doc, 0));
 }
 
 // Binds a function of blocks as a ufunc of float32 and float64.
-inline void bind_elementwise(py::module_& module, const char* name, UnaryBlock block,
+inline void bind_elementwise(const UfuncModule& module, const char* name, UnaryBlock block,
                              const char* doc, int at_infinity = FE_OVERFLOW) {
   bind_block<1>(module, name, {reinterpret_cast<void*>(block), at_infinity}, doc);
 }
-inline void bind_elementwise(py::module_& module, const char* name, BinaryBlock block,
+inline void bind_elementwise(const UfuncModule& module, const char* name, BinaryBlock block,
                              const char* doc, int at_infinity = FE_OVERFLOW) {
   bind_block<2>(module, name, {reinterpret_cast<void*>(block), at_infinity}, doc);
 }
@@ -137,7 +129,7 @@ inline void bind_elementwise(py::module_& module, const char* name, BinaryBlock 
 // Binds loops over matrices as a generalised ufunc: one of float64, or those of float32 and
 // float64. The signature is numpy's, such as "(n,n),(n,m)->(n,m)"; a loop gets the counts and the
 // strides of these axes after those of the items.
-inline void bind_matrix_function(py::module_& module, const char* name,
+inline void bind_matrix_function(const UfuncModule& module, const char* name,
                                  std::initializer_list<UfuncLoop> loops, const char* signature,
                                  int inputs, int outputs, const char* doc) {
   using Make = PyObject* (*)(UfuncLoop*, void**, const char*, int, int, int, int, const char*,
@@ -148,10 +140,10 @@ inline void bind_matrix_function(py::module_& module, const char* name,
   auto* data = new std::vector<void*>(kinds, nullptr);
   auto* types = new std::vector<char>(kinds * arrays, 12);        // NPY_DOUBLE
   if (kinds == 2) std::fill_n(types->begin(), arrays, char{11});  // NPY_FLOAT
-  const auto make = reinterpret_cast<Make>(ufunc_interface()[31]);
-  module.attr(name) =
-      py::reinterpret_steal<py::object>(make(kept->data(), data->data(), types->data(), kinds,
-                                             inputs, outputs, -1, name, doc, 0, signature));
+  const auto make = reinterpret_cast<Make>(module.numpy[31]);
+  add(module, name,
+      make(kept->data(), data->data(), types->data(), kinds, inputs, outputs, -1, name, doc, 0,
+           signature));
 }
 
 }  // namespace hmt

@@ -188,8 +188,6 @@ class _Softmax:
 
     def newton(self, weights: Array, precisions: Array, steps: int) -> Array:
         """Damped Newton steps; the ratio of true to predicted gain sets the damping."""
-        from scipy.linalg import cho_solve, cholesky
-
         shape = weights.shape
         prior = np.tile(precisions, shape[0])
         likelihood, gates = self.likelihood(weights)
@@ -205,7 +203,7 @@ class _Softmax:
                 scale = np.diagonal(hessian).copy()
             damped = hessian.copy()
             damped[np.diag_indices_from(damped)] += damping * scale
-            step = cho_solve((cholesky(damped, lower=True), True), gradient)
+            step = np.linalg.solve(damped, gradient)
             predicted = float(gradient @ step - 0.5 * step @ hessian @ step)
             if predicted < 1e-4 or damping > DAMPING_LIMIT:
                 break
@@ -225,20 +223,18 @@ class _Softmax:
 
     def laplace(self, weights: Array, precisions: Array) -> _SoftmaxFit:
         """The share of the bound, with a Laplace approximation at the weights."""
-        from scipy.linalg import cholesky, solve_triangular
-
         experts, count = weights.shape
         likelihood, gates = self.likelihood(weights)
         hessian = self.curvature(gates)
         hessian[np.diag_indices_from(hessian)] += np.tile(precisions, experts)
-        factor = cholesky(hessian, lower=True)
+        factor = np.linalg.cholesky(hessian)
         half_log_det = float(np.log(np.diagonal(factor)).sum())
         penalty = -0.5 * float((precisions * weights**2).sum()) - half_log_det
         penalty += 0.5 * experts * float(np.log(precisions).sum())
         # Relative to the mode of the hyperprior, so that pruning a function costs nothing.
         hyper = SHAPE * np.log(precisions * RATE / SHAPE) - RATE * precisions + SHAPE
         penalty += float(hyper.sum())
-        inverse = solve_triangular(factor, np.eye(len(factor)), lower=True)
+        inverse = np.linalg.inv(factor)
         variances = (inverse**2).sum(0).reshape(experts, count)
         determined = experts - precisions * variances.sum(0)
         return _SoftmaxFit(weights, precisions, likelihood + penalty, penalty, determined)

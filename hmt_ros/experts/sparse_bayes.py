@@ -21,8 +21,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
-from scipy.linalg.lapack import dpotri
 
 from hmt_ros.inference.arrays import Array, Index
 
@@ -108,27 +106,20 @@ def posterior(
     sums: WeightedSums, active: Index, precisions: Array, noise: Array, prior: RegressionPrior
 ) -> SparseRegression:
     """The posterior for given functions, precisions and noise, by a fresh Cholesky factor."""
-    count, outputs = len(active), len(noise)
     inner = sums.gram[np.ix_(active, active)] + np.diag(precisions)
-    covariance, half, weights = np.zeros((0, 0)), np.zeros((0, outputs)), np.zeros((0, outputs))
-    log_det_inner = 0.0
-    # LAPACK, called by older versions of scipy, refuses empty matrices.
-    if count:
-        # Scaled to a unit diagonal: precisions span many orders of magnitude.
-        root = 1.0 / np.sqrt(np.diagonal(inner))
-        factor = cholesky(inner * root[:, None] * root, lower=True, check_finite=False)
-        covariance, _ = dpotri(factor, lower=True)
-        covariance = np.tril(covariance) + np.tril(covariance, -1).T
-        covariance *= root[:, None] * root
-        cross = root[:, None] * sums.cross[active]
-        half = solve_triangular(factor, cross, lower=True, check_finite=False)
-        weights = root[:, None] * solve_triangular(factor, half, lower=True, trans=1)
-        log_det_inner = 2.0 * float(np.log(np.diagonal(factor)).sum() - np.log(root).sum())
+    # Scaled to a unit diagonal: precisions span many orders of magnitude.
+    root = 1.0 / np.sqrt(np.diagonal(inner))
+    factor = np.linalg.cholesky(inner * root[:, None] * root)
+    whitener = np.linalg.inv(factor) * root
+    covariance = whitener.T @ whitener
+    half = whitener @ sums.cross[active]
+    weights = whitener.T @ half
+    log_det_inner = 2.0 * float(np.log(np.diagonal(factor)).sum() - np.log(root).sum())
     residual = sums.outer - half.T @ half
-    noise_factor = cholesky(noise, lower=True, check_finite=False)
+    noise_factor = np.linalg.cholesky(noise)
     log_det_noise = 2.0 * float(np.log(np.diagonal(noise_factor)).sum())
-    z = solve_triangular(noise_factor, residual + prior.scale, lower=True, check_finite=False)
-    z = solve_triangular(noise_factor, z.T, lower=True, check_finite=False)
+    noise_whitener, outputs = np.linalg.inv(noise_factor), len(noise)
+    z = noise_whitener @ (residual + prior.scale) @ noise_whitener.T
     evidence = -0.5 * (
         outputs * sums.total * np.log(2.0 * np.pi)
         + (sums.total + prior.strength) * log_det_noise
@@ -214,8 +205,8 @@ class _GreedyState:
     def __init__(self, sums: WeightedSums, found: SparseRegression) -> None:
         self.gram = sums.gram
         self.outputs = len(found.noise)
-        factor = cholesky(found.noise, lower=True, check_finite=False)
-        whitened = solve_triangular(factor, sums.cross.T, lower=True, check_finite=False).T
+        factor = np.linalg.cholesky(found.noise)
+        whitened = np.linalg.solve(factor, sums.cross.T).T
         self.active = found.active
         self.precisions = found.precisions
         self.covariance = found.covariance

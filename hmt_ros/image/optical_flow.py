@@ -9,6 +9,8 @@ compare modes, because each mode has its own points.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import cv2
@@ -34,11 +36,23 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
         return window.as_map(np.zeros((2, *grey[0].shape), np.float32))
     # The stubs do not know that there may be no flow to start from.
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-    flow = method.calc(grey[0], grey[1], None)
+    with without_ipp():
+        flow = method.calc(grey[0], grey[1], None)
     channels = np.ascontiguousarray(flow.transpose(2, 0, 1))
     if window.others is not None:
         channels[:, window.others > 0] = np.nan
     return window.as_map(channels)
+
+
+@contextmanager
+def without_ipp() -> Iterator[None]:
+    """OpenCV without Intel's IPP in this thread: that resizes in other ways on other processors."""
+    before = cv2.ipp.useIPP()
+    cv2.ipp.setUseIPP(False)
+    try:
+        yield
+    finally:
+        cv2.ipp.setUseIPP(before)
 
 
 class FlowTerm(NamedTuple):

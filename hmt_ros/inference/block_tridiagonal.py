@@ -27,12 +27,13 @@ from hmt_ros.core import (
     elementary,
     factorise_band,
     fill_lower,
+    invert_block,
     multiply_band_transposed,
     solve_band_lower,
     solve_band_transposed,
 )
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.linear_algebra import inverse_triangular, product
+from hmt_ros.inference.linear_algebra import product
 
 
 class NotPositiveDefiniteError(ValueError):
@@ -99,11 +100,14 @@ class BlockCholesky:
     Attributes:
         columns: (T n, width + 1) of L in LAPACK's band storage: [j, i - j] = L[i, j].
         times, size: T and n.
+        last_first: whether L is of the blocks from the last to the first. Then blocks of the
+            inverse come from the first on.
     """
 
     columns: Array
     times: int
     size: int
+    last_first: bool = False
 
     @property
     def width(self) -> int:
@@ -140,29 +144,37 @@ class BlockCholesky:
         below = np.where(n + row - column <= width, self._windows(n, t - 1), 0.0)
         return own, below
 
-    def inverse_blocks(self) -> Array:
-        """Blocks (T, n, n) on the diagonal of P^-1: for a precision the marginal covariances.
+    def inverse_blocks(self, count: int | None = None) -> Array:
+        """The first blocks, or all (T, n, n), on the diagonal of P^-1.
 
-        Backwards, with G_t = L_{t+1,t} L_t^-1:
+        For a precision these are the marginal covariances. Backwards along L, with
+        G_t = L_{t+1,t} L_t^-1:
 
             C_T = (L_T L_T')^-1,    C_t = (L_t L_t')^-1 + G_t' C_{t+1} G_t
         """
-        own, below = self.blocks
-        inverse = inverse_triangular(own)
-        gain = product(below, inverse[:-1])
-        covariances: Array = product(inverse.swapaxes(1, 2), inverse)
-        for i in range(self.times - 2, -1, -1):
-            covariances[i] += product(gain[i].T, product(covariances[i + 1], gain[i]))
-        covariances += covariances.swapaxes(1, 2).copy()
-        covariances *= 0.5
-        return covariances
+        count = self.times if count is None else count
+        known, n = self._inverse_blocks, self.size
+        while len(known) < (count if self.last_first else self.times):
+            block = np.empty((n, n))
+            after = known[-1] if known else np.empty((0, n))
+            invert_block(self.columns, self.times - 1 - len(known), after, block)
+            known.append(block)
+        return np.array((known if self.last_first else known[::-1])[:count])
+
+    @cached_property
+    def _inverse_blocks(self) -> list[Array]:
+        """Those that were asked for, backwards along L."""
+        return []
 
     def matrix(self) -> BlockTridiagonal:
         """P."""
         own, below = self.blocks
         diagonal = product(own, own.swapaxes(1, 2))
         diagonal[1:] += product(below, below.swapaxes(1, 2))
-        return BlockTridiagonal(diagonal, product(below, own[:-1].swapaxes(1, 2)))
+        lower = product(below, own[:-1].swapaxes(1, 2))
+        if self.last_first:
+            return BlockTridiagonal(diagonal[::-1], lower[::-1].swapaxes(1, 2))
+        return BlockTridiagonal(diagonal, lower)
 
     def _windows(self, offset: int, count: int) -> Array:
         """Blocks L[t n + offset + a, t n + b] for t < count, with rubbish outside the band.
@@ -181,10 +193,12 @@ class BlockCholesky:
 
     def _applied(self, vectors: Array, *functions: Callable[[Array, Array], None]) -> Array:
         """The results of functions that overwrite vectors (..., T, n), one after the other."""
-        result = np.array(vectors.reshape(-1, self.times * self.size), order='C')
+        order = slice(None, None, -1 if self.last_first else 1)
+        trajectories = vectors.reshape(-1, self.times, self.size)[:, order]
+        result = np.array(trajectories, order='C').reshape(-1, self.times * self.size)
         for function in functions:
             function(self.columns, result)
-        return result.reshape(vectors.shape)
+        return result.reshape(trajectories.shape)[:, order].reshape(vectors.shape)
 
 
 def bandwidth(lower: Array, n: int) -> int:

@@ -1,11 +1,9 @@
-"""K-means: scipy's iterations from k-means++ seeds.
+"""K-means: Lloyd's iterations from k-means++ seeds.
 
 min over c_1 ... c_K of sum_n min_k |x_n - c_k|^2
 """
 
 from __future__ import annotations
-
-import warnings
 
 import numpy as np
 
@@ -18,19 +16,16 @@ def k_means(
 ) -> tuple[Array, Index]:
     """Clusters of points (N, p), at most `count` of them, fewer where fewer points differ.
 
-    The seeds are those of `spread_points`: scipy's own k-means++ takes the square of the number of
-    clusters, and its argument for a generator has a different name in each of its versions.
-
     Returns:
         centres (K, p) and labels (N,). A cluster that loses all its points keeps its centre.
     """
-    from scipy.cluster.vq import kmeans2
-
-    seeds = points[spread_points(points, count, rng)]
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore', UserWarning)  # a cluster without points
-        centres, labels = kmeans2(points, seeds, iterations, minit='matrix', check_finite=False)
-    return np.asarray(centres), np.asarray(labels, dtype=np.intp)
+    centres = points[spread_points(points, count, rng)]
+    for _ in range(iterations):
+        labels = squared_distances(points, centres).argmin(1)
+        sizes = np.bincount(labels, minlength=len(centres))[:, None]
+        sums = [np.bincount(labels, column, len(centres)) for column in points.T]
+        centres = np.where(sizes > 0, np.stack(sums, axis=1) / np.maximum(sizes, 1), centres)
+    return centres, labels
 
 
 def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:

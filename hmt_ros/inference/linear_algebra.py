@@ -22,6 +22,12 @@ product: Callable[..., Any] = matrices.product
 # log sum exp(x) along the last axis, or along `axis`, as `numpy.logaddexp.reduce`.
 log_sum_exp: Callable[..., Any] = matrices.log_sum_exp
 
+# Mean distance (...) of points (..., P, c) from others.
+mean_distances: Callable[..., Any] = matrices.mean_distance
+
+# Distances (..., N, N) of vectors (..., N, k) from each other.
+distances: Callable[..., Any] = matrices.distances
+
 
 def _checked(what: str) -> np.errstate:
     def fail(_kind: str, _flag: int) -> NoReturn:

@@ -13,12 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_ros.core import elementary
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
 from hmt_ros.inference.linear_algebra import (
     cholesky,
@@ -69,6 +70,28 @@ class TrajectoryPrior:
             self.precision.diagonal[first:last], self.precision.lower[first : last - 1]
         )
         return TrajectoryPrior(precision, information, 0.0, self.dimension)
+
+
+class Couplings(NamedTuple):
+    """What couples T states, by interval between two of them.
+
+    Attributes:
+        before, after, forth: (I, n, n) A' Q^-1 A, Q^-1 and Q^-1 A of the different intervals.
+        which: (T-1,) the interval after each state but the last.
+        log_determinants: (T-1,) log |Q|.
+    """
+
+    before: Array
+    after: Array
+    forth: Array
+    which: Index
+    log_determinants: Array
+
+    def constant(self, noise: Array) -> float:
+        """-log of the densities at their modes, with factors (T-1,) on the noise, nats."""
+        n = self.before.shape[1]
+        logs = n * elementary.log(2.0 * np.pi * noise) + self.log_determinants
+        return 0.5 * float(logs.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +213,21 @@ class LinearGaussianDynamics:
         forth = product(precision, a)
         return product(a.T, forth), precision, forth, log_det
 
+    def couplings(self, intervals: Array) -> Couplings:
+        """What couples states with intervals (T-1,) between them, s.
+
+        Raises:
+            ValueError: the noise over an interval is not positive definite.
+        """
+        n = self.state_dimension
+        different, which = np.unique(intervals, return_inverse=True)
+        each = [self.coupling(float(interval)) for interval in different]
+        before, after, forth = (
+            np.array([one[k] for one in each]).reshape(-1, n, n) for k in range(3)
+        )
+        logs = np.array([one[3] for one in each])[which]
+        return Couplings(before, after, forth, which, logs)
+
     @cached_property
     def unknown_velocity(self) -> Array:
         """Covariance (n - d, n - d) of the first velocity."""
@@ -273,16 +311,12 @@ class LinearGaussianDynamics:
             - elementary.log(known).sum()
             + product(self.initial_mean, information[0])
         )
-        different, which = np.unique(intervals, return_inverse=True)
-        for i, interval in enumerate(different):
-            before, after, forth, log_det = self.coupling(float(interval))
-            at = np.flatnonzero(which == i)
-            share = 1.0 / factors[at, None, None]
-            diagonal[at] += share * before
-            diagonal[at + 1] += share * after
-            lower[at] = -share * forth
-            constant += 0.5 * len(at) * (n * elementary.log(2 * np.pi) + log_det)
-        constant += 0.5 * n * float(elementary.log(factors).sum())
+        coupled = self.couplings(intervals)
+        share = 1.0 / factors[:, None, None]
+        diagonal[:-1] += share * coupled.before[coupled.which]
+        diagonal[1:] += share * coupled.after[coupled.which]
+        lower[:] = -share * coupled.forth[coupled.which]
+        constant += coupled.constant(factors)
         precision = BlockTridiagonal(diagonal, lower)
         return TrajectoryPrior(precision, information, float(constant), self.dimension)
 

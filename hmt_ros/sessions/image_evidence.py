@@ -9,10 +9,10 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.inference.linear_algebra import mean_distances
 from hmt_ros.inference.mode_chain import reachable_origins
 from hmt_ros.sessions.smoothed_messages import SmoothedBody
 from hmt_ros.smoothing import ImageModes, Link
-from hmt_ros.smoothing.motions import mean_distances
 from msg_tools import MessageError
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture

@@ -20,13 +20,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmt_ros.body.resting_points import RestingPoints
+from hmt_ros.body.resting_points import RestingPoints, RestingTable
+from hmt_ros.core import condition_chain
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index, Mask
-from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
+from hmt_ros.inference.block_tridiagonal import BlockCholesky, NotPositiveDefiniteError
 from hmt_ros.inference.error_model import TOGETHER, CueErrors
-from hmt_ros.inference.linear_algebra import inverse, log_determinant, product, solve
-from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
+from hmt_ros.inference.linear_algebra import (
+    inverse,
+    log_determinant,
+    mean_distances,
+    product,
+    solve,
+)
+from hmt_ros.inference.linear_gaussian_dynamics import Couplings, LinearGaussianDynamics
 from hmt_ros.inference.mode_chain import Link, backward_weights, drawn_paths
 from hmt_ros.smoothing.motions import (
     SAME_MOTION,
@@ -34,7 +41,6 @@ from hmt_ros.smoothing.motions import (
     MotionEvidence,
     evidence_of_motions,
     grouped,
-    mean_distances,
     path_distances,
 )
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
@@ -112,6 +118,25 @@ class Past(NamedTuple):
     shares: Array
     first: FirstStates
     places: Array
+
+
+class ChainPrior(NamedTuple):
+    """What states are before images speak, for the core.
+
+    Attributes:
+        before, after, forth, which: of `Couplings`.
+        shares: (T-1,) 1 / l.
+        known: (n, n) P_1.
+        pull: (n,) P_1 m_1.
+    """
+
+    before: Array
+    after: Array
+    forth: Array
+    which: Index
+    shares: Array
+    known: Array
+    pull: Array
 
 
 class MotionStates(NamedTuple):
@@ -261,8 +286,9 @@ class MotionSmoother:
         ]
         first = None if past is None else self._first(past, nodes[:, 0], weights, labels)
         intervals = np.diff(stamps) / SECOND_NS
+        couplings = self.dynamics.couplings(intervals)
         found = [
-            self._states(intervals, evidence, first, m, masses[m] >= LEAST_HELD)
+            self._states(intervals, couplings, evidence, first, m, masses[m] >= LEAST_HELD)
             for m in range(len(masses))
         ]
         trust = np.array([one.trust for one in found])
@@ -321,6 +347,7 @@ class MotionSmoother:
     def _states(
         self,
         intervals: Array,
+        couplings: Couplings,
         evidence: MotionEvidence,
         first: FirstStates | None,
         m: int,
@@ -339,10 +366,10 @@ class MotionSmoother:
             at, known = first.means[m], inverse(first.covariances[m])
             least = first.liveliness[m] / LIVELIER[1]
         known = 0.5 * (known + known.T)
+        pull_of_first = product(known, at)
         for liveliness in (x for x in LIVELIER if x >= least):
-            prior = dynamics.prior(intervals, initial=False, noise=liveliness)
-            prior.precision.diagonal[0] += known
-            prior.information[0] += product(known, at)
+            noise = np.full(len(intervals), liveliness)
+            prior = ChainPrior(*couplings[:4], 1.0 / noise, known, pull_of_first)
             states, factor = _conditioned(prior, precisions, means)
             away = self._away(states, places)
             if self.points is None or np.median(away) <= ASTRAY:
@@ -357,20 +384,20 @@ class MotionSmoother:
         precisions = precisions * trust[:, None, None]
         pull = product(precisions, means[:, :, None])[:, :, 0]
         seen = 0.5 * ((means * pull).sum() - log_determinant(precisions).sum())
-        seen += 0.5 * product(product(at, known), at) + prior.constant
-        gained = 0.5 * ((states * prior.information).sum() + (states[:, :d] * pull).sum())
+        seen += 0.5 * product(at, pull_of_first) + couplings.constant(noise)
+        gained = 0.5 * (product(states[0], pull_of_first) + (states[:, :d] * pull).sum())
         if held and self.resting is not None and len(states) > 1:
             # Covariances ignore what rests: rest is a decision, the same from image to image.
             poses = np.clip(states, *self.limits())[:, :d]
-            resting = self.resting.held(prior, poses, evidence.covariances[m], intervals)
-            if resting is not prior:
-                states = _conditioned(resting, precisions, means)[0]
+            resting = self.resting.along(poses, evidence.covariances[m], intervals)
+            if resting is not None:
+                states = _conditioned(prior, precisions, means, resting)[0]
         return MotionStates(states, factor, float(gained - seen), liveliness, trust, fresh)
 
     def _away(self, states: Array, places: Array) -> Array:
         """Mean distances (T,) of the points of states (T, n) from others (T, P, 3), m."""
         poses = np.clip(states, *self.limits())[:, : self.dynamics.dimension]
-        return mean_distances(self.points_of(poses), places)
+        return np.asarray(mean_distances(self.points_of(poses), places))
 
     def advanced(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
         """What the first images of a window tell of the one after them.
@@ -423,16 +450,23 @@ def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Arr
 
 
 def _conditioned(
-    prior: TrajectoryPrior, precisions: Array, means: Array
+    prior: ChainPrior, precisions: Array, means: Array, resting: RestingTable | None = None
 ) -> tuple[Array, BlockCholesky]:
     """States (T, n) given Gaussians over poses, and the factor of their precision.
 
     Args:
         precisions, means: (T, d, d) and (T, d) of the Gaussians.
+
+    Raises:
+        NotPositiveDefiniteError: the precision of the states is not.
     """
-    d = means.shape[1]
-    diagonal, right = prior.precision.diagonal.copy(), prior.information.copy()
-    diagonal[:, :d, :d] += precisions
-    right[:, :d] += product(precisions, means[:, :, None])[:, :, 0]
-    factor = BlockTridiagonal(diagonal, prior.precision.lower).cholesky()
-    return factor.solve(right), factor
+    (times, d), n = means.shape, len(prior.pull)
+    columns, states = np.empty((times * n, 2 * n)), np.empty((times, n))
+    held = RestingTable.none(times, d) if resting is None else resting
+    done = condition_chain(prior, precisions, means, held, columns, states)
+    if done < len(columns):
+        raise NotPositiveDefiniteError(
+            f'the precision of {times} states is not positive definite: pivot {done + 1} of '
+            f'{len(columns)}'
+        )
+    return states, BlockCholesky(columns, times, n, last_first=True)

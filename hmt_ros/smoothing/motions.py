@@ -23,7 +23,7 @@ import numpy as np
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.linear_algebra import product
+from hmt_ros.inference.linear_algebra import distances, product
 
 SECOND_NS = 10**9
 # Distance of two paths below which they are one motion, and the most that a span counts with, m.
@@ -44,11 +44,6 @@ class MotionEvidence(NamedTuple):
     means: Array
     covariances: Array
     disagreements: Array
-
-
-def mean_distances(one: Array, other: Array) -> Array:
-    """Mean distances (...) of points (..., P, 3), m."""
-    return np.asarray(np.linalg.norm(one - other, axis=-1).mean(-1))
 
 
 def path_distances(
@@ -83,8 +78,7 @@ def path_distances(
 def _apart(places: Sequence[Array]) -> Array:
     """Distances (N, N) of paths over a span, of whose images places (N, P, 3) are given, m."""
     means = np.mean(places, axis=0)
-    flat = means.reshape(len(means), -1)
-    apart = np.sqrt(((flat[:, None] - flat) ** 2).sum(2))
+    apart = distances(means.reshape(len(means), -1))
     return np.asarray(apart / np.sqrt(means.shape[1]))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import mean_distances
 from hmt_ros.inference.mode_chain import Link
 from hmt_ros.smoothing.motion_smoother import (
     ImageModes,
@@ -25,7 +26,7 @@ from hmt_ros.smoothing.motion_smoother import (
     SmoothedMotions,
     WindowImage,
 )
-from hmt_ros.smoothing.motions import SAME_MOTION, SECOND_NS, mean_distances
+from hmt_ros.smoothing.motions import SAME_MOTION, SECOND_NS
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
 # Intervals between poses vary by this share of their length.

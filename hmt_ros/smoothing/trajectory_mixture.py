@@ -107,20 +107,12 @@ class TrajectoryMixture:
         """Covariances of each pose in each component, inflation included, (M, T, d, d)."""
         return np.array([self.covariances_of(i) for i in range(len(self))])
 
-    def covariances_of(self, i: int) -> Array:
-        """Covariances (T, d, d) of the poses of component i, inflation included."""
-        if i not in self._covariances:
-            d = self.dimension
-            blocks = self.factors[i].inverse_blocks()
-            self._covariances[i] = self.inflation[i] ** 2 * blocks[:, :d, :d]
-            if self.disagreements is not None:
-                self._covariances[i] += self.disagreements[i]
-        return self._covariances[i]
-
-    @cached_property
-    def _covariances(self) -> dict[int, Array]:
-        """The covariances that were asked for, by component."""
-        return {}
+    def covariances_of(self, i: int, count: int | None = None) -> Array:
+        """Covariances (T, d, d) of the poses of component i, or of the first of them."""
+        d = self.dimension
+        blocks = self.factors[i].inverse_blocks(count)
+        result: Array = self.inflation[i] ** 2 * blocks[:, :d, :d]
+        return result if self.disagreements is None else result + self.disagreements[i, :count]
 
     @cached_property
     def velocities(self) -> Array | None:
@@ -142,7 +134,7 @@ class TrajectoryMixture:
         Of motions the heaviest leads at every time, see `led_by_first`: what outweighs it for an
         image is flicker.
         """
-        covariances = np.array([self.covariances_of(i)[t] for i in range(len(self))])
+        covariances = np.array([self.covariances_of(i, t + 1)[t] for i in range(len(self))])
         weights = self.weights if self.weights_in_time is None else self.weights_in_time[t]
         poses = GaussianMixture(weights, self.means[:, t], covariances)
         if self.strays:

@@ -7,6 +7,7 @@ from hmt_ros.core import (
     factorise_band,
     fill_lower,
     hold,
+    invert_block,
     multiply_band_transposed,
     solve_band_lower,
     solve_band_transposed,
@@ -87,6 +88,23 @@ def test_a_factor_ends_at_the_first_pivot_that_is_none(value):
     assert factorise_band(columns) == 13
 
 
+@pytest.mark.parametrize(('times', 'n', 'width'), [(3, 5, 9), (4, 2, 2), (1, 3, 2), (3, 1, 1)])
+def test_blocks_of_the_inverse_are_those_of_the_dense_matrix(times, n, width):
+    rng = np.random.default_rng(n)
+    columns = 0.3 * rng.normal(size=(times * n, width + 1))
+    columns[:, 0] = width + 1.0
+    # Blocks are coupled to the next one alone.
+    columns[np.add.outer(np.arange(times * n) % n, np.arange(width + 1)) >= 2 * n] = 0.0
+    inverse = np.linalg.inv(dense(columns)).reshape(times, n, times, n)
+    assert factorise_band(columns) == times * n
+    after = np.empty((0, n))
+    for place in reversed(range(times)):
+        block = np.full((n, n), np.nan)
+        invert_block(columns, place, after, block)
+        np.testing.assert_allclose(block, inverse[place, :, place], rtol=0, atol=1e-13)
+        after = block
+
+
 @pytest.mark.parametrize(
     ('function', 'arguments', 'text'),
     [
@@ -107,6 +125,13 @@ def test_a_factor_ends_at_the_first_pivot_that_is_none(value):
         (solve_band_lower, (np.ones((4, 2)), np.zeros((2, 3))), 'x: wanted shape'),
         (solve_band_transposed, (np.ones((4, 2)), np.zeros((4, 2)).T), 'x: wanted .*contiguous'),
         (multiply_band_transposed, (np.ones((4, 0)), np.zeros((1, 4))), 'columns: wanted a'),
+        (invert_block, (np.ones((4, 2)), 0, np.zeros((0, 2)), np.zeros((2, 2))), 'after: wanted'),
+        (invert_block, (np.ones((4, 2)), 1, np.zeros((2, 2)), np.zeros((2, 2))), 'after: wanted'),
+        (invert_block, (np.ones((4, 2)), 2, np.zeros((0, 2)), np.zeros((2, 2))), 'place: wanted'),
+        (invert_block, (np.ones((4, 2)), -1, np.zeros((2, 2)), np.zeros((2, 2))), 'place: wan'),
+        (invert_block, (np.ones((4, 2)), 1, np.zeros((0, 2)), np.zeros((2, 3))), 'result: wan'),
+        (invert_block, (np.ones((4, 2)), 1, np.zeros((0, 0)), np.zeros((0, 0))), 'columns: wan'),
+        (invert_block, (np.ones((5, 2)), 1, np.zeros((0, 2)), np.zeros((2, 2))), 'columns: wan'),
     ],
 )
 def test_what_does_not_fit_is_refused(function, arguments, text):

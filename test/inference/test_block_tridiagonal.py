@@ -7,6 +7,7 @@ import pytest
 
 from hmt_ros.core import add_band_product
 from hmt_ros.inference.block_tridiagonal import (
+    BlockCholesky,
     BlockTridiagonal,
     NotPositiveDefiniteError,
 )
@@ -58,6 +59,22 @@ def test_everything_agrees_with_the_dense_matrix(n, times, coupling):
     blocks = inverse.reshape(times, n, times, n)
     for t in range(times):
         np.testing.assert_allclose(covariances[t], blocks[t, :, t], atol=1e-14)
+
+
+def test_the_last_block_may_come_first():
+    matrix, dense = example(3, 5, 'full')
+    backwards = BlockTridiagonal(matrix.diagonal[::-1], matrix.lower[::-1].swapaxes(1, 2))
+    columns = backwards.cholesky().columns
+    factor = BlockCholesky(columns, 5, 3, last_first=True)
+    inverse, x = np.linalg.inv(dense), np.random.default_rng(1).normal(size=(2, 5, 3))
+    np.testing.assert_allclose(factor.solve(x).reshape(2, -1), x.reshape(2, -1) @ inverse)
+    squares = np.square(factor.whiten(x)).sum((1, 2))
+    np.testing.assert_allclose(squares, np.einsum('sti,sti->s', x, matrix.product(x)))
+    np.testing.assert_allclose(factor.matrix().diagonal, matrix.diagonal)
+    np.testing.assert_allclose(factor.matrix().lower, matrix.lower)
+    blocks = inverse.reshape(5, 3, 5, 3)[range(5), :, range(5)]
+    np.testing.assert_allclose(factor.inverse_blocks(2), blocks[:2], atol=1e-14)
+    np.testing.assert_allclose(factor.inverse_blocks(), blocks, atol=1e-14)
 
 
 def test_the_band_is_as_narrow_as_the_coupling():

@@ -126,3 +126,17 @@ def test_shapes_that_do_not_fit_are_errors_and_empty_ones_are_not():
     assert linear_algebra.inverse(np.zeros((2, 0, 0))).shape == (2, 0, 0)
     assert linear_algebra.symmetric_eigen(np.zeros((2, 0, 0)))[1].shape == (2, 0, 0)
     assert linear_algebra.product(np.zeros((2, 0)), np.zeros((0, 3))).tolist() == [[0.0] * 3] * 2
+
+
+def test_distances_are_those_of_numpy():
+    rng = np.random.default_rng(0)
+    one, other = rng.normal(size=(5, 1, 7, 3)), rng.normal(size=(4, 7, 3))
+    wanted = np.linalg.norm(one - other, axis=-1).mean(-1)
+    np.testing.assert_allclose(linear_algebra.mean_distances(one, other), wanted, rtol=1e-14)
+    flat = other.reshape(4, -1)
+    wanted = np.linalg.norm(flat[:, None] - flat, axis=-1)
+    np.testing.assert_allclose(linear_algebra.distances(flat), wanted, rtol=1e-14)
+    assert (np.diagonal(linear_algebra.distances(flat)) == 0.0).all()
+    assert np.isnan(linear_algebra.distances(np.full((2, 3), np.nan))[0, 1])
+    with pytest.raises(ValueError, match='dimension'):
+        linear_algebra.mean_distances(one, other[:, :6])
