@@ -102,6 +102,7 @@ def chain_links(skeleton: Skeleton, name: str) -> ChainLinks:
     )
 
 
+@lru_cache(maxsize=64)
 def _signs(lower: float, upper: float, sine: bool) -> list[bool]:
     """Whether angles within the limits give the sine, or the cosine, a sign: first +, then -."""
     samples = np.linspace(lower, min(upper, lower + 2.0 * np.pi), 721)

@@ -139,19 +139,17 @@ class ImageLikelihood:
             share: of the energy that counts, beside the prior of the exchanges.
             lifted_share: the same of the energy of lifted poses.
         """
+        if exchanges is None and share == 1.0:
+            return usual_keypoints(self, observation, lifted_share)
         assert observation.keypoints is not None
-        settings = self.settings.keypoints
-        if exchanges is None:
-            exchanges = usual_exchanges()
-        if share != 1.0:
-            settings = replace(settings, weight=share * settings.weight)
+        s = self.settings.keypoints
         return KeypointTerm(
             self.body.skeleton,
             self.camera,
             observation.keypoints,
-            settings,
+            s if share == 1.0 else replace(s, weight=share * s.weight),
             observation.magnification,
-            exchanges,
+            usual_exchanges() if exchanges is None else exchanges,
             None if observation.beliefs is None else observation.beliefs.keypoints,
             lifted_share,
         )
@@ -253,6 +251,14 @@ class ObservedImage:
 
 
 # An image is compared with many sets of poses.
+@lru_cache(maxsize=4)
+def usual_keypoints(
+    likelihood: ImageLikelihood, observation: Observation, lifted_share: float
+) -> KeypointTerm:
+    """The term of keypoints whose exchanges are as usual, the same at each call."""
+    return likelihood.keypoint_term(observation, usual_exchanges(), 1.0, lifted_share)
+
+
 @lru_cache(maxsize=4)
 def observed(likelihood: ImageLikelihood, observation: Observation) -> ObservedImage:
     """The image terms of an observation, the same at each call."""

@@ -99,7 +99,7 @@ class Keypoints:
             if given is not None and given.shape != shape:
                 raise ValueError(f'{n} keypoints with {name} of shape {given.shape}')
 
-    @property
+    @cached_property
     def seen(self) -> NDArray[np.bool_]:
         """(n,) joints that have a position and are not to be ignored."""
         return np.asarray(np.isfinite(self.pixels).all(1) & (self.confidences > 0), dtype=np.bool_)
