@@ -57,29 +57,31 @@ struct FleshTable {
   }
 };
 
-// Rings side by side, n of them with some more to whole lanes; made once for many poses.
+// Rings of the parts that are wanted side by side, n of them with some more to whole lanes; made
+// once for many poses.
 class RingLanes {
  public:
   RingLanes(const FleshTable& flesh, const Mask& wanted)
       : flesh_(flesh),
-        count_(in_whole_lanes(flesh.rings())),
+        which_(rings_of(flesh, wanted)),
+        count_(in_whole_lanes(std::ssize(which_))),
         parts_(2 * count_),
         segments_(count_),
         extents_(flesh.parts()),
         rows_(rows, count_) {
-    expect_shape("wanted", wanted, {flesh.parts()});
+    const Index last = std::ssize(which_) - 1;
     for (Index i = 0; i < count_; ++i) {
-      const Index r = std::min(i, flesh.rings() - 1), part = flesh.ring_parts[r];
+      const Index r = which_[std::min(i, last)], part = flesh.ring_parts[r];
       const Ring ring = flesh.ring(r);
       const double values[] = {ring.centre[0], ring.centre[1], ring.centre[2], ring.radii[0],
                                ring.radii[1],  ring.slopes[0], ring.slopes[1], ring.leans[0],
                                ring.leans[1],  ring.noise[0],  ring.noise[1]};
       for (Index k = 0; k < std::ssize(values); ++k) rows_(k, i) = values[k];
-      rows_(traced_row, i) = i == r && wanted[part] ? 1.0 : 0.0;
+      rows_(traced_row, i) = i <= last ? 1.0 : 0.0;
       parts_[i] = parts_[count_ + i] = part;
       segments_[i] = flesh.part_segments[part];
-      if (i != r) continue;
-      if (ring.exponent != 1.0 || ring.slopes[0] != ring.slopes[1]) odd_.push_back(r);
+      if (i > last) continue;
+      if (ring.exponent != 1.0 || ring.slopes[0] != ring.slopes[1]) odd_.push_back(i);
       const double* middle = flesh.part_centres[part].data;
       double away[3];
       for (int k = 0; k < 3; ++k) away[k] = std::abs(ring.centre[k] - middle[k]);
@@ -87,8 +89,8 @@ class RingLanes {
       extents_[part] = most(extents_[part], std::sqrt(dot(away, away)));
     }
   }
-  const FleshTable& flesh() const { return flesh_; }
   Index count() const { return count_; }
+  Ring ring(Index i) const { return flesh_.ring(which_[i]); }
   // Part (2n,) of each point.
   const Index* parts() const { return parts_.view().data; }
   const Index* segments() const { return segments_.view().data; }
@@ -104,8 +106,18 @@ class RingLanes {
   const double* traced() const { return rows_[traced_row].data; }  // 1 or 0
 
  private:
+  static std::vector<Index> rings_of(const FleshTable& flesh, const Mask& wanted) {
+    expect_shape("wanted", wanted, {flesh.parts()});
+    std::vector<Index> result;
+    for (Index r = 0; r < flesh.rings(); ++r) {
+      if (wanted[flesh.ring_parts[r]]) result.push_back(r);
+    }
+    return result;
+  }
+
   static constexpr Index traced_row = 11, rows = 12;
   const FleshTable& flesh_;
+  const std::vector<Index> which_;
   const Index count_;
   Scratch<Index, 1> parts_, segments_;
   Scratch<double, 1> extents_;
@@ -286,7 +298,7 @@ inline void find_angles(const RingLanes& rings, const RingFrames& frames, const 
   for (const Index r : rings.odd()) {
     const Turned b = turned_ring(rings, frames, r);
     double cosines[2] = {1.0, 1.0}, sines[2] = {0.0, 0.0};
-    const bool found = contour_angles(rings.flesh().ring(r), b.x, b.y, b.depth, cosines, sines);
+    const bool found = contour_angles(rings.ring(r), b.x, b.y, b.depth, cosines, sines);
     for (int side = 0; side < 2; ++side) {
       const Index i = r + side * n;
       contour.cosine[i] = cosines[side];
@@ -322,7 +334,7 @@ inline void place_on_rings(const RingLanes& rings, const RingFrames& frames,
       }
     }
     for (const Index r : rings.odd()) {
-      const Ring ring = rings.flesh().ring(r);
+      const Ring ring = rings.ring(r);
       if (ring.exponent == 1.0) continue;
       double axes[9], origin[3], point[3], normal[3];
       for (int k = 0; k < 9; ++k) axes[k] = frames.rows(k, r);
@@ -526,7 +538,10 @@ inline void fill_contour(const FleshTable& flesh, const Mask& wanted, const Lens
   flesh.check_frames(columns, origins);
   const Index rings = flesh.rings();
   expect_shape("contour.parts", result.parts, {2 * rings});
-  const RingLanes side_by_side(flesh, wanted);
+  expect_shape("wanted", wanted, {flesh.parts()});
+  const Scratch<bool, 1> all(flesh.parts());
+  all.fill(true);
+  const RingLanes side_by_side(flesh, all.view());
   const RingFrames frames(side_by_side);
   const ContourRoom room(side_by_side);
   const Contour contour = room.contour();
@@ -541,7 +556,7 @@ inline void fill_contour(const FleshTable& flesh, const Mask& wanted, const Lens
     for (int k = 0; k < 6; ++k) result.projections[m].data[k] = contour.by[k][i];
     result.normals(m, 0) = contour.nu[i];
     result.normals(m, 1) = contour.nv[i];
-    result.valid[m] = contour.valid[i] > 0.0;
+    result.valid[m] = contour.valid[i] > 0.0 && wanted[contour.parts[i]];
     result.noise[m] = contour.noise[i];
   }
 }
