@@ -33,6 +33,7 @@
 #include "tracking/optima.h"
 #include "vision/colours.h"
 #include "vision/edge_distances.h"
+#include "vision/line_directions.h"
 #include "vision/outline.h"
 
 PYBIND11_MODULE(_compiled, m) {
@@ -77,6 +78,8 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "keypoint_errors", keypoint_errors, "inputs columns origins errors");
   bind(m, "record_keypoints", record_keypoints, "inputs joints columns origins residuals");
   bind(m, "edge_distances", edge_distances, "edges dx dy near others hidden distances");
+  bind(m, "rate_lines", rate_lines, "directions normals middles deviations result");
+  bind(m, "rate_frames", rate_frames, "densities vertical first second share result");
   bind(m, "gradient_lengths", gradient_lengths, "dx dy longest lengths");
   bind(m, "sample_outline", sample_outline,
        "pixels ends mask unsure others count left top places normals beliefs");
