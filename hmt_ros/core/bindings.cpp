@@ -1,6 +1,7 @@
 // What Python calls, and the names of its arguments; each function is described where it is.
 #include "array_functions.h"
 #include "block_tridiagonal.h"
+#include "camera.h"
 #include "experts/bones.h"
 #include "experts/window_inputs.h"
 #include "flesh.h"
@@ -48,6 +49,8 @@ PYBIND11_MODULE(_compiled, m) {
   // body
   bind(m, "place_poses", place_poses, "tree poses columns origins axes dof_origins");
   bind(m, "place_points", place_points, "tree poses segments local relative points");
+  bind(m, "find_pixels", find_pixels, "lens points pixels");
+  bind(m, "find_rays", find_rays, "lens pixels rays");
   bind(m, "derive_along", derive_along,
        "moves is_rotation axes dof_origins segments points directions result");
   bind(m, "lift_origins", lift_origins, "parents basis columns result");
