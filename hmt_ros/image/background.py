@@ -240,7 +240,7 @@ class BackgroundModel:
             return self._last[1]
         small = self._smaller(image)
         raw = self._model.labels(small)
-        raw[(raw == FOREGROUND) & self._is_beside(small)] = 0
+        raw[(raw & self._beside(small)) == FOREGROUND] = 0
         if parts is not None:
             raw[self._any_of(parts.unknown)] = 0
         self.changed = cv2.countNonZero(raw) / raw.size
@@ -248,8 +248,8 @@ class BackgroundModel:
             self._last = (image, raw)
         return raw
 
-    def _is_beside(self, image: Image) -> Mask:
-        """Pixels (h, w) whose colour the background has beside them: its edges, slightly moved."""
+    def _beside(self, image: Image) -> Image:
+        """255 (h, w) where the background has the colour beside: its edges, slightly moved."""
         if self._nearby is None:
             empty = self.empty
             square = np.ones((3, 3), np.uint8)
@@ -260,7 +260,7 @@ class BackgroundModel:
                 np.asarray(cv2.add(brightest, margin), dtype=np.uint8),
             )
         lowest, highest = self._nearby
-        return np.asarray(cv2.inRange(image, lowest, highest) > 0)
+        return np.asarray(cv2.inRange(image, lowest, highest), dtype=np.uint8)
 
     @property
     def _factor(self) -> int:
