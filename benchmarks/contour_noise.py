@@ -30,7 +30,7 @@ from hmt_ros.core import mark_visibility, trace_contour
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, ObservedImage
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.pose_energy import PoseEnergy
-from hmt_ros.image.surface import empty_contour, flesh_table_of, lens_of
+from hmt_ros.image.surface import empty_contour, flesh_table_of
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
@@ -192,7 +192,7 @@ def contour_distances(body: Body, camera: Camera, poses: Array, masks: Sequence[
     found = []
     for n, mask in enumerate(masks):
         contour = empty_contour(count)
-        trace_contour(flesh, every, lens_of(camera), columns[n], origins[n], contour)
+        trace_contour(flesh, every, camera.lens, columns[n], origins[n], contour)
         mark_visibility(
             flesh,
             every,

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmt_ros.core import elementary
+from hmt_ros.core import elementary, find_pixels, find_rays
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product
 
@@ -36,8 +37,6 @@ NEAREST_PERSON, FARTHEST_PERSON, USUAL_LENS = 0.4, 15.0, np.radians(60.0)
 NEAR = 0.01  # least depth of a point that has an image, m
 # Least part of the vertical across the optical axis by which a camera has a roll.
 STEEP = 0.1
-STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
-CLOSE = 1e-14  # error of a ray at which the inversion ends, of the tangent
 # Tangents at which a distortion is checked, and the largest factor by which a lens magnifies more
 # farther out: calibrations of real lenses reach 2.5, at the corners of wide images.
 _TURNS = 0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2
@@ -46,6 +45,22 @@ LARGEST_RISE = 4.0
 # Part of the way from the principal point to a corner on which a distortion must not fold. The ends
 # of the longer side lie there; polynomials of real calibrations may fold farther out.
 LEAST_UNFOLDED = 0.8
+
+# Models of distortion in compiled code.
+LENSES = {'plumb_bob': 0, 'rational_polynomial': 0, 'equidistant': 1}
+
+
+class Lens(NamedTuple):
+    """A camera as compiled code reads it: fx fy cx cy, model (-1: no distortion), coefficients.
+
+    `near` is the least depth of a point that has a pixel, m.
+    """
+
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    model: int
+    coefficients: tuple[float, ...]
+    near: float = NEAR
 
 
 @dataclass(frozen=True)
@@ -129,6 +144,14 @@ class Camera:
             height=height,
         )
 
+    @cached_property
+    def lens(self) -> Lens:
+        """The camera as compiled code reads it."""
+        coefficients = (*map(float, self.distortion), *(0.0,) * 8)[:8]
+        model = LENSES[self.distortion_model] if self.distortion else -1
+        focal, centre = (float(self.fx), float(self.fy)), (float(self.cx), float(self.cy))
+        return Lens(focal, centre, model, coefficients)
+
     @property
     def matrix(self) -> Array:
         """Intrinsic matrix K (3, 3)."""
@@ -139,9 +162,10 @@ class Camera:
 
         A point on or behind the plane z = 0.01 m has no image: its pixel is NaN.
         """
-        p = np.asarray(points, dtype=np.float64)
-        pixels, _ = self.project_with_derivative(np.moveaxis(p, -1, 0), derivative=False)
-        return np.moveaxis(pixels, 0, -1)
+        p = np.ascontiguousarray(points, dtype=np.float64)
+        result = np.empty((*p.shape[:-1], 2))
+        find_pixels(self.lens, p.reshape(-1, 3), result.reshape(-1, 2))
+        return result
 
     def project_with_derivative(
         self, points: Array, *, derivative: bool = True
@@ -176,28 +200,9 @@ class Camera:
         Newton's method inverts the distortion. Where the model has no ray through a pixel, the
         result is the ray after the last iteration.
         """
-        uv = np.asarray(pixels, dtype=np.float64)
-        target = np.stack([(uv[..., 0] - self.cx) / self.fx, (uv[..., 1] - self.cy) / self.fy])
-        ab = target.copy()
-        if self.distortion:
-            for _ in range(20):
-                value, inner = self.distort(ab[0], ab[1])
-                error = value - target
-                error[:, np.abs(error).max(0) < CLOSE] = 0.0
-                if not error.any():
-                    break
-                det = inner[0][0] * inner[1][1] - inner[0][1] * inner[1][0]
-                det = np.where(np.abs(det) > 1e-9, det, 1.0)
-                step = np.stack(
-                    [
-                        (inner[1][1] * error[0] - inner[0][1] * error[1]) / det,
-                        (inner[0][0] * error[1] - inner[1][0] * error[0]) / det,
-                    ]
-                )
-                # Where the model has no such ray, iterations must not run away.
-                ab = np.clip(ab - step, -STEEPEST, STEEPEST)
-        rays = np.stack([ab[0], ab[1], np.ones_like(ab[0])], axis=-1)
-        result: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        uv = np.ascontiguousarray(pixels, dtype=np.float64)
+        result = np.empty((*uv.shape[:-1], 3))
+        find_rays(self.lens, uv.reshape(-1, 2), result.reshape(-1, 3))
         return result
 
     def distort(self, a: Array, b: Array) -> tuple[Array, tuple[tuple[Array, Array], ...]]:

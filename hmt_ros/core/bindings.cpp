@@ -1,6 +1,7 @@
 // What Python calls, and the names of its arguments; each function is described where it is.
 #include "array_functions.h"
 #include "block_tridiagonal.h"
+#include "camera.h"
 #include "experts/bones.h"
 #include "experts/window_inputs.h"
 #include "flesh.h"
@@ -34,6 +35,7 @@
 #include "tracking/optima.h"
 #include "vision/colours.h"
 #include "vision/edge_distances.h"
+#include "vision/line_directions.h"
 #include "vision/outline.h"
 
 PYBIND11_MODULE(_compiled, m) {
@@ -48,6 +50,8 @@ PYBIND11_MODULE(_compiled, m) {
   // body
   bind(m, "place_poses", place_poses, "tree poses columns origins axes dof_origins");
   bind(m, "place_points", place_points, "tree poses segments local relative points");
+  bind(m, "find_pixels", find_pixels, "lens points pixels");
+  bind(m, "find_rays", find_rays, "lens pixels rays");
   bind(m, "derive_along", derive_along,
        "moves is_rotation axes dof_origins segments points directions result");
   bind(m, "lift_origins", lift_origins, "parents basis columns result");
@@ -78,6 +82,8 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "keypoint_errors", keypoint_errors, "inputs columns origins errors");
   bind(m, "record_keypoints", record_keypoints, "inputs joints columns origins residuals");
   bind(m, "edge_distances", edge_distances, "edges dx dy near others hidden distances");
+  bind(m, "rate_lines", rate_lines, "directions normals middles deviations result");
+  bind(m, "rate_frames", rate_frames, "densities vertical first second share result");
   bind(m, "gradient_lengths", gradient_lengths, "dx dy longest lengths");
   bind(m, "sample_outline", sample_outline,
        "pixels ends mask unsure others count left top places normals beliefs");

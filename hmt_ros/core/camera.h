@@ -53,6 +53,12 @@ inline constexpr auto bent_by_angle = [](const auto& k, double a, double b) {
               a * b * slope, a * b * slope, scale + b * b * slope};
 };
 
+inline Bent bent_by(const Lens& lens, double a, double b) {
+  return lens.model < 0    ? unbent(lens.coefficients, a, b)
+         : lens.model == 0 ? bent_by_polynomials(lens.coefficients, a, b)
+                           : bent_by_angle(lens.coefficients, a, b);
+}
+
 // Sets the pixel (2,) and its derivative (2, 3) by the point (a z, b z, z) whose ray is bent.
 inline void set_pixel(const Lens& lens, const Bent& bent, double a, double b, double z,
                       double* pixel, double* projection) {
@@ -72,11 +78,48 @@ inline bool project(const Lens& lens, double x, double y, double z, double* pixe
                     double* projection) {
   if (!(z > lens.near)) return false;
   const double a = x / z, b = y / z;
-  const Bent bent = lens.model < 0    ? unbent(lens.coefficients, a, b)
-                    : lens.model == 0 ? bent_by_polynomials(lens.coefficients, a, b)
-                                      : bent_by_angle(lens.coefficients, a, b);
-  set_pixel(lens, bent, a, b, z, pixel, projection);
+  set_pixel(lens, bent_by(lens, a, b), a, b, z, pixel, projection);
   return true;
+}
+
+// Pixels (N, 2) of points (N, 3); no numbers behind the camera.
+inline void find_pixels(const Lens& lens, const Table& points, const Matrix& pixels) {
+  expect_shape("points", points, {pixels.size(), 3});
+  expect_shape("pixels", pixels, {-1, 2});
+  double projection[6];
+  for (Index i = 0; i < points.size(); ++i) {
+    const double* p = points[i].data;
+    if (!project(lens, p[0], p[1], p[2], pixels[i].data, projection)) pixels[i].fill(nan);
+  }
+}
+
+// Error of a ray at which the inversion of a distortion ends, and its largest tangent.
+inline constexpr double close_ray = 1e-14, steepest_ray = 1e3;
+
+// Unit rays (N, 3) through pixels (N, 2). Newton's method inverts the distortion; where the lens
+// sends no ray to a pixel, the result is the one after the last iteration.
+inline void find_rays(const Lens& lens, const Table& pixels, const Matrix& rays) {
+  expect_shape("pixels", pixels, {rays.size(), 2});
+  expect_shape("rays", rays, {-1, 3});
+  for (Index i = 0; i < rays.size(); ++i) {
+    const double u = (pixels(i, 0) - lens.centre[0]) / lens.focal[0];
+    const double v = (pixels(i, 1) - lens.centre[1]) / lens.focal[1];
+    double a = u, b = v;
+    for (int k = 0; k < 20 && lens.model >= 0; ++k) {
+      const Bent bent = bent_by(lens, a, b);
+      const double x = bent.u - u, y = bent.v - v;
+      if (std::abs(x) < close_ray && std::abs(y) < close_ray) break;
+      double det = bent.da * bent.eb - bent.db * bent.ea;
+      if (!(std::abs(det) > 1e-9)) det = 1.0;
+      // Where there is no such ray, iterations must not run away.
+      a = between(a - (bent.eb * x - bent.db * y) / det, -steepest_ray, steepest_ray);
+      b = between(b - (bent.da * y - bent.ea * x) / det, -steepest_ray, steepest_ray);
+    }
+    const double length = std::sqrt(a * a + b * b + 1.0);
+    rays(i, 0) = a / length;
+    rays(i, 1) = b / length;
+    rays(i, 2) = 1.0 / length;
+  }
 }
 
 }  // namespace hmt

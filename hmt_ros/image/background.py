@@ -54,6 +54,8 @@ BESIDE = 8
 # levels.
 AGREEING = 10
 AGREEMENT = 20.0
+# Pixels around those of a mask that what is done with it may reach.
+AROUND = 2
 
 
 @dataclass(frozen=True)
@@ -212,19 +214,18 @@ class BackgroundModel:
         raw = self._subtracted(image)
         if others is not None:
             raw = np.where(self._any_of(others), 0, raw).astype(np.uint8)
-        region = self._smaller_box(region)
-        mask, square = raw == FOREGROUND, np.ones((3, 3), np.uint8)
-        part, unsure = mask[_part(region)], np.zeros(mask.shape, dtype=np.bool_)
+        inside = _around(raw, self._smaller_box(region))
+        part, square = raw[inside], np.ones((3, 3), np.uint8)
+        masks = np.zeros((2, *raw.shape), np.bool_)
         if part.size:
-            pixels = np.ascontiguousarray(part).view(np.uint8)
+            person, unsure = ((part == x).view(np.uint8) for x in (FOREGROUND, SHADOW))
             if self._factor == 1:
-                opened = cv2.morphologyEx(pixels, cv2.MORPH_OPEN, square)
-                pixels = np.asarray(opened, dtype=np.uint8)
-            part[:] = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, square) > 0
-            pixels = np.ascontiguousarray(raw[_part(region)] == SHADOW).view(np.uint8)
-            unsure[_part(region)] = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, square) > 0
-        found = self._larger(one_person(mask, self.settings, region))
-        return Silhouette(found, self._larger(unsure) > found)
+                person = np.asarray(cv2.morphologyEx(person, cv2.MORPH_OPEN, square), np.uint8)
+            for mask, pixels in zip(masks, (person, unsure), strict=True):
+                mask[inside] = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, square) > 0
+            masks[0][inside] = one_person(masks[0][inside], self.settings)
+        found, unsure = map(self._larger, masks)
+        return Silhouette(found, unsure > found)
 
     def _subtracted(self, image: Image) -> Image:
         """`FOREGROUND`, `SHADOW` or 0 (h, w), of an image made smaller."""
@@ -239,7 +240,7 @@ class BackgroundModel:
             return self._last[1]
         small = self._smaller(image)
         raw = self._model.labels(small)
-        raw[(raw == FOREGROUND) & self._is_beside(small)] = 0
+        raw[(raw & self._beside(small)) == FOREGROUND] = 0
         if parts is not None:
             raw[self._any_of(parts.unknown)] = 0
         self.changed = cv2.countNonZero(raw) / raw.size
@@ -247,8 +248,8 @@ class BackgroundModel:
             self._last = (image, raw)
         return raw
 
-    def _is_beside(self, image: Image) -> Mask:
-        """Pixels (h, w) whose colour the background has beside them: its edges, slightly moved."""
+    def _beside(self, image: Image) -> Image:
+        """255 (h, w) where the background has the colour beside: its edges, slightly moved."""
         if self._nearby is None:
             empty = self.empty
             square = np.ones((3, 3), np.uint8)
@@ -259,7 +260,7 @@ class BackgroundModel:
                 np.asarray(cv2.add(brightest, margin), dtype=np.uint8),
             )
         lowest, highest = self._nearby
-        return np.asarray(cv2.inRange(image, lowest, highest) > 0)
+        return np.asarray(cv2.inRange(image, lowest, highest), dtype=np.uint8)
 
     @property
     def _factor(self) -> int:
@@ -281,8 +282,19 @@ class BackgroundModel:
         """A mask (h, w) in the size of images (H, W), its outline between the pixels smooth."""
         if self._factor == 1:
             return mask
-        pixels = cv2.resize(255 * mask.view(np.uint8), self._shape[1::-1])
-        return cv2.threshold(pixels, 127, 1, cv2.THRESH_BINARY)[1].view(np.bool_)
+        factor, result = self._factor, np.zeros(self._shape[:2], np.uint8)
+        part, larger = mask, result
+        if tuple(factor * x for x in mask.shape) == result.shape:
+            rows, columns = inside = _around(mask)
+            part = mask[inside]
+            larger = result[
+                factor * rows.start : factor * rows.stop,
+                factor * columns.start : factor * columns.stop,
+            ]
+        if part.size:
+            pixels = cv2.resize(255 * part.view(np.uint8), larger.shape[::-1])
+            cv2.threshold(pixels, 127, 1, cv2.THRESH_BINARY, larger)
+        return result.view(np.bool_)
 
     def _smaller_box(self, box: Box | None) -> Box | None:
         """A region in the pixels of images made smaller, rounded outwards."""
@@ -345,38 +357,55 @@ class _Parts:
 def one_person(mask: Mask, settings: BackgroundSettings, region: Box | None = None) -> Mask:
     """The largest piece of a mask (H, W) and those large and near enough to belong to it."""
     result = np.zeros(mask.shape, dtype=np.bool_)
-    part, found = mask[_part(region)], result[_part(region)]
-    if part.size == 0:
-        return result
-    pixels = np.ascontiguousarray(part).view(np.uint8)
-    x, y, width, height = cv2.boundingRect(pixels)
-    if width == 0:
-        return result
-    # Most of an image is empty.
-    inside = slice(y, y + height), slice(x, x + width)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(pixels[inside], connectivity=8)
-    area = stats[1:, cv2.CC_STAT_AREA]
-    main = 1 + int(np.argmax(area))
-    keep = np.zeros(count, dtype=bool)
-    keep[main] = True
-    left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
-    right = left + stats[:, cv2.CC_STAT_WIDTH]
-    bottom = top + stats[:, cv2.CC_STAT_HEIGHT]
-    gap = settings.largest_gap * stats[main, cv2.CC_STAT_HEIGHT]
-    apart_x = np.maximum(left - right[main], left[main] - right)
-    apart_y = np.maximum(top - bottom[main], top[main] - bottom)
-    near = np.maximum(apart_x, apart_y) < gap
-    large = stats[:, cv2.CC_STAT_AREA] >= settings.smallest_part * area.max()
-    keep |= near & large
-    keep[0] = False
-    found[inside] = keep[labels]
+    inside = _around(mask, region)
+    part = mask[inside]
+    if part.size:
+        labels, stats = pieces_of(part)
+        result[inside] = of_one_person(stats, settings).take(labels)
     return result
 
 
-def _part(region: Box | None) -> tuple[slice, slice]:
-    """Rows and columns of a region; None: all."""
-    left, top, right, bottom = region or (0, 0, None, None)
-    return slice(top, bottom), slice(left, right)
+def pieces_of(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Labels (H, W) of the connected pieces of a mask, and their statistics (N, 5) by OpenCV."""
+    pixels = np.ascontiguousarray(mask).view(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
+        pixels, 8, cv2.CV_32S, cv2.CCL_BBDT
+    )
+    return np.asarray(labels, np.int32), np.asarray(stats, np.int32)
+
+
+def of_one_person(stats: NDArray[np.int32], settings: BackgroundSettings) -> Mask:
+    """Which pieces of a mask belong to its largest one; the first is what lies around them.
+
+    Args:
+        stats: (N, 5) of them, as OpenCV has them.
+        settings: how large and near they have to be.
+    """
+    area = stats[:, cv2.CC_STAT_AREA]
+    main = 1 + int(np.argmax(area[1:]))
+    near_corners = stats[:, :2]
+    far_corners = near_corners + stats[:, 2:4]
+    gap = settings.largest_gap * stats[main, cv2.CC_STAT_HEIGHT]
+    apart = np.maximum(near_corners - far_corners[main], near_corners[main] - far_corners).max(1)
+    keep = (apart < gap) & (area >= settings.smallest_part * area[main])
+    keep[main], keep[0] = True, False
+    return np.asarray(keep)
+
+
+def _around(pixels: NDArray[np.bool_ | np.uint8], region: Box | None = None) -> tuple[slice, slice]:
+    """Rows and columns of a region (None: all) with its pixels that are not 0, and a margin.
+
+    Most of an image is empty, and there are none if all of it is.
+    """
+    left, top, right, bottom = region or (0, 0, pixels.shape[1], pixels.shape[0])
+    part = pixels[top:bottom, left:right].view(np.uint8)
+    x, y, width, height = cv2.boundingRect(part) if part.size else (0, 0, 0, 0)
+    if width == 0:
+        return slice(0, 0), slice(0, 0)
+    return (
+        slice(top + max(y - AROUND, 0), min(top + y + height + AROUND, bottom)),
+        slice(left + max(x - AROUND, 0), min(left + x + width + AROUND, right)),
+    )
 
 
 WIDTH, REACH = 320, 24

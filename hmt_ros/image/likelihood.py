@@ -30,7 +30,7 @@ from hmt_ros.body.self_intersection import SelfIntersection
 from hmt_ros.core import record_residuals
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.surface import flesh_table_of, lens_of
+from hmt_ros.image.surface import flesh_table_of
 from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
 from hmt_ros.image.terms.registry import TERMS, Model
@@ -194,7 +194,7 @@ class ImageLikelihood:
         return Model(
             tree_of(body.skeleton),
             flesh,
-            lens_of(self.camera),
+            self.camera.lens,
             _selected(self.parts, count),
             _selected(self.occluders, count),
             0 if self.parts is None else 2 * len(flesh.ring_parts),

@@ -38,7 +38,8 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     with without_ipp():
         flow = method.calc(grey[0], grey[1], None)
-    channels = np.ascontiguousarray(flow.transpose(2, 0, 1))
+    channels = np.empty((2, *grey[0].shape), np.float32)
+    cv2.split(flow, list(channels))
     if window.others is not None:
         channels[:, window.others > 0] = np.nan
     return window.as_map(channels)

@@ -171,7 +171,7 @@ class Colours:
         if unseen:
             ratio[self._scene < 1.0 / bins.size] = unseen
         size = (max(self.size[0], 1), max(self.size[1], 1))
-        means = cv2.boxFilter(ratio[bins], cv2.CV_32F, size, borderType=cv2.BORDER_CONSTANT)
+        means = cv2.boxFilter(ratio.take(bins), cv2.CV_32F, size, borderType=cv2.BORDER_CONSTANT)
         return np.asarray(means, dtype=np.float32)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import point_positions
-from hmt_ros.image.background import BackgroundSettings, one_person
+from hmt_ros.image.background import BackgroundSettings, of_one_person, pieces_of
 from hmt_ros.image.surface_points import coarse_mesh
 from hmt_ros.inference.arrays import Array, Mask
 
@@ -61,10 +61,11 @@ def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
     if across == 0:
         return None
     # Most of an image is empty.
-    inside = np.ascontiguousarray(foreground[y : y + down, x : x + across])
-    _, _, stats, _ = cv2.connectedComponentsWithStats(inside.view(np.uint8), connectivity=8)
-    whole = one_person(inside, BackgroundSettings())
-    boxes = [*stats[1:].tolist(), [*cv2.boundingRect(whole.view(np.uint8)), counted(whole)]]
+    _, stats = pieces_of(foreground[y : y + down, x : x + across])
+    parts = stats[of_one_person(stats, BackgroundSettings())]
+    corner = parts[:, :2].min(0)
+    size = (parts[:, :2] + parts[:, 2:4]).max(0) - corner
+    boxes = [*stats[1:].tolist(), [*corner.tolist(), *size.tolist(), int(parts[:, 4].sum())]]
     alike = [
         Piece(float(step**2 * area), x + left == 0 or x + left + width == foreground.shape[1])
         for left, _, width, height, area in boxes

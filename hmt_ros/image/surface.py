@@ -15,26 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import NEAR, Camera
 from hmt_ros.inference.arrays import Array, Mask
 from msg_tools.files.plain_yaml import load_plain_yaml
 
 Ints = NDArray[np.int64]
-
-LENSES = {'plumb_bob': 0, 'rational_polynomial': 0, 'equidistant': 1}
-
-
-class Lens(NamedTuple):
-    """A camera as compiled code reads it: fx fy cx cy, model (-1: no distortion), coefficients.
-
-    `near` is the least depth of a point that has a pixel, m.
-    """
-
-    focal: tuple[float, float]
-    centre: tuple[float, float]
-    model: int
-    coefficients: tuple[float, float, float, float, float, float, float, float]
-    near: float = NEAR
 
 
 class FleshTable(NamedTuple):
@@ -80,19 +64,6 @@ class Contour(NamedTuple):
     covered: Mask
     hidden: Mask
     noise: Array
-
-
-@lru_cache(maxsize=16)
-def lens_of(camera: Camera) -> Lens:
-    """The compiled code's view of a camera."""
-    k1, k2, k3, k4, k5, k6, k7, k8, *_ = (*map(float, camera.distortion), *(0.0,) * 8)
-    model = LENSES[camera.distortion_model] if camera.distortion else -1
-    return Lens(
-        (float(camera.fx), float(camera.fy)),
-        (float(camera.cx), float(camera.cy)),
-        model,
-        (k1, k2, k3, k4, k5, k6, k7, k8),
-    )
 
 
 @lru_cache(maxsize=16)

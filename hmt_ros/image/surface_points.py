@@ -12,7 +12,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.core import see_points
-from hmt_ros.image.surface import flesh_table_of, lens_of
+from hmt_ros.image.surface import flesh_table_of
 from hmt_ros.inference.arrays import Array, Mask
 
 Ints = NDArray[np.int64]
@@ -60,7 +60,7 @@ def seen_points(
     see_points(
         flesh_table_of(body),
         (mesh.vertices, mesh.normals, mesh.segments, mesh.parts),
-        (lens_of(camera), (camera.width, camera.height), hidden),
+        (camera.lens, (camera.width, camera.height), hidden),
         *frames.by_pose(),
         *result,
     )

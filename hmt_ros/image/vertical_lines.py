@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from hmt_ros.body.camera import Camera
-from hmt_ros.core import elementary
+from hmt_ros.core import elementary, rate_frames, rate_lines
 from hmt_ros.inference.arrays import Array, Image, Index
 from hmt_ros.inference.linear_algebra import inverse, length, log_sum_exp, product, solve
 from hmt_ros.inference.logistic import probability_of
@@ -148,10 +148,9 @@ def vertical_of(lines: Lines) -> Vertical | None:
     """The vertical of lines; None: they are clutter, or fit several."""
     raster = _raster()
     ratios = _ratios(raster.directions, lines, COARSE)
-    vertical = SHARE / 3.0 * ratios[raster.vertical] + (1.0 - SHARE)
-    levels = [ratios[a] + ratios[b] for a, b in zip(raster.first.T, raster.second.T, strict=True)]
-    value = np.array([elementary.log(vertical + SHARE / 3.0 * level).sum(1) for level in levels])
-    posterior = log_sum_exp(value, axis=0) - elementary.log(len(value)) + raster.log_prior
+    value = np.empty(raster.first.shape)
+    rate_frames(ratios, raster.vertical, raster.first, raster.second, SHARE, value)
+    posterior = log_sum_exp(value) - elementary.log(len(raster.first[0])) + raster.log_prior
     evidence = float(log_sum_exp(posterior))
     found = _refined(raster.ups[posterior.argmax()], lines)
     near = product(raster.ups, found.up) > elementary.cos(SURROUNDINGS)
@@ -182,14 +181,9 @@ def _refined(start: Array, lines: Lines) -> Vertical:
 
 def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
     """Densities (D, N) of the angles of lines if they ran along directions (D, 3), over uniform."""
-    across = np.sqrt(np.maximum(1.0 - product(directions, lines.middles.T) ** 2, 1e-4))
-    angle = elementary.arcsin(
-        np.minimum(np.abs(product(directions, lines.normals.T)) / across, 1.0)
-    )
-    deviation = np.sqrt(sigma**2 + lines.errors**2)
-    result: Array = (
-        np.sqrt(np.pi / 2.0) / deviation * elementary.exp(-0.5 * (angle / deviation) ** 2)
-    )
+    deviations = np.sqrt(sigma**2 + lines.errors**2)
+    result = np.empty((len(directions), len(deviations)))
+    rate_lines(directions, lines.normals, lines.middles, deviations, result)
     return result
 
 

@@ -10,7 +10,7 @@ import pytest
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.core import mark_visibility, see_points, trace_contour
-from hmt_ros.image.surface import empty_contour, flesh_table_of, lens_of
+from hmt_ros.image.surface import empty_contour, flesh_table_of
 from hmt_ros.image.surface_points import SurfacePoints, coarse_mesh, seen_points
 from test.oracles.numpy_contour import occluding_contour
 
@@ -34,7 +34,7 @@ def as_arguments(body, frames):
     columns, origins = (array[0] for array in frames.by_pose())
     flesh = flesh_table_of(body)
     wanted = np.ones(len(flesh.part_segments), np.bool_)
-    return [flesh, wanted, lens_of(CAMERA), columns, origins, empty_contour(len(flesh.ring_parts))]
+    return [flesh, wanted, CAMERA.lens, columns, origins, empty_contour(len(flesh.ring_parts))]
 
 
 def visibility_arguments(body, frames):
@@ -46,7 +46,7 @@ def visibility_arguments(body, frames):
 def point_arguments(body, frames):
     mesh, flesh = coarse_mesh(body), flesh_table_of(body)
     vertices = (mesh.vertices, mesh.normals, mesh.segments, mesh.parts)
-    scene = (lens_of(CAMERA), (640, 480), np.zeros((0, 0), np.bool_))
+    scene = (CAMERA.lens, (640, 480), np.zeros((0, 0), np.bool_))
     n = frames.count
     result = np.zeros(n, np.int64), np.zeros((n, 5), np.int64), np.zeros((n, 5, 3))
     return [flesh, vertices, scene, *frames.by_pose(), *result, np.zeros((n, 5, 2))]
@@ -151,7 +151,7 @@ def test_a_body_without_flesh():
     columns, origins = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))
     none = np.zeros(0, np.bool_)
     contour = empty_contour(0)
-    trace_contour(tuple(flesh), none, lens_of(CAMERA), columns, origins, contour)
+    trace_contour(tuple(flesh), none, CAMERA.lens, columns, origins, contour)
     assert len(contour.points) == 0
 
 

@@ -9,7 +9,7 @@ from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.core import RECORDED, record_residuals
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import flesh_table_of, lens_of
+from hmt_ros.image.surface import flesh_table_of
 from hmt_ros.image.terms.depth import DepthInputs
 from hmt_ros.image.terms.edges import ORIENTATIONS, EdgeInputs
 from hmt_ros.image.terms.image_term import Weighting
@@ -26,7 +26,7 @@ def model():
     body = load_body('human32')
     flesh = flesh_table_of(body)
     every = np.ones(len(flesh.part_segments), np.bool_)
-    return Model(tree_of(body.skeleton), flesh, lens_of(CAMERA), every, every, 0)
+    return Model(tree_of(body.skeleton), flesh, CAMERA.lens, every, every, 0)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
+from hmt_ros.body.camera import Camera, Lens
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.skeleton import Skeleton, other_side
 from hmt_ros.core import elementary, exchange_posteriors, keypoint_errors, record_keypoints
@@ -30,7 +30,6 @@ from hmt_ros.image.keypoint_schemes import (
     scheme_of,
 )
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, middle_of_hips
-from hmt_ros.image.surface import Lens, lens_of
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.residuals import RECORDED, Tree, tree_of
 from hmt_ros.inference.arrays import Array, Index
@@ -300,7 +299,7 @@ class KeypointTerm:
             self.measured.points,
             lifted._replace(weight=self.lifted_share * lifted.weight),
             tree_of(self.skeleton),
-            lens_of(self.camera),
+            self.camera.lens,
             float(self.settings.scale),
             self.weights,
             EXCHANGED[: exchanges.shape[1]],

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from hmt_ros.image.surface import FleshTable, Lens
+from hmt_ros.body.camera import Lens
+from hmt_ros.image.surface import FleshTable
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.edges import EDGES
 from hmt_ros.image.terms.image_term import ImageTerm
