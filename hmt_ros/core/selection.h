@@ -90,7 +90,7 @@ inline void fill_distances(const Tables& joints, float same, float cap,
   const Index n = joints.size(), count = joints.size(1);
   const JointPlaces places(joints);
   const Scratch<float, 2> gaps(places.distinct.size(), strip), others(3, strip);
-  const Scratch<float, 1> found(strip);
+  const Scratch<float, 2> tile(strip, strip);
   const Scratch<const float*, 1> rows(count);
   for (Index first = 0; first < n; first += strip) {
     const Index last = std::min(first + strip, n);
@@ -105,10 +105,16 @@ inline void fill_distances(const Tables& joints, float same, float cap,
         fill_gaps(places.distinct[place], others[0].data, cap, gaps[place].data);
       }
     }
-    for (Index a = 0; a < last; ++a) {
-      for (Index k = 0; k < count; ++k) rows[k] = gaps[places.numbers(a, k)].data;
-      add_gaps(rows.view().data, count, same, found.view().data);
-      for (Index b = first; b < last; ++b) distances(a, b) = distances(b, a) = found[b - first];
+    for (Index start = 0; start <= first; start += strip) {
+      const Index end = std::min(start + strip, n);
+      for (Index a = start; a < end; ++a) {
+        for (Index k = 0; k < count; ++k) rows[k] = gaps[places.numbers(a, k)].data;
+        add_gaps(rows.view().data, count, same, tile[a - start].data);
+        std::copy_n(tile[a - start].data, last - first, distances[a].data + first);
+      }
+      for (Index b = first; b < last; ++b) {
+        for (Index a = start; a < end; ++a) distances(b, a) = tile(a - start, b - first);
+      }
     }
   }
 }
