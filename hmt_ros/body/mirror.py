@@ -12,6 +12,7 @@ by their variables has to take turns out first.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -197,6 +198,7 @@ class Trunk(NamedTuple):
     right: Index
 
 
+@lru_cache(maxsize=16)
 def trunk_of(body: Body) -> Trunk:
     """The trunk, which tells where a person faces.
 

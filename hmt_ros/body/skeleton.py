@@ -107,7 +107,7 @@ class Skeleton:
         if wrong:
             raise ValueError(f'{self.name}: lower limit not below upper limit for {wrong}')
 
-    @property
+    @cached_property
     def dimension(self) -> int:
         """Number of degrees of freedom, d."""
         return len(self.dof_names)

@@ -6,24 +6,81 @@
 // less what counts as none.
 #pragma once
 
+#include <bit>
+
 #include "arrays.h"
 #include "elementary.h"
+#include "lanes.h"
 #include "wide.h"
 
 namespace hmt {
 
-// Adds to `totals` how far the J joints of N hypotheses (J, 3, N) are from those of hypothesis a,
-// each capped, for this one and those after it.
-HMT_WIDE inline void add_distances(const float* rows, Index joints, Index n, Index a, float cap,
-                                   float* totals) {
-  for (Index k = 0; k < joints; ++k, rows += 3 * n) {
-    const float *xs = rows, *ys = rows + n, *zs = rows + 2 * n;
-    const float xa = xs[a], ya = ys[a], za = zs[a];
-    for (Index b = a; b < n; ++b) {
-      const float x = xa - xs[b], y = ya - ys[b], z = za - zs[b];
-      const float gap = std::sqrt(x * x + y * y + z * z);
-      totals[b] += gap < cap ? gap : cap;
+// Single precision is micrometres here.
+using Place = std::array<float, 3>;
+
+// The places of the joints (N, J, 3) of hypotheses: combinations of limbs share most of them.
+struct JointPlaces {
+  std::vector<Place> distinct;  // joint by joint
+  std::vector<std::size_t> ends;
+  Scratch<std::uint32_t, 2> numbers;  // (N, J) of places in `distinct`
+
+  explicit JointPlaces(const Tables& joints) : numbers(joints.size(), joints.size(1)) {
+    const std::size_t slots = std::bit_ceil(2 * std::size_t(joints.size()) + 1);
+    // A table of places by their bits; one more than the number of a place, 0: none.
+    std::vector<std::uint32_t> found;
+    for (Index k = 0; k < joints.size(1); ++k) {
+      found.assign(slots, 0);
+      for (Index i = 0; i < joints.size(); ++i) numbers(i, k) = number_of(joints[i][k], found);
+      ends.push_back(distinct.size());
     }
+  }
+
+ private:
+  std::uint32_t number_of(const Numbers& joint, std::vector<std::uint32_t>& found) {
+    Place place;
+    std::uint64_t slot = 0;
+    for (int x = 0; x < 3; ++x) {
+      place[x] = static_cast<float>(joint[x]);
+      slot = (slot ^ std::bit_cast<std::uint32_t>(place[x])) * 0x9e3779b97f4a7c15;
+    }
+    for (slot >>= 32;; ++slot) {
+      std::uint32_t& number = found[slot & (found.size() - 1)];
+      const bool is_new = number == 0;
+      if (is_new) {
+        distinct.push_back(place);
+        number = static_cast<std::uint32_t>(distinct.size());
+      }
+      if (is_new || distinct[number - 1] == place) return number - 1;
+    }
+  }
+};
+
+// So many hypotheses are compared with another one at once.
+inline constexpr Index strip = 32;
+
+// Fills how far a place is from others (3, strip), capped, (strip,).
+HMT_WIDE inline void fill_gaps(const Place& place, const float* others, float cap, float* gaps) {
+  for (Index b = 0; b < strip; ++b) {
+    const float x = place[0] - others[b], y = place[1] - others[strip + b];
+    const float z = place[2] - others[2 * strip + b];
+    const float gap = std::sqrt(x * x + y * y + z * z);
+    gaps[b] = gap < cap ? gap : cap;
+  }
+}
+
+// Fills the distances of a hypothesis from others (strip,), of rows (J,) of gaps.
+HMT_WIDE inline void add_gaps(const float* const* rows, Index joints, float same,
+                              float* distances) {
+  constexpr Index groups = strip / Lanes<float>::count;
+  Group<float> totals[groups] = {};
+  for (Index k = 0; k < joints; ++k) {
+    const auto* row = reinterpret_cast<const Group<float>*>(rows[k]);
+    for (Index g = 0; g < groups; ++g) totals[g] += row[g];
+  }
+  for (Index g = 0; g < groups; ++g) {
+    const Group<float> none{}, distance = totals[g] / static_cast<float>(joints) - same;
+    *reinterpret_cast<Group<float>*>(distances + g * Lanes<float>::count) =
+        none > distance ? none : distance;
   }
 }
 
@@ -31,20 +88,33 @@ HMT_WIDE inline void add_distances(const float* rows, Index joints, Index n, Ind
 inline void fill_distances(const Tables& joints, float same, float cap,
                            const Array<float, 2>& distances) {
   const Index n = joints.size(), count = joints.size(1);
-  // A row a coordinate, so that the innermost loops run along memory; single precision is
-  // micrometres here.
-  Scratch<float, 3> rows(count, 3, n);
-  for (Index k = 0; k < count; ++k) {
-    for (int x = 0; x < 3; ++x) {
-      for (Index a = 0; a < n; ++a) rows(k, x, a) = static_cast<float>(joints(a, k, x));
+  const JointPlaces places(joints);
+  const Scratch<float, 2> gaps(places.distinct.size(), strip), others(3, strip);
+  const Scratch<float, 2> tile(strip, strip);
+  const Scratch<const float*, 1> rows(count);
+  for (Index first = 0; first < n; first += strip) {
+    const Index last = std::min(first + strip, n);
+    std::size_t place = 0;
+    for (Index k = 0; k < count; ++k) {
+      for (Index b = first; b < last; ++b) {
+        for (int x = 0; x < 3; ++x) {
+          others(x, b - first) = places.distinct[places.numbers(b, k)][x];
+        }
+      }
+      for (; place < places.ends[k]; ++place) {
+        fill_gaps(places.distinct[place], others[0].data, cap, gaps[place].data);
+      }
     }
-  }
-  for (Index a = 0; a < n; ++a) {
-    float* own = distances[a].data;
-    add_distances(rows.view().data, count, n, a, cap, own);
-    for (Index b = a; b < n; ++b) {
-      const float distance = own[b] / static_cast<float>(count) - same;
-      own[b] = distances(b, a) = 0.0f > distance ? 0.0f : distance;
+    for (Index start = 0; start <= first; start += strip) {
+      const Index end = std::min(start + strip, n);
+      for (Index a = start; a < end; ++a) {
+        for (Index k = 0; k < count; ++k) rows[k] = gaps[places.numbers(a, k)].data;
+        add_gaps(rows.view().data, count, same, tile[a - start].data);
+        std::copy_n(tile[a - start].data, last - first, distances[a].data + first);
+      }
+      for (Index b = first; b < last; ++b) {
+        for (Index a = start; a < end; ++a) distances(b, a) = tile(a - start, b - first);
+      }
     }
   }
 }
@@ -58,21 +128,27 @@ HMT_WIDE inline void add_gains(const float* away, Index n, double weight, float 
   }
 }
 
-// What N hypotheses gain if one that is `away` from them is kept, too. Sums are in order; only what
-// is summed can be computed side by side, so it is put down first.
-HMT_WIDE inline double gain_of(const float* away, const float* nearest, const double* weights,
-                               Index n) {
-  constexpr Index strip = 32;
-  double gain = 0.0, parts[strip];
+// So many candidates are looked at together.
+inline constexpr Index together = 8;
+
+// Fills what N hypotheses gain if one that is `away` from them is kept, too, for several. Sums are
+// in order; only what is summed can be computed side by side, so it is put down first.
+HMT_WIDE inline void fill_gains(const float* const* away, const float* nearest,
+                                const double* weights, Index n, double* gains) {
+  double parts[together][strip];
+  std::fill_n(gains, together, 0.0);
   for (Index first = 0; first < n; first += strip) {
     const Index count = std::min(strip, n - first);
-    for (Index i = 0; i < count; ++i) {
-      const float less = nearest[first + i] - away[first + i];
-      parts[i] = weights[first + i] * most(static_cast<double>(less), 0.0);
+    for (Index c = 0; c < together; ++c) {
+      for (Index i = 0; i < count; ++i) {
+        const float less = nearest[first + i] - away[c][first + i];
+        parts[c][i] = weights[first + i] * most(static_cast<double>(less), 0.0);
+      }
     }
-    for (Index i = 0; i < count; ++i) gain += parts[i];
+    for (Index i = 0; i < count; ++i) {
+      for (Index c = 0; c < together; ++c) gains[c] += parts[c][i];
+    }
   }
-  return gain;
 }
 
 // The choice as it grows.
@@ -96,28 +172,28 @@ class Selection {
     }
   }
 
-  // The hypothesis that lessens the expected distance most; -1: none does.
+  // The hypothesis that lessens the expected distance most, the first of these; -1: none does.
   Index best() {
-    Index best = -1;
-    double best_gain = 0.0;
-    // Gains only shrink as more are kept: a candidate whose last gain is no larger than the best of
+    // Gains only shrink as more are kept: a candidate whose last gain is smaller than the best of
     // this round need not be looked at again. The one with the largest last gain comes first.
-    const Index likely = place_of_largest(gains_);
-    for (Index turn = -1; turn < weights_.size(); ++turn) {
-      const Index c = turn < 0 ? likely : turn;
-      const bool kept_already = nearest_[c] == 0.0f;  // or the same as one that is
-      if (turn == likely || kept_already || gains_[c] < best_gain ||
-          (gains_[c] == best_gain && c > best && best >= 0)) {
-        continue;
-      }
-      const double gain = gains_[c] =
-          gain_of(distances_[c].data, nearest_.view().data, weights_.data, weights_.size());
-      if (gain > best_gain || (gain == best_gain && gain > 0.0 && c < best)) {
-        best = c;
-        best_gain = gain;
-      }
+    for (Index c = 0; c < weights_.size(); ++c) {
+      if (nearest_[c] == 0.0f) gains_[c] = 0.0;  // kept, or the same as one that is
     }
-    return best;
+    Index best = place_of_largest(gains_);
+    if (gains_[best] > 0.0) update({best});
+    std::vector<Index> some;
+    for (Index c = 0; c < weights_.size(); ++c) {
+      if (c != best && gains_[c] > 0.0 && gains_[c] >= gains_[best]) some.push_back(c);
+      if (some.empty() || (some.size() < together && c + 1 < weights_.size())) continue;
+      update(some);
+      for (Index other : some) {
+        if (gains_[other] > gains_[best] || (gains_[other] == gains_[best] && other < best)) {
+          best = other;
+        }
+      }
+      some.clear();
+    }
+    return gains_[best] > 0.0 ? best : -1;
   }
 
   // Keeps a hypothesis as number `kept` of the chosen, the owner of those that it is nearest to.
@@ -133,6 +209,17 @@ class Selection {
   }
 
  private:
+  // Takes the present gains of a few.
+  void update(const std::vector<Index>& some) {
+    const float* away[together];
+    double gains[together];
+    for (std::size_t i = 0; i < together; ++i) {
+      away[i] = distances_[some[std::min(i, some.size() - 1)]].data;
+    }
+    fill_gains(away, nearest_.view().data, weights_.data, weights_.size(), gains);
+    for (std::size_t i = 0; i < some.size(); ++i) gains_[some[i]] = gains[i];
+  }
+
   const Numbers weights_;
   Scratch<float, 2> distances_;  // (N, N)
   Scratch<float, 1> nearest_;    // distances to the nearest that is kept

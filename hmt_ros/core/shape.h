@@ -70,13 +70,15 @@ class ShapeSums {
         carried_(table.segments(), table.size(), 6),
         rates_(9, table.variables.size(1)),
         totals_(table.variables.size(1)),
-        row_(table.lengths()) {}
+        row_(table.lengths()),
+        seen_(table.segments()) {}
 
   void clear() {
     pulls_.fill(0.0);
     squares_.fill(0.0);
     products_.fill(0.0);
     carried_.fill(0.0);
+    seen_.fill(false);
   }
 
   // Sums up a list (1 + M, recorded) of residuals on the flesh, by segment.
@@ -85,6 +87,7 @@ class ShapeSums {
       const double* entry = list[m].data;
       const Index s = static_cast<Index>(entry[0]), part = table_.part_of[s];
       if (part < 0) continue;
+      seen_[s] = true;
       const double *point = entry + 1, *a = entry + 4, pull = entry[7], c = entry[8];
       const double *column = columns[s].data, *origin = origins[s].data;
       double f[9];
@@ -113,7 +116,7 @@ class ShapeSums {
   // the curvature (P, P). The lift (S, 3, L) are the derivatives of the origins.
   void spread_flesh(const Tables& lift, const Vector& gradient, const Matrix& curvature) {
     for (Index s = 0; s < table_.segments(); ++s) {
-      if (table_.part_of[s] >= 0) spread_segment(s, lift, gradient, curvature);
+      if (seen_[s]) spread_segment(s, lift, gradient, curvature);
     }
   }
 
@@ -211,6 +214,7 @@ class ShapeSums {
   Scratch<double, 3> carried_;   // (S, P, 6) of c r b'
   Scratch<double, 2> rates_;     // (9, V) B of a segment
   Scratch<double, 1> totals_, row_;
+  Scratch<bool, 1> seen_;  // (S,) segments with residuals on their flesh
 };
 
 // Adds sum g r (N, P) and sum c r r' (N, P, P) and sets sum c r q' (N, P, d) of residuals on the

@@ -28,6 +28,22 @@ inline void expect_modes(const Tables& mixed, const Tables& covariances) {
   expect_shape("covariances", covariances, {k, d, d});
 }
 
+// The variables of the shape with derivatives (P, d) by a pose; what the others would add is zero:
+// without contours all of the flesh.
+inline std::vector<Index> coupled(const Table& mixed) {
+  std::vector<Index> rows;
+  for (Index p = 0; p < mixed.size(); ++p) {
+    const Numbers row = mixed[p];
+    if (std::any_of(row.begin(), row.end(), [](double x) { return x != 0.0; })) rows.push_back(p);
+  }
+  return rows;
+}
+inline Scratch<double, 2> rows_of(const Table& matrix, const std::vector<Index>& rows) {
+  Scratch<double, 2> result(rows.size(), matrix.size(1));
+  for (std::size_t i = 0; i < rows.size(); ++i) result[i].copy_from(matrix[rows[i]]);
+  return result;
+}
+
 // Fills the covariances (K, d, d) of modes due to that of the shape (P, P).
 inline void consider_shape(const Tables& mixed, const Tables& covariances, const Table& of_shape,
                            const Tensor& result) {
@@ -35,14 +51,18 @@ inline void consider_shape(const Tables& mixed, const Tables& covariances, const
   expect_modes(mixed, covariances);
   expect_shape("of_shape", of_shape, {p, p});
   expect_shape("result", result, {k, d, d});
-  const Scratch<double, 2> moved(d, p), spread(d, p);
   const Scratch<double, 1> room((std::max(p, d) + 1) * lanes);
   for (Index i = 0; i < k; ++i) {
-    matrices::multiply(strided(covariances[i]), transposed(mixed[i]), strided(moved), d, d, p,
+    const std::vector<Index> rows = coupled(mixed[i]);
+    const Index n = static_cast<Index>(rows.size());
+    const Scratch<double, 2> own = rows_of(mixed[i], rows), moved(d, n), spread(d, n), known(n, n);
+    for (Index a = 0; a < n; ++a) {
+      for (Index b = 0; b < n; ++b) known(a, b) = of_shape(rows[a], rows[b]);
+    }
+    matrices::multiply(strided(covariances[i]), transposed(own), strided(moved), d, d, n,
                        room.view().data);
-    matrices::multiply(strided(moved), strided(of_shape), strided(spread), d, p, p,
-                       room.view().data);
-    matrices::multiply(strided(spread), transposed(moved), strided(result[i]), d, p, d,
+    matrices::multiply(strided(moved), strided(known), strided(spread), d, n, n, room.view().data);
+    matrices::multiply(strided(spread), transposed(moved), strided(result[i]), d, n, d,
                        room.view().data);
     make_symmetric(result[i]);
   }
@@ -102,7 +122,7 @@ inline bool inform_shape(const Table& by_shape, const Tables& curvature, const T
   expect_shape("turns", turns, {d});
   expect_shape("information", information, {p, p});
   expect_shape("pull", pull, {p});
-  const Scratch<double, 2> moved(d, p), given(p, p);
+  const Scratch<double, 2> given(p, p);
   const Scratch<double, 1> shift(d), room((d + 1) * lanes);
   information.fill(0.0);
   pull.fill(0.0);
@@ -111,13 +131,19 @@ inline bool inform_shape(const Table& by_shape, const Tables& curvature, const T
       shift[j] = dot(covariances[i][j].data, gradients[i].data, d);
     }
     if (!limit_shift(covariances[i], turns, most_turn, shift)) return false;
-    matrices::multiply(strided(covariances[i]), transposed(mixed[i]), strided(moved), d, d, p,
+    const std::vector<Index> rows = coupled(mixed[i]);
+    const Index n = static_cast<Index>(rows.size());
+    const Scratch<double, 2> own = rows_of(mixed[i], rows), moved(d, n), lost(n, n);
+    matrices::multiply(strided(covariances[i]), transposed(own), strided(moved), d, d, n,
                        room.view().data);
-    matrices::multiply(strided(mixed[i]), strided(moved), strided(given), p, d, p,
-                       room.view().data);
+    matrices::multiply(strided(own), strided(moved), strided(lost), n, d, n, room.view().data);
+    given.fill(0.0);
+    for (Index a = 0; a < n; ++a) {
+      for (Index b = 0; b < n; ++b) given(rows[a], rows[b]) = lost(a, b);
+    }
     for (Index a = 0; a < p; ++a) {
-      const double lost = dot(mixed[i][a].data, shift.view().data, d);
-      pull[a] += weights[i] * (by_shape(i, a) - lost);
+      const double moved_along = dot(mixed[i][a].data, shift.view().data, d);
+      pull[a] += weights[i] * (by_shape(i, a) - moved_along);
       for (Index b = 0; b < p; ++b) {
         information(a, b) += weights[i] * (curvature(i, a, b) - given(a, b));
       }

@@ -20,7 +20,7 @@ true sets lambda for the next step [Nielsen, Damping parameter in Marquardt's me
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -53,11 +53,11 @@ class Minimum:
 
     def __getitem__(self, rows: Index) -> Minimum:
         """Some of them."""
-        return Minimum(*(getattr(self, f.name)[rows] for f in fields(Minimum)))
+        return Minimum(*(part[rows] for part in vars(self).values()))
 
     def joined(self, other: Minimum) -> Minimum:
         """These and others."""
-        parts = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(Minimum))
+        parts = zip(vars(self).values(), vars(other).values(), strict=True)
         return Minimum(*(np.concatenate(pair) for pair in parts))
 
 

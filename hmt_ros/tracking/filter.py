@@ -423,7 +423,7 @@ def _finite(optimised: Optimised) -> Optimised:
     Raises:
         ValueError: there is none.
     """
-    usable = np.flatnonzero(np.isfinite(optimised.minima.value))
-    if len(usable) == 0:
+    usable = np.isfinite(optimised.minima.value)
+    if not usable.any():
         raise ValueError('no hypothesis has a finite energy')
-    return optimised[usable]
+    return optimised if usable.all() else optimised[np.flatnonzero(usable)]

@@ -9,7 +9,8 @@ is locally optimal and a weight; if it is selected it is a mode, with covariance
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,8 +55,8 @@ class Hypotheses:
 
     def __getitem__(self, rows: Index | slice) -> Self:
         """Some of them."""
-        parts: dict[str, Any] = {x.name: getattr(self, x.name)[rows] for x in fields(self)}
-        return replace(self, **parts)
+        names = self.__dataclass_fields__
+        return type(self)(**{name: getattr(self, name)[rows] for name in names})
 
     def proposed(
         self, rows: Index, poses: Array, jumped: Mask, expected: Array | None = None
@@ -87,8 +88,9 @@ class Hypotheses:
 
 def joined(parts: Sequence[Hypotheses]) -> Hypotheses:
     """All hypotheses of some proposals."""
-    arrays = {x.name: [getattr(one, x.name) for one in parts] for x in fields(Hypotheses)}
-    return Hypotheses(**{name: np.concatenate(each) for name, each in arrays.items()})
+    names = Hypotheses.__dataclass_fields__
+    arrays: list[Any] = [np.concatenate([getattr(x, name) for x in parts]) for name in names]
+    return Hypotheses(*arrays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +168,7 @@ class Modes(Hypotheses):
             contacts=nothing,
         )
 
-    @property
+    @cached_property
     def mixture(self) -> GaussianMixture:
         """The modes as a mixture over poses."""
         weights = elementary.exp(self.log_weights - log_sum_exp(self.log_weights))

@@ -78,7 +78,7 @@ class PointEstimate:
             dt: time since the image before, s; None: the modes begin with this image.
         """
         turns, own = self._choose_way(body, posterior, begins=dt is None)
-        found, uncertain = _moments(body, posterior[own].normalised(), self._leader)
+        found, uncertain = _moments(body, posterior, own, self._leader)
         if dt is None or turns:
             at_rest = dynamics.initial_mean[body.dimension :]
             self._mean = np.concatenate([found, at_rest])
@@ -129,11 +129,15 @@ class PointEstimate:
         self._mean, self._covariance = moved, left
 
 
-def _moments(body: Body, own: GaussianMixture, leader: Array) -> tuple[Array, Array]:
+def _moments(
+    body: Body, posterior: GaussianMixture, own: Index, leader: Array
+) -> tuple[Array, Array]:
     """Mean (d,) and covariance (d, d), as in (1), of the modes that face as one of them does."""
-    mean = leader + product(own.weights, _differences(body, own.means, leader))
-    covariance = product(own.weights, own.covariances.reshape(len(own), -1))
-    return np.clip(mean, body.lower, body.upper), covariance.reshape(own.covariances.shape[1:])
+    weights, covariances = posterior.weights[own], posterior.covariances[own]
+    weights = weights / weights.sum()
+    mean = leader + product(weights, _differences(body, posterior.means[own], leader))
+    covariance = product(weights, covariances.reshape(len(own), -1))
+    return np.clip(mean, body.lower, body.upper), covariance.reshape(covariances.shape[1:])
 
 
 def _differences(body: Body, poses: Array, reference: Array) -> Array:
