@@ -53,7 +53,7 @@ struct FleshTable {
   void check_frames(const Tables& columns, const Table& origins) const {
     expect_shape("columns", columns, {-1, 3, 3});
     expect_shape("origins", origins, {columns.size(), 3});
-    expect_range("part_segments", part_segments, 0, columns.size());
+    expect_range("flesh.part_segments", part_segments, 0, columns.size());
   }
 };
 

@@ -99,7 +99,7 @@ def test_precisions_of_what_jumped(d):
 def test_a_covariance_that_is_not_positive_is_refused():
     x = found_states(0)
     x['predicted'].covariances[:] = -1.0
-    with pytest.raises(ValueError, match='not positive definite'):
+    with pytest.raises(ValueError, match='wanted a positive definite'):
         correct_states(*x.values())
 
 

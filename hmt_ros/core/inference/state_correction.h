@@ -35,8 +35,8 @@ class Blocks {
 inline Strided<double> rows_of(double* data, Index columns) {
   return {reinterpret_cast<char*>(data), columns * Index(sizeof(double)), sizeof(double)};
 }
-inline void expect_factor(bool good) {
-  if (!good) throw Misfit("a covariance of poses is not positive definite");
+inline void expect_factor(bool good, const char* name) {
+  expect(good, name, "a positive definite covariance of poses");
 }
 
 }  // namespace matrices
@@ -110,7 +110,7 @@ inline void widen_precisions(const Tables& precisions, const Places& ancestors,
       }
       for (Index j = 0; j < d; ++j) blocks.row(1, i)[j] = sigma * own(rows[i], j);
     }
-    expect_factor(factorise(blocks.rows(), m));
+    expect_factor(factorise(blocks.rows(), m), "precisions");
     multiply<double>(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, m, d,
                      room.view().data);
     for (Index i = 0; i < d * d; ++i) to.data[i] -= loss.view().data[i];
@@ -134,7 +134,7 @@ inline void fuse(const Tables& a, const Tables& b, const Tensor& result) {
         blocks.row(1, i)[j] = a(n, i, j);
       }
     }
-    expect_factor(factorise(blocks.rows(), d));
+    expect_factor(factorise(blocks.rows(), d), "a");
     multiply<double>(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, d, d,
                      room.view().data);
     for (Index i = 0; i < d; ++i) {
@@ -183,7 +183,7 @@ inline void correct_states(const Predicted& predicted, const Places& ancestors,
       if (fresh[i]) blocks.row(0, i)[i] += predicted.unknown_variance;
     }
     // With P_xx = U' U the block beside it becomes Y = U'^-1 P_xv, so that G P_xv = Y' Y; then G'.
-    expect_factor(factorise(blocks.rows(), d));
+    expect_factor(factorise(blocks.rows(), d), "predicted.covariances");
     multiply<double>(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, d, d,
                      room.view().data);
     solve_upper(blocks.rows(), d, blocks.start(1));
@@ -229,7 +229,7 @@ inline void condition(const Numbers& mean, const Table& covariance, const Number
     *blocks.row(2, i) = offset[i];
   }
   // With P_xx + R = U' U the blocks beside it become Y = U'^-1 P_x. and y = U'^-1 offset.
-  expect_factor(factorise(blocks.rows(), d));
+  expect_factor(factorise(blocks.rows(), d), "covariance");
   const Scratch<double, 1> room((d + 1) * lanes);
   multiply<double>(blocks.transposed(1), blocks.matrix(1), rows_of(left.data, n), n, d, n,
                    room.view().data);

@@ -1,0 +1,19 @@
+"""Arguments spoilt at random give a result or an error that names one; see tools/fuzz_core.py."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_no_arguments_crash_the_core():
+    """In a process of its own, which records the other tests' calls first."""
+    command = [sys.executable, str(ROOT / 'tools' / 'fuzz_core.py'), '3', '0']
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    count, word = done.stdout.splitlines()[-1].split()
+    assert word == 'calls'
+    assert int(count) > 70

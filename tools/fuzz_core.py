@@ -1,0 +1,204 @@
+"""Spoils the arguments of all functions of the core at random: a result or an error, no crash.
+
+    python tools/fuzz_core.py SECONDS [SEED]
+
+Good arguments are those with which the tests of the core call the functions. Prints each call
+before it is made with --verbose, so that the last line says which one crashed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import BuiltinFunctionType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hmt_ros import core
+
+TESTS = Path(__file__).parents[1] / 'test'
+KEPT = 8  # calls of each function
+NUMBERS = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e-300, 1e300, -(2**63), 2**62, 2**31, -1, 3)
+TYPES = (np.float32, np.float64, np.int64, np.int32, np.int8, np.uint8, np.bool_, '>f8', object)
+EXTENTS = (0, 1, 2, 200)  # such as those of bodies
+
+
+class Recorder:
+    """Stands for a function of the core, and keeps arguments that it takes."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+        self.names = function.__doc__.rstrip(')\n').rpartition('(')[2].split()
+        self.calls: list[tuple[Any, ...]] = []
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Calls the function."""
+        copies = copied(arguments) if len(self.calls) < KEPT else None
+        result = self.function(*arguments)
+        if copies is not None:
+            self.calls.append(copies)
+        return result
+
+
+def copied(value: Any) -> Any:
+    """Arguments with memory of their own."""
+    return changed(value, lambda x: x.copy() if isinstance(x, np.ndarray) else x)
+
+
+def changed(value: Any, change: Callable[[Any], Any]) -> Any:
+    """Tuples with changed arrays and numbers."""
+    if not isinstance(value, tuple):
+        return change(value)
+    own = [changed(x, change) for x in value]
+    return value._make(own) if hasattr(value, '_make') else tuple(own)
+
+
+def leaves(value: Any) -> Iterator[Any]:
+    """The arrays and numbers in tuples."""
+    if isinstance(value, tuple):
+        for x in value:
+            yield from leaves(x)
+    else:
+        yield value
+
+
+def spoilt(value: Any, rng: np.random.Generator) -> Any:
+    """An array or a number in another way."""
+    number = NUMBERS[rng.integers(len(NUMBERS))]
+    if not isinstance(value, np.ndarray):
+        return (number, None, 'text', np.zeros(3))[rng.choice(4, p=[0.85, 0.05, 0.05, 0.05])]
+    with np.errstate(all='ignore'):
+        way = rng.integers(9)
+        if way < 3 and value.size and value.dtype != object:  # one number, or all
+            result, given = value.copy(), np.asarray(number).astype(value.dtype)
+            result.ravel()[rng.integers(value.size) if way else slice(None)] = given
+            return result
+        if way == 3:
+            return value.astype(TYPES[rng.integers(len(TYPES))], copy=True)
+        if way == 4:  # of another extent along an axis
+            shape = list(value.shape) or [1]
+            shape[rng.integers(len(shape))] = EXTENTS[rng.integers(len(EXTENTS))]
+            return np.resize(value, shape) if value.size else np.zeros(shape, value.dtype)
+        if way == 5:  # of no numbers, but huge
+            shape = list(value.shape) or [1]
+            shape[rng.integers(len(shape))] = 0
+            shape[rng.integers(len(shape))] = 0 if len(shape) == 1 else 2**31
+            return np.zeros(shape, value.dtype) if 0 in shape else value[:0]
+        if way == 6:
+            return np.repeat(value[..., None], 2, axis=-1)[..., 0]
+        if way == 7 and value.ndim:
+            return value[::-1]
+        return (
+            value[None]
+            if way == 8
+            else np.rint(100.0 * rng.normal(size=value.shape)).astype(
+                value.dtype if value.dtype != object else float
+            )
+        )
+
+
+def resized(arguments: tuple[Any, ...], rng: np.random.Generator) -> tuple[Any, ...]:
+    """All axes of one extent at another: such as a body with other segments."""
+    extents = [x for array in leaves(arguments) for x in np.shape(array)]
+    if not extents:
+        return arguments
+    old, new = extents[rng.integers(len(extents))], EXTENTS[rng.integers(len(EXTENTS))]
+
+    def resize(value: Any) -> Any:
+        if not isinstance(value, np.ndarray) or old not in value.shape:
+            return value
+        shape = [new if x == old else x for x in value.shape]
+        return np.resize(value, shape) if value.size else np.zeros(shape, value.dtype)
+
+    return tuple(changed(x, resize) for x in arguments)
+
+
+def spoil(arguments: tuple[Any, ...], rng: np.random.Generator) -> tuple[Any, ...]:
+    """Arguments of which a few are spoilt."""
+    result: Any = copied(arguments)
+    if rng.random() < 0.3:
+        result = resized(result, rng)
+    count = len(list(leaves(result)))
+    for _ in range(rng.integers(3)):
+        place = iter(range(count))
+        wanted = int(rng.integers(count)) if count else -1
+        result = changed(
+            result,
+            lambda x, place=place, wanted=wanted: spoilt(x, rng) if next(place) == wanted else x,
+        )
+    return tuple(result)
+
+
+def recorded() -> dict[str, Recorder]:
+    """The functions of the core with arguments, from its tests."""
+    found = {
+        name: Recorder(value)
+        for name, value in vars(core).items()
+        if isinstance(value, BuiltinFunctionType)
+    }
+    vars(core).update(found)
+
+    files = sorted(
+        str(x)
+        for x in (TESTS / 'core').glob('test_*.py')
+        if x.stem not in ('test_build', 'test_fuzz')
+    )
+    files += [
+        str(TESTS / name) for name in ('image/test_pose_energy.py', 'tracking/test_classes.py')
+    ]
+    if pytest.main(['-q', '-x', '--no-header', '-p', 'no:cacheprovider', *files]):
+        raise SystemExit('the tests fail, from which good arguments come')
+    return found
+
+
+def run(seconds: float, seed: int, *, verbose: bool) -> int:
+    """Number of calls made; raises what is no error of an argument."""
+    functions = recorded()
+    unused = sorted(name for name, x in functions.items() if not x.calls)
+    if unused:
+        raise SystemExit(f'no test calls {", ".join(unused)}')
+    rng, end, count = np.random.default_rng(seed), time.monotonic() + seconds, 0
+    names, crowded = list(functions), set[str]()
+    while time.monotonic() < end:
+        own = functions[names[count % len(names)]]
+        arguments = spoil(own.calls[rng.integers(len(own.calls))], rng)
+        count += 1
+        if verbose:
+            show(f'{count} {own.function.__name__} {arguments}')
+        try:
+            own.function(*arguments)
+        except (TypeError, ValueError) as error:
+            if not str(error).startswith(tuple(own.names)):
+                raise
+        except MemoryError:  # huge, but valid
+            crowded.add(own.function.__name__)
+    if crowded:
+        show(f'no memory for some calls of {", ".join(sorted(crowded))}')
+    return count
+
+
+def show(line: str) -> None:
+    """Prints a line at once."""
+    sys.stdout.write(f'{line}\n')
+    sys.stdout.flush()
+
+
+def main(argv: list[str]) -> int:
+    """Runs the fuzz."""
+    parser = argparse.ArgumentParser('fuzz', description=__doc__.splitlines()[0])
+    parser.add_argument('seconds', type=float)
+    parser.add_argument('seed', type=int, nargs='?', default=0)
+    parser.add_argument('--verbose', action='store_true')
+    options = parser.parse_args(argv)
+    np.set_printoptions(threshold=20)
+    show(f'{run(options.seconds, options.seed, verbose=options.verbose)} calls')
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main(sys.argv[1:]))
