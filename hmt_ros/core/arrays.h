@@ -87,6 +87,33 @@ using Tables = Array<const double, 3>;
 using Places = Array<const Index, 1>;
 using Mask = Array<const bool, 1>;
 
+// An argument that does not fit; Python raises it as ValueError.
+struct Misfit : std::invalid_argument {
+  using std::invalid_argument::invalid_argument;
+};
+
+inline std::string in_brackets(const Index* shape, int axes) {
+  std::string text = "(";
+  for (int axis = 0; axis < axes; ++axis) {
+    text += (axis ? ", " : "") + std::to_string(shape[axis]);
+  }
+  return text + (axes == 1 ? ",)" : ")");
+}
+
+// How many elements scratch space has, which arrays with absurd extents would make endless.
+[[gnu::noinline]] inline std::size_t scratch_size(const Index* shape, int axes) {
+  constexpr Index limit = Index(1) << 27;
+  Index count = 1;
+  for (int axis = 0; axis < axes; ++axis) {
+    if (shape[axis] < 0 || (shape[axis] > 0 && count > limit / shape[axis])) {
+      throw Misfit("arguments: wanted at most " + std::to_string(limit) +
+                   " numbers of scratch space, saw " + in_brackets(shape, axes));
+    }
+    count *= shape[axis];
+  }
+  return static_cast<std::size_t>(count);
+}
+
 // Scratch space, zero at first: an array that owns its elements.
 template <class T, int N>
 class Scratch {
@@ -95,7 +122,7 @@ class Scratch {
   explicit Scratch(I... extents) {
     view_.shape = {static_cast<Index>(extents)...};
     // Not std::vector<bool>, which has no array of bool.
-    elements_ = std::make_unique<T[]>(static_cast<std::size_t>(view_.count()));
+    elements_ = std::make_unique<T[]>(scratch_size(view_.shape.data(), N));
     view_.data = elements_.get();
   }
   operator const Array<T, N>&() const { return view_; }
@@ -135,19 +162,6 @@ inline Index place_of_largest(const Numbers& numbers) {
     if (numbers[i] > numbers[place]) place = i;
   }
   return place;
-}
-
-// An argument that does not fit; Python raises it as ValueError.
-struct Misfit : std::invalid_argument {
-  using std::invalid_argument::invalid_argument;
-};
-
-inline std::string in_brackets(const Index* shape, int axes) {
-  std::string text = "(";
-  for (int axis = 0; axis < axes; ++axis) {
-    text += (axis ? ", " : "") + std::to_string(shape[axis]);
-  }
-  return text + (axes == 1 ? ",)" : ")");
 }
 
 // An array of this name must have these extents; -1 fits any.

@@ -59,7 +59,7 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "fill_surface", fill_surface, "parts heights cosines sines points normals");
   bind(m, "evaluate_prior_at", evaluate_prior_at, "model poses value gradient hessian");
   bind(m, "add_overlaps", add_overlaps_of_pose,
-       "overlaps columns origins dof_axes dof_origins wanted value gradient hessian");
+       "overlaps columns origins axes dof_origins wanted value gradient hessian");
   bind(m, "overlap_depths", overlap_depths, "parts first second columns origins depths");
   bind(m, "add_ground_energy", add_ground_energy,
        "ground columns origins axes dof_origins wanted gradient hessian");

@@ -13,7 +13,8 @@ namespace hmt {
 inline void add_diagonal(const Matrix& columns, const Tables& blocks, Index n) {
   const Index times = blocks.size(), d = blocks.size(1);
   expect_shape("blocks", blocks, {times, d, d});
-  expect(d <= n && times * n == columns.size(), "n", "at least d, and T n columns");
+  const bool may_fit = d <= n && (times == 0 || n <= columns.size());  // before they are multiplied
+  expect(may_fit && times * n == columns.size(), "n", "at least d, and T n columns");
   expect(d <= columns.size(1), "columns", "a band as wide as the blocks");
   for (Index t = 0; t < times; ++t) {
     for (Index b = 0; b < d; ++b) {

@@ -23,7 +23,7 @@ def test_overlaps_need_arguments_that_fit():
         'overlaps': overlaps_of(BODY, 0.03),
         'columns': COLUMNS,
         'origins': ORIGINS,
-        'dof_axes': AXES,
+        'axes': AXES,
         'dof_origins': DOF_ORIGINS,
         'wanted': True,
         'value': np.zeros(1),
