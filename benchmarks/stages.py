@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.tracking import filter as filter_module
 from hmt_ros.tracking import observer as observer_module
 from hmt_ros.tracking import tracker as tracker_module
@@ -24,15 +25,15 @@ STAGES: Stages = (
     (filter_module, 'follow_flow', 'motion'),
     (filter_module, 'propose', 'proposals'),
     (jumps_module, 'find_limb', 'chain search'),
-    (Posterior, 'values', 'rating'),
+    (PoseEnergy, 'values', 'rating'),
     (Posterior, 'minimise', 'candidates'),
     (MixtureFilter, '_weigh', 'keeping'),
     (MixtureFilter, '_select', 'keeping'),
     (MixtureFilter, '_fit_shape', 'shape'),
     (tracker_module, 'likelihood_modes', 'likelihood modes'),
 )
-# In these, minimisation is part of the stage.
-WHOLE = ('motion', 'start of the track', 'flesh')
+# In these, minimisation and rating are part of the stage.
+WHOLE = ('motion', 'start of the track', 'chain search')
 PROPOSED = ('proposals',)
 
 
@@ -59,11 +60,10 @@ class StageClock:
         self._proposed = False
 
     def _enter(self, stage: str) -> None:
-        if stage == 'candidates':
-            if self._stack and self._stack[-1] in WHOLE:
-                stage = self._stack[-1]
-            elif not self._proposed:
-                stage = 'predictions'
+        if stage in ('candidates', 'rating') and self._stack and self._stack[-1] in WHOLE:
+            stage = self._stack[-1]
+        elif stage == 'candidates' and not self._proposed:
+            stage = 'predictions'
         self._proposed |= stage in PROPOSED
         self._charge()
         self._stack.append(stage)
