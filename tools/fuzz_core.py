@@ -85,7 +85,7 @@ def spoilt(value: Any, rng: np.random.Generator) -> Any:
             shape[rng.integers(len(shape))] = EXTENTS[rng.integers(len(EXTENTS))]
             return np.resize(value, shape) if value.size else np.zeros(shape, value.dtype)
         if way == 5:  # of no numbers, but huge
-            shape = list(value.shape) or [1]
+            shape = [min(x, max(EXTENTS)) for x in value.shape] or [1]
             shape[rng.integers(len(shape))] = 0
             shape[rng.integers(len(shape))] = 0 if len(shape) == 1 else 2**31
             return np.zeros(shape, value.dtype) if 0 in shape else value[:0]

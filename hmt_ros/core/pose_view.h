@@ -27,7 +27,7 @@ struct Model {
     expect_range("flesh.part_segments", flesh.part_segments, 0, tree.segments());
     expect_shape("traced", traced, {flesh.parts()});
     expect_shape("occluders", occluders, {flesh.parts()});
-    expect(contour_points >= 0, "contour_points", "0 or more");
+    expect(0 <= contour_points && contour_points <= 1000000, "contour_points", "0 to a million");
   }
 };
 

@@ -64,6 +64,7 @@ inline void see_points(const FleshTable& flesh, const Vertices& mesh, const Scen
   expect_shape("columns", columns, {k, -1, 3, 3});
   expect_shape("origins", origins, {k, columns.size(1), 3});
   expect_range("mesh.segments", mesh.segments, 0, columns.size(1));
+  expect_range("mesh.parts", mesh.parts, 0, flesh.parts());
   expect_shape("segments", segments, {k, q});
   expect_shape("local", local, {k, q, 3});
   expect_shape("pixels", pixels, {k, q, 2});

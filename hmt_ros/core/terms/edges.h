@@ -38,8 +38,10 @@ inline void read_cells(const ImageMap& map, const Contour& contour, std::int32_t
   const std::int32_t h = map.values.size(1), w = map.values.size(2);
 #pragma omp simd
   for (Index i = 0; i < contour.count; ++i) {
-    const auto column = static_cast<std::int32_t>(inside(contour.u[i] - double(map.left), w));
-    const auto row = static_cast<std::int32_t>(inside(contour.v[i] - double(map.top), h));
+    // What is no number counts as 0.
+    const double x = most(0.0, inside(contour.u[i] - double(map.left), w));
+    const double y = most(0.0, inside(contour.v[i] - double(map.top), h));
+    const auto column = static_cast<std::int32_t>(x), row = static_cast<std::int32_t>(y);
     const std::int32_t channel = orientation(contour.nu[i], contour.nv[i]);
     const bool shown = contour.valid[i] > contour.hidden[i];
     cells[i] = shown ? (channel * h + row) * w + column : 0;
