@@ -219,11 +219,12 @@ HMT_WIDE inline void multiply_band_transposed(const Matrix& columns, const Matri
 inline void invert_block(const Matrix& columns, Index place, const Table& after,
                          const Matrix& result) {
   using namespace matrices;
-  const Index n = result.size(), width = columns.size(1) - 1, first = place * n;
+  const Index n = result.size(), width = columns.size(1) - 1;
   expect_shape("result", result, {n, n});
   expect(columns.size(1) > 0, "columns", "a diagonal");
   expect(n > 0 && columns.size() % n == 0, "columns", "whole blocks");
-  expect(place >= 0 && first < columns.size(), "place", "that of a block");
+  expect(place >= 0 && place < columns.size() / n, "place", "that of a block");
+  const Index first = place * n;
   const bool last = first + n == columns.size();
   expect_shape("after", after, {last ? 0 : n, n});
   const Index side = in_whole_lanes(n), rows = last ? n : 2 * n;

@@ -19,12 +19,14 @@ using TermInputs = std::tuple<CoverageInputs,  //
                               DepthInputs>;
 inline constexpr Index term_count = std::tuple_size_v<TermInputs>;
 
-// Inputs must have room for the results of so many poses.
-inline void check_poses(const TermInputs& inputs, Index poses) {
+// Inputs, an argument of this name, must have room for the results of so many poses.
+inline void check_poses(const char* name, const TermInputs& inputs, Index poses) try {
   const auto one = [&](const auto& own) {
     if constexpr (requires { own.check_poses(poses); }) own.check_poses(poses);
   };
   std::apply([&](const auto&... own) { (one(own), ...); }, inputs);
+} catch (const Misfit& error) {
+  throw Misfit(std::string(name) + "." + error.what());
 }
 
 // Runs the terms that are on for the pose in a view; their energies (terms,) are set.
