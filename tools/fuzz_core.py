@@ -72,9 +72,11 @@ def spoilt(value: Any, rng: np.random.Generator) -> Any:
     number = NUMBERS[rng.integers(len(NUMBERS))]
     if not isinstance(value, np.ndarray):
         return (number, None, 'text', np.zeros(3))[rng.choice(4, p=[0.85, 0.05, 0.05, 0.05])]
+    if value.dtype == object:
+        return value
     with np.errstate(all='ignore'):
         way = rng.integers(9)
-        if way < 3 and value.size and value.dtype != object:  # one number, or all
+        if way < 3 and value.size:  # one number, or all
             result, given = value.copy(), np.asarray(number).astype(value.dtype)
             result.ravel()[rng.integers(value.size) if way else slice(None)] = given
             return result
@@ -93,13 +95,9 @@ def spoilt(value: Any, rng: np.random.Generator) -> Any:
             return np.repeat(value[..., None], 2, axis=-1)[..., 0]
         if way == 7 and value.ndim:
             return value[::-1]
-        return (
-            value[None]
-            if way == 8
-            else np.rint(100.0 * rng.normal(size=value.shape)).astype(
-                value.dtype if value.dtype != object else float
-            )
-        )
+        if way == 8:
+            return value[None]
+        return np.rint(100.0 * rng.normal(size=value.shape)).astype(value.dtype)
 
 
 def resized(arguments: tuple[Any, ...], rng: np.random.Generator) -> tuple[Any, ...]:
