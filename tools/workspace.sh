@@ -162,9 +162,11 @@ stage_ros() {
   saying_how_long 'creating .venv' "$python" -m venv "$venv"
   touch "$unfinished"
   unpack_python_headers
+  [[ " ${stages[*]} " != *' core '* ]] || begin_core
   saying_how_long 'installing ROS 2' install -r requirements/ros.txt -r requirements/runtime.txt
   saying_how_long 'preparing ROS 2' repair_exported_include_paths
   build_tf2_msgs
+  wait
   mkdir -p "$stamps"
   echo "$key" >"$stamps/ros"
   rm "$unfinished"
@@ -231,14 +233,25 @@ stage_build() {
   echo "$key" >"$stamps/build"
 }
 
+# Compiles the core while the rest is installed, of which it needs little. What fails here fails again
+# in its own stage, which says so.
+begin_core() {
+  install -c requirements/lock.txt setuptools pybind11
+  compile_in_place >/dev/null 2>&1 9<&- &
+}
+
 # What colcon installs is linked from the same objects: this comes first.
 stage_core() {
   local key
   key=$(sources_of_core | checksum "$(cat "$stamps/ros")" "${CXX:-}")
   done_already core "$key" && compgen -G 'hmt_ros/core/*.so' >/dev/null && return
-  saying_how_long 'compiling the core' compile_core '' build_ext --inplace \
-    --build-temp "build/hmt_ros/build/temp.linux-x86_64-$(cache_tag)"
+  saying_how_long 'compiling the core' compile_in_place
   echo "$key" >"$stamps/core"
+}
+
+compile_in_place() {
+  compile_core '' build_ext --inplace \
+    --build-temp "build/hmt_ros/build/temp.linux-x86_64-$(cache_tag)"
 }
 
 stage_sanitize() {
@@ -287,7 +300,8 @@ colcon_build() {
 exec 9<"$root/tools/workspace.sh"
 flock 9
 
-for stage in "$@"; do
+stages=("$@")
+for stage in "${stages[@]}"; do
   case $stage in
     ros | test | lint | detector | core | build | sanitize) "stage_$stage" ;;
     *) fail "no stage '$stage': ros, test, lint, detector, core, build or sanitize" ;;

@@ -66,6 +66,10 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix='hmt_ros')
 
 
+# A child of fork has the pool, but none of its threads.
+os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
 @lru_cache(maxsize=1)
 def _cores() -> int:
     return max(len(os.sched_getaffinity(0)) - 1, 1)

@@ -1,5 +1,7 @@
 """The tracker on short motions whose poses are known: joints as keypoints, and rendered images."""
 
+import multiprocessing
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import replace
 
@@ -200,6 +202,22 @@ def test_the_number_of_threads_does_not_change_a_byte(follow):
     for threads in (2, 4):
         _, other, _ = follow(4, seed=3, threads=threads)
         assert in_bytes(first) == in_bytes(other)
+
+
+def test_trackers_in_threads_and_in_a_forked_process_give_the_same_bytes(follow):
+    def run(seed):
+        return in_bytes(follow(4, seed=seed, threads=2)[1])
+
+    wanted = [run(3), run(4)]
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(run, (3, 4))) == wanted
+    context = multiprocessing.get_context('fork')
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=lambda: sender.send(run(4)), daemon=True)
+    child.start()
+    assert receiver.poll(120.0), 'the child waits for threads that only its parent has'
+    assert receiver.recv() == wanted[1]
+    child.join()
 
 
 def test_other_body_sizes(follow, human32, camera, motion, keypoints_of):
