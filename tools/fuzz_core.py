@@ -1,6 +1,6 @@
 """Spoils the arguments of all functions of the core at random: a result or an error, no crash.
 
-    python tools/fuzz_core.py SECONDS [SEED]
+    python tools/fuzz_core.py CALLS [SEED]
 
 Good arguments are those with which the tests of the core call the functions. Prints each call
 before it is made with --verbose, so that the last line says which one crashed.
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import BuiltinFunctionType
@@ -154,18 +153,16 @@ def recorded() -> dict[str, Recorder]:
     return found
 
 
-def run(seconds: float, seed: int, *, verbose: bool) -> int:
-    """Number of calls made; raises what is no error of an argument."""
+def run(calls: int, seed: int, *, verbose: bool) -> None:
+    """Makes so many calls; raises what is no error of an argument."""
     functions = recorded()
     unused = sorted(name for name, x in functions.items() if not x.calls)
     if unused:
         raise SystemExit(f'no test calls {", ".join(unused)}')
-    rng, end, count = np.random.default_rng(seed), time.monotonic() + seconds, 0
-    names, crowded = list(functions), set[str]()
-    while time.monotonic() < end:
+    rng, names, crowded = np.random.default_rng(seed), list(functions), set[str]()
+    for count in range(calls):
         own = functions[names[count % len(names)]]
         arguments = spoil(own.calls[rng.integers(len(own.calls))], rng)
-        count += 1
         if verbose:
             show(f'{count} {own.function.__name__} {arguments}')
         try:
@@ -177,7 +174,6 @@ def run(seconds: float, seed: int, *, verbose: bool) -> int:
             crowded.add(own.function.__name__)
     if crowded:
         show(f'no memory for some calls of {", ".join(sorted(crowded))}')
-    return count
 
 
 def show(line: str) -> None:
@@ -189,12 +185,13 @@ def show(line: str) -> None:
 def main(argv: list[str]) -> int:
     """Runs the fuzz."""
     parser = argparse.ArgumentParser('fuzz', description=__doc__.splitlines()[0])
-    parser.add_argument('seconds', type=float)
+    parser.add_argument('calls', type=int)
     parser.add_argument('seed', type=int, nargs='?', default=0)
     parser.add_argument('--verbose', action='store_true')
     options = parser.parse_args(argv)
     np.set_printoptions(threshold=20)
-    show(f'{run(options.seconds, options.seed, verbose=options.verbose)} calls')
+    run(options.calls, options.seed, verbose=options.verbose)
+    show(f'{options.calls} calls')
     return 0
 
 
