@@ -26,7 +26,7 @@ PROFILE_FILE = 'HMT_PROFILE_FILE'
 # Time between two samples, s: no divisor of the interval between two images.
 PERIOD = 0.0043
 PACKAGES = tuple(f'{ROOT / name}{os.sep}' for name in ('hmt_ros', 'msg_tools', 'hmt_learning'))
-STEP = ('hmt_ros/tracking/tracker.py', 'Tracker.step')
+STEP = ('hmt_ros/tracking/tracker.py', 'step')
 NODES = {
     'hmt_ros/sessions/smoother_session.py': 'smoother',
     'hmt_ros/sessions/bme_session.py': 'experts',
@@ -35,10 +35,10 @@ NODES = {
     'hmt_ros/sessions/keypoints_session.py': 'detector',
 }
 IN_STEPS, EXECUTOR, OTHER, REST = 'steps', 'executor of ROS', 'other threads', 'DDS, and unsampled'
-# Functions that are told of.
+# Functions in a table.
 TOLD = 25
 
-Function = tuple[str, str]  # file and qualified name
+Function = tuple[str, str]  # file and name
 
 
 class Sample(NamedTuple):
@@ -102,7 +102,7 @@ class StackSampler(AbstractContextManager['StackSampler']):
 
 def _of_project(stack: Iterable[CodeType]) -> tuple[Function, ...]:
     return tuple(
-        (os.path.relpath(code.co_filename, ROOT), code.co_qualname)
+        (os.path.relpath(code.co_filename, ROOT), code.co_name)
         for code in stack
         if code.co_filename.startswith(PACKAGES)
     )

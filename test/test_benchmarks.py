@@ -47,9 +47,9 @@ def test_command_line(capsys):
 
 
 def test_time_is_told_by_node_by_stage_and_by_function():
-    step = ('hmt_ros/tracking/tracker.py', 'Tracker.step')
-    split = ('hmt_ros/image/background.py', 'BackgroundModel.split')
-    session = ('hmt_ros/sessions/smoother_session.py', 'SmootherSession._take')
+    step = ('hmt_ros/tracking/tracker.py', 'step')
+    split = ('hmt_ros/image/background.py', 'split')
+    session = ('hmt_ros/sessions/smoother_session.py', '_take')
     samples = [
         sampling.Sample(0, 'estimate', (split, step), 0.2),
         sampling.Sample(0, 'estimate', (step,), 0.1),

@@ -154,7 +154,7 @@ def recorded() -> dict[str, Recorder]:
 
 
 def run(calls: int, seed: int, *, verbose: bool) -> None:
-    """Makes so many calls; raises what is no error of an argument."""
+    """Makes so many calls; an error that names no argument is raised."""
     functions = recorded()
     unused = sorted(name for name, x in functions.items() if not x.calls)
     if unused:

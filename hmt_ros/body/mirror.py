@@ -174,14 +174,15 @@ def clear_level(body: Body, pose: Array) -> Array:
     if not {*ROOT_ANGLES} <= {*body.dof_names}:
         return best
     limits = root_rotation_dofs(body.skeleton)[1:]
-    for turn in (np.eye(3), QUARTER, product(QUARTER, QUARTER), QUARTER.T):
+    upright = np.eye(3)
+    for turn in (upright, QUARTER, product(QUARTER, QUARTER), QUARTER.T):
         level: Array = product(turn, body.level)
         angles = turned(body, pose[None], body.levelled(level))[0, limits]
         share = float(np.abs(angles / body.upper[limits]).max())
-        if share < least and turn[0, 0] > 0.5:
-            return level
         if share < least:
             best, least = level, share
+            if turn is upright:
+                break
     return best
 
 

@@ -118,9 +118,11 @@ class ImageLikelihood:
             explained: as for `ObservedImage`.
             exchanges, share, lifted_share: as for `keypoint_term`.
         """
-        image = observed(self, observation)
-        if explained is not None:
-            image = ObservedImage(self, observation, explained)
+        image = (
+            observed(self, observation)
+            if explained is None
+            else ObservedImage(self, observation, explained)
+        )
         if observation.keypoints is None or self.settings.keypoints.weight == 0:
             return (image,)
         return (image, self.keypoint_term(observation, exchanges, share, lifted_share))

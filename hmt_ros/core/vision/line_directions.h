@@ -5,7 +5,7 @@
 
 #include "../arrays.h"
 #include "../elementary.h"
-#include "../wide.h"
+#include "../lanes.h"
 
 namespace hmt {
 
@@ -87,9 +87,9 @@ inline void rate_lines(const Table& directions, const Table& normals, const Tabl
 inline void rate_frames(const Table& densities, const Places& vertical,
                         const Array<const Index, 2>& first, const Array<const Index, 2>& second,
                         double share, const Matrix& result) {
-  constexpr Index lanes = 4, together = 128;  // lines whose product is a number
+  constexpr Index together = 128;  // lines whose product is a number
   const Index d = densities.size(), n = densities.size(1), frames = vertical.size();
-  const Index padded = (n + lanes - 1) / lanes * lanes;
+  const Index padded = (n + group_size - 1) / group_size * group_size;
   expect_range("vertical", vertical, 0, d);
   expect_range("first", first, 0, d);
   expect_range("second", second, 0, d);
@@ -107,9 +107,9 @@ inline void rate_frames(const Table& densities, const Places& vertical,
       const double *a = parts[first(k, m)].data, *b = parts[second(k, m)].data;
       double sum = 0.0;
       for (Index start = 0; start < padded; start += together) {
-        double products[lanes] = {1.0, 1.0, 1.0, 1.0};
-        for (Index i = start; i < std::min(start + together, padded); i += lanes) {
-          for (Index j = 0; j < lanes; ++j) {
+        double products[group_size] = {1.0, 1.0, 1.0, 1.0};
+        for (Index i = start; i < std::min(start + together, padded); i += group_size) {
+          for (Index j = 0; j < group_size; ++j) {
             products[j] *= 1.0 - share + up[i + j] + (a[i + j] + b[i + j]);
           }
         }

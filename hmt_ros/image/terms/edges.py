@@ -29,9 +29,13 @@ ORIENTATIONS: int = core.ORIENTATIONS
 EDGE_LOW, EDGE_HIGH = 40.0, 100.0
 # Edges further outside the silhouette than this belong to the background, px.
 MARGIN = 4
-# Grown by both, a pixel covers a disc of radius `MARGIN`.
-_SQUARE = np.ones((MARGIN + 1, MARGIN + 1), np.uint8)
-_DIAMOND = np.array([[abs(x) + abs(y) <= 2 for x in range(-2, 3)] for y in range(-2, 3)], np.uint8)
+_DISC = np.array(
+    [
+        [x * x + y * y <= (MARGIN + 0.5) ** 2 for x in range(-MARGIN, MARGIN + 1)]
+        for y in range(-MARGIN, MARGIN + 1)
+    ],
+    dtype=np.uint8,
+)
 # Distance to an edge that is assumed where somebody else hides the edges, px.
 HIDDEN = 2.0
 
@@ -50,8 +54,7 @@ def edge_distances(window: ImageWindow) -> ImageMap:
     dx = cv2.Sobel(grey, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(grey, cv2.CV_16S, 0, 1)
     edges = cv2.Canny(dx, dy, EDGE_LOW, EDGE_HIGH)
-    widest = window.widest
-    near = NOTHING if widest is None else cv2.dilate(cv2.dilate(widest, _SQUARE), _DIAMOND)
+    near = NOTHING if window.widest is None else cv2.dilate(window.widest, _DISC)
     others = NOTHING if window.others is None else window.others
     result = np.empty((ORIENTATIONS, *grey.shape), dtype=np.float32)
     core.edge_distances(edges, dx, dy, near, others, HIDDEN, result)
