@@ -6,8 +6,6 @@
 // less what counts as none.
 #pragma once
 
-#include <bit>
-
 #include "arrays.h"
 #include "elementary.h"
 #include "lanes.h"
@@ -15,72 +13,18 @@
 
 namespace hmt {
 
-// Single precision is micrometres here.
-using Place = std::array<float, 3>;
-
-// The places of the joints (N, J, 3) of hypotheses: combinations of limbs share most of them.
-struct JointPlaces {
-  std::vector<Place> distinct;  // joint by joint
-  std::vector<std::size_t> ends;
-  Scratch<std::uint32_t, 2> numbers;  // (N, J) of places in `distinct`
-
-  explicit JointPlaces(const Tables& joints) : numbers(joints.size(), joints.size(1)) {
-    const std::size_t slots = std::bit_ceil(2 * std::size_t(joints.size()) + 1);
-    // A table of places by their bits; one more than the number of a place, 0: none.
-    std::vector<std::uint32_t> found;
-    for (Index k = 0; k < joints.size(1); ++k) {
-      found.assign(slots, 0);
-      for (Index i = 0; i < joints.size(); ++i) numbers(i, k) = number_of(joints[i][k], found);
-      ends.push_back(distinct.size());
+// Adds to `totals` how far the J joints of N hypotheses (J, 3, N) are from those of hypothesis a,
+// each capped, for this one and those after it.
+HMT_WIDE inline void add_distances(const float* rows, Index joints, Index n, Index a, float cap,
+                                   float* totals) {
+  for (Index k = 0; k < joints; ++k, rows += 3 * n) {
+    const float *xs = rows, *ys = rows + n, *zs = rows + 2 * n;
+    const float xa = xs[a], ya = ys[a], za = zs[a];
+    for (Index b = a; b < n; ++b) {
+      const float x = xa - xs[b], y = ya - ys[b], z = za - zs[b];
+      const float gap = std::sqrt(x * x + y * y + z * z);
+      totals[b] += gap < cap ? gap : cap;
     }
-  }
-
- private:
-  std::uint32_t number_of(const Numbers& joint, std::vector<std::uint32_t>& found) {
-    Place place;
-    std::uint64_t slot = 0;
-    for (int x = 0; x < 3; ++x) {
-      place[x] = static_cast<float>(joint[x]);
-      slot = (slot ^ std::bit_cast<std::uint32_t>(place[x])) * 0x9e3779b97f4a7c15;
-    }
-    for (slot >>= 32;; ++slot) {
-      std::uint32_t& number = found[slot & (found.size() - 1)];
-      const bool is_new = number == 0;
-      if (is_new) {
-        distinct.push_back(place);
-        number = static_cast<std::uint32_t>(distinct.size());
-      }
-      if (is_new || distinct[number - 1] == place) return number - 1;
-    }
-  }
-};
-
-// So many hypotheses are compared with another one at once.
-inline constexpr Index strip = 32;
-
-// Fills how far a place is from others (3, strip), capped, (strip,).
-HMT_WIDE inline void fill_gaps(const Place& place, const float* others, float cap, float* gaps) {
-  for (Index b = 0; b < strip; ++b) {
-    const float x = place[0] - others[b], y = place[1] - others[strip + b];
-    const float z = place[2] - others[2 * strip + b];
-    const float gap = std::sqrt(x * x + y * y + z * z);
-    gaps[b] = gap < cap ? gap : cap;
-  }
-}
-
-// Fills the distances of a hypothesis from others (strip,), of rows (J,) of gaps.
-HMT_WIDE inline void add_gaps(const float* const* rows, Index joints, float same,
-                              float* distances) {
-  constexpr Index groups = strip / Lanes<float>::count;
-  Group<float> totals[groups] = {};
-  for (Index k = 0; k < joints; ++k) {
-    const auto* row = reinterpret_cast<const Group<float>*>(rows[k]);
-    for (Index g = 0; g < groups; ++g) totals[g] += row[g];
-  }
-  for (Index g = 0; g < groups; ++g) {
-    const Group<float> none{}, distance = totals[g] / static_cast<float>(joints) - same;
-    *reinterpret_cast<Group<float>*>(distances + g * Lanes<float>::count) =
-        none > distance ? none : distance;
   }
 }
 
@@ -88,33 +32,20 @@ HMT_WIDE inline void add_gaps(const float* const* rows, Index joints, float same
 inline void fill_distances(const Tables& joints, float same, float cap,
                            const Array<float, 2>& distances) {
   const Index n = joints.size(), count = joints.size(1);
-  const JointPlaces places(joints);
-  const Scratch<float, 2> gaps(places.distinct.size(), strip), others(3, strip);
-  const Scratch<float, 2> tile(strip, strip);
-  const Scratch<const float*, 1> rows(count);
-  for (Index first = 0; first < n; first += strip) {
-    const Index last = std::min(first + strip, n);
-    std::size_t place = 0;
-    for (Index k = 0; k < count; ++k) {
-      for (Index b = first; b < last; ++b) {
-        for (int x = 0; x < 3; ++x) {
-          others(x, b - first) = places.distinct[places.numbers(b, k)][x];
-        }
-      }
-      for (; place < places.ends[k]; ++place) {
-        fill_gaps(places.distinct[place], others[0].data, cap, gaps[place].data);
-      }
+  // A row a coordinate, so that the innermost loops run along memory; single precision is
+  // micrometres here.
+  Scratch<float, 3> rows(count, 3, n);
+  for (Index k = 0; k < count; ++k) {
+    for (int x = 0; x < 3; ++x) {
+      for (Index a = 0; a < n; ++a) rows(k, x, a) = static_cast<float>(joints(a, k, x));
     }
-    for (Index start = 0; start <= first; start += strip) {
-      const Index end = std::min(start + strip, n);
-      for (Index a = start; a < end; ++a) {
-        for (Index k = 0; k < count; ++k) rows[k] = gaps[places.numbers(a, k)].data;
-        add_gaps(rows.view().data, count, same, tile[a - start].data);
-        std::copy_n(tile[a - start].data, last - first, distances[a].data + first);
-      }
-      for (Index b = first; b < last; ++b) {
-        for (Index a = start; a < end; ++a) distances(b, a) = tile(a - start, b - first);
-      }
+  }
+  for (Index a = 0; a < n; ++a) {
+    float* own = distances[a].data;
+    add_distances(rows.view().data, count, n, a, cap, own);
+    for (Index b = a; b < n; ++b) {
+      const float distance = own[b] / static_cast<float>(count) - same;
+      own[b] = distances(b, a) = 0.0f > distance ? 0.0f : distance;
     }
   }
 }
@@ -128,8 +59,8 @@ HMT_WIDE inline void add_gains(const float* away, Index n, double weight, float 
   }
 }
 
-// So many candidates are looked at together.
-inline constexpr Index together = 8;
+// So many candidates are looked at together, and so many hypotheses at a time.
+inline constexpr Index together = 8, strip = 32;
 
 // Fills what N hypotheses gain if one that is `away` from them is kept, too, for several. Sums are
 // in order; only what is summed can be computed side by side, so it is put down first.
