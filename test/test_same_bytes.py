@@ -246,7 +246,7 @@ SWITCHES = {
 VERSIONS = {'numpy': '2.4.6', 'cv2': '5.0.0'}
 DIGESTS = {
     'keypoints/pose_mixture': 'b11d36dc97c25c40',
-    'keypoints/smoothed_pose_mixture': 'a136446dd69818f0',
+    'keypoints/smoothed_pose_mixture': '1b828a724b6ff50e',
     'anybody/pose_mixture': 'fa8fa48f7fbca28f',
     'images/pose_mixture': '97da8f3ee1af5da4',
 }

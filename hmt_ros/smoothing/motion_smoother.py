@@ -278,7 +278,8 @@ class MotionSmoother:
         least = LEAST if len(images) > 1 else 0.0
         labels = grouped(weights, *distances, self.max_motions, least)
         counted = [image.counted for image in images]
-        evidence = evidence_of_motions(nodes, weights, labels, counted)
+        known = None if self.points is None else points
+        evidence = evidence_of_motions(nodes, weights, labels, counted, known)
         masses: Array = np.bincount(labels, weights).astype(np.float64)
         shares = [
             _shares(nodes[:, t], weights, labels, len(link.weights), masses)

@@ -10,8 +10,9 @@ its own, however far away it is, and is absorbed by the one nearest in time. Whe
 is a span before the first. Spans without an image do not count; where a window is shorter than a
 moment the mean is over the window.
 
-A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each. b is the
-share by which the image tells changes (`CueErrors.of_changes`). What the modes disagree by is in R.
+A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each, of those
+within reach of the heaviest: a mean over opposite poses is no pose. b is the share by which the
+image tells changes (`CueErrors.of_changes`). What the modes disagree by is in R.
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ import numpy as np
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.linear_algebra import distances, product
+from hmt_ros.inference.linear_algebra import distances, mean_distances, product
 
 SECOND_NS = 10**9
 # Distance of two paths below which they are one motion, and the most that a span counts with, m.
 SAME_MOTION, MOST_APART = 0.03, 0.09
+# Distance of two modes of an image from which on they are no one Gaussian, m.
+OPPOSITE = 0.1
 # Length of a span, s, and spans of a moment.
 SPAN, MOMENT = 1.0 / 6.0, 3
 
@@ -114,6 +117,7 @@ def evidence_of_motions(
     weights: Array,
     labels: Index,
     mixtures: Sequence[GaussianMixture],
+    points: Sequence[Array] | None = None,
 ) -> MotionEvidence:
     """What images say of each motion.
 
@@ -121,6 +125,7 @@ def evidence_of_motions(
         nodes: (N, T) modes of the paths.
         weights, labels: (N,) of the paths, and the motion of each.
         mixtures: T likelihoods, with covariances S_k / b.
+        points: T arrays (K_t, P, 3) of their modes, m; None: any modes are one Gaussian.
     """
     count, times, d = int(labels.max()) + 1, len(mixtures), mixtures[0].dimension
     means = np.empty((count, times, d))
@@ -128,6 +133,9 @@ def evidence_of_motions(
     for t, mixture in enumerate(mixtures):
         shares = np.zeros((count, len(mixture)))
         np.add.at(shares, (labels, nodes[:, t]), weights)
+        if points is not None:
+            heaviest = points[t][shares.argmax(1), None]
+            shares[mean_distances(heaviest, points[t]) > OPPOSITE] = 0.0
         shares /= shares.sum(1, keepdims=True)
         means[:, t] = product(shares, mixture.means)
         offsets = mixture.means - means[:, t, None]
