@@ -20,14 +20,22 @@ OF_NODES = ('live', 'nodes', 'soak')
 )
 def test_every_benchmark_runs(name, capsys):
     """Where the development data is absent, one that needs it says so."""
-    # What a step costs here may be above the table, which is of other machines and clips.
-    assert main([name, '--quick', '--json']) in ((0, 1) if name == 'gate' else (0,))
-    said = capsys.readouterr()
-    if said.out:
-        assert 'machine' in json.loads(said.out)
+    code, said = main([name, '--quick', '--json']), capsys.readouterr()
+    found = json.loads(said.out) if said.out else None
+    # What a step costs here may be above the table, which is of other machines and clips. DDS keeps
+    # ten results for a flooded reader: beside other tests one may be lost.
+    late = name == 'soak' and all('is silent: waited' in x for x in faults_in(found))
+    assert code == 0 or (code == 1 and (name == 'gate' or late)), found
+    if found is not None:
+        assert 'machine' in found
     else:
         (line,) = (x for x in said.err.splitlines() if x.startswith(f'{name}: '))
         assert 'skipped' in line or name == 'gate'
+
+
+def faults_in(found):
+    rows = [row for part in (found or {}).values() if isinstance(part, list) for row in part]
+    return [fault for row in rows for fault in row['faults']]
 
 
 def test_every_benchmark_has_its_page():
