@@ -429,16 +429,16 @@ def training_windows(
     now = (rng.random((n, len(which))) * tracks.counts[which.T]).astype(np.intp).T
     times, there, rows, part = _images(now, tracks.counts[which], rng, s)
     base, first = tracks.starts[which][:, :, None] + rows, tracks.starts[which] + now
-    joints = _assembled(tracks, tracks.joints, JOINTS, first[..., None])[:, 0]
+    joints = assembled(tracks, tracks.joints, JOINTS, first[..., None])[:, 0]
     # Parts that meet stay those of one motion.
-    met = _meet(joints)
+    met = meet(joints)
     for one in (base, first, which):
         one[1:, met] = one[:1, met]
     part[1:, met] = part[:1, met]
-    joints = _assembled(tracks, tracks.joints, JOINTS, first[..., None])[:, 0]
+    joints = assembled(tracks, tracks.joints, JOINTS, first[..., None])[:, 0]
     joints = joints - tracks.roots[first[0]][:, None]
     joints -= joints[:, [JOINTS.index(name) for name in HIPS]].mean(1, keepdims=True)
-    places = _assembled(tracks, tracks.landmarks, (*LANDMARKS, *CENTRES), base, part)
+    places = assembled(tracks, tracks.landmarks, (*LANDMARKS, *CENTRES), base, part)
     root = tracks.roots[first[0]]
     chosen = rng.choice(len(SCHEMES), n, p=SHARES) if scheme is None else np.full(n, scheme)
     centres = OF_CENTRES[chosen]
@@ -491,7 +491,7 @@ def _drawn_tracks(
     return np.stack([legs, trunk, np.where((sits | other) & third, arms, trunk)])
 
 
-def _assembled(
+def assembled(
     tracks: KeypointTracks,
     figures: Figures,
     names: Sequence[str],
@@ -521,7 +521,7 @@ def _assembled(
     return np.asarray(result + at(tracks.roots, 0)[:, :, None])
 
 
-def _meet(joints: Floats) -> NDArray[np.bool_]:
+def meet(joints: Floats) -> NDArray[np.bool_]:
     """Whether arms are within the trunk or a leg, of joints (N, J, 3)."""
 
     def place(name: str) -> Floats:
