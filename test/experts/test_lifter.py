@@ -353,7 +353,7 @@ def test_parts_of_one_track_make_the_person_again():
 
 def test_a_person_of_three_tracks_holds_together():
     found, rng = tracks(), np.random.default_rng(1)
-    which = rng.integers(len(found.counts), size=(3, 40))
+    which = rng.integers((~found.seated).sum(), size=(3, 40))
     rows = (found.starts[which] + 5)[..., None]
     made = dict(zip(JOINTS, assembled(found, found.joints, JOINTS, rows)[:, 0].swapaxes(0, 1)))
     for above, below, length in (
