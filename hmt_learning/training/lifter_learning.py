@@ -171,13 +171,22 @@ def scores_on(
     """Scores on motions of other people, as text by kind of keypoints."""
     tracks = keypoint_tracks(body, tested, [1.0] * len(tested), variants=1)
     known = replace(
-        windows, cut=0.0, causal=0.0, gravity_spread=0.0, lengths_spread=0.0, lengths=1.0
+        windows,
+        cut=0.0,
+        causal=0.0,
+        gravity_spread=0.0,
+        lengths_spread=0.0,
+        lengths=1.0,
+        near=0.0,
+        recombined=0.0,
+        seated=0.0,
     )
     kinds = {
         'clean keypoints': replace(known, noise=0.0),
         'a detector that errs': known,
         'the same, causal': replace(known, causal=1.0),
         'the same, lengths unknown': replace(known, causal=1.0, lengths=0.0),
+        'causal, near, legs out of view': replace(known, causal=1.0, near=1.0),
     }
     result = {}
     for name, kind in kinds.items():
