@@ -605,12 +605,12 @@ def name_of(one: Run) -> str:
 def code_digest() -> str:
     """Of the code and data that a record depends on."""
     digest = hashlib.sha256()
-    layers = ('body', 'evaluation', 'flips', 'image', 'inference', 'tracking')
+    layers = ('body', 'core', 'evaluation', 'experts', 'flips', 'image', 'inference', 'tracking')
     for path in sorted(
         path
         for layer in layers
         for path in (ROOT / 'hmt_ros' / layer).rglob('*')
-        if path.suffix in ('.py', '.yaml')
+        if path.suffix in ('.py', '.yaml', '.npz', '.h', '.cpp')
     ):
         digest.update(path.read_bytes())
     for name in ('clips.py', 'runs.py'):

@@ -61,12 +61,13 @@ from hmt_learning.training.prior_learning import (
     recorded_dofs,
 )
 from hmt_learning.training.training_set import PoseSequence, recorded_sequence
-from hmt_ros.app.command_line import CommandParser, run_command, whole_number
+from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import say, show_progress, with_progress
 from hmt_ros.body import Body, load_body, model_names
 from hmt_ros.body.angle_mixture import AngleMixture
 from hmt_ros.body.learned_file import write_model
 from hmt_ros.body.motion_prior import LearnedMotion
+from hmt_ros.experts.lifter import Lifter
 from hmt_ros.experts.pose_predictor import RATE
 from hmt_ros.inference.arrays import Array, Index
 
@@ -126,6 +127,18 @@ def _add_lifter(parser: CommandParser) -> None:
         type=whole_number(1, 32),
         default=usual.experts,
         help=f'number of experts ({usual.experts})',
+    )
+    parser.add_argument(
+        '--start-from',
+        type=Path,
+        metavar='LIFTER',
+        help='lifter to learn on from, with fewer steps and a lower rate (from nothing)',
+    )
+    parser.add_argument(
+        '--rate',
+        type=number(0.0, 1.0),
+        default=usual.rate,
+        help=f'highest rate of the descent ({usual.rate:g})',
     )
     parser.add_argument(
         '--resume',
@@ -219,6 +232,7 @@ def _lifter(arguments: argparse.Namespace) -> int:
     mark = output.with_suffix('.resume')
     if mark.exists() and not arguments.resume:
         raise ValueError(f'{mark} marks a training that was broken off: --resume, or remove it')
+    taught = None if arguments.start_from is None else Lifter.load(arguments.start_from)
     check_tools()
     body = load_body(arguments.body)
     if body.name not in model_names():
@@ -235,6 +249,7 @@ def _lifter(arguments: argparse.Namespace) -> int:
         experts=arguments.experts,
         steps=arguments.steps,
         batch=arguments.batch,
+        rate=arguments.rate,
         seed=arguments.seed,
     )
     windows = WindowSettings()
@@ -246,6 +261,8 @@ def _lifter(arguments: argparse.Namespace) -> int:
         'learning': asdict(settings),
         'windows': asdict(windows),
     }
+    if taught is not None:
+        notes['started from'] = {x: taught.notes.get(x) for x in ('date', 'learning', 'windows')}
     with show_progress('learning', 'steps', arguments.steps, quiet=quiet) as bar:
         done = 0
 
@@ -254,7 +271,7 @@ def _lifter(arguments: argparse.Namespace) -> int:
             bar.update(step - done)
             done = step
 
-        lifter = learn_lifter(body, tracks, settings, windows, notes, told, mark)
+        lifter = learn_lifter(body, tracks, settings, windows, notes, told, mark, taught)
     if tested:
         lifter.notes['scores'] = scores_on(body, tested, lifter, windows)
     lifter.save(output)

@@ -72,6 +72,7 @@ def learn_lifter(
     notes: dict[str, Any],
     told: Callable[[int, float], None] | None = None,
     resume: Path | None = None,
+    taught: Lifter | None = None,
 ) -> Lifter:
     """A lifter that has learned.
 
@@ -79,9 +80,11 @@ def learn_lifter(
         body: with the usual lengths.
         told: is called after each step, with its number and the loss.
         resume: file in which the training is marked now and then, and taken up if it is there.
+        taught: a lifter to learn on from; None: from nothing.
 
     Raises:
-        ValueError: JAX or Optax is missing, or the file to take up is of another training.
+        ValueError: JAX or Optax is missing, the file to take up is of another training, or the
+            lifter to learn on from has another network.
     """
     check_tools()
     import jax
@@ -93,9 +96,17 @@ def learn_lifter(
         return training_windows(tracks, s.batch, np.random.default_rng([s.seed, step]), windows)
 
     inputs, joints = drawn(s.steps)
+    k, j = s.experts, len(JOINTS)
     mean, scale = inputs.mean(0), inputs.std(0) + np.float32(LEAST_SCALE)
     middle = joints.mean(0)
-    k, j = s.experts, len(JOINTS)
+    first = first_layers(inputs.shape[1], s.units, s.layers, k * (1 + 6 * j), s.seed)
+    if taught is not None:
+        before = taught.network
+        known = {name: np.asarray(getattr(before, name), np.float32) for name in first}
+        sizes = {name: value.shape for name, value in first.items()}
+        if {name: value.shape for name, value in known.items()} != sizes or taught.joints != JOINTS:
+            raise ValueError(f'the lifter to learn on from has another network: wanted {sizes}')
+        first, mean, scale, middle = known, before.mean, before.scale, before.middle
 
     def terms(p: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
         out = layer_outputs(p, (x - mean) / scale)
@@ -108,7 +119,6 @@ def learn_lifter(
         return jax.nn.log_softmax(out[:, :k]), density, distance
 
     descent = Descent(s.steps, s.rate, s.distance_weight, s.sharpness, told, resume, str(asdict(s)))
-    first = first_layers(inputs.shape[1], s.units, s.layers, k * (1 + 6 * j), s.seed)
     found = learned_network(first, terms, 3 * j, drawn, descent)
     return Lifter(Network(mean=mean, scale=scale, middle=middle, **found), JOINTS, body, notes)
 
@@ -161,13 +171,22 @@ def scores_on(
     """Scores on motions of other people, as text by kind of keypoints."""
     tracks = keypoint_tracks(body, tested, [1.0] * len(tested), variants=1)
     known = replace(
-        windows, cut=0.0, causal=0.0, gravity_spread=0.0, lengths_spread=0.0, lengths=1.0
+        windows,
+        cut=0.0,
+        causal=0.0,
+        gravity_spread=0.0,
+        lengths_spread=0.0,
+        lengths=1.0,
+        near=0.0,
+        recombined=0.0,
+        seated=0.0,
     )
     kinds = {
         'clean keypoints': replace(known, noise=0.0),
         'a detector that errs': known,
         'the same, causal': replace(known, causal=1.0),
         'the same, lengths unknown': replace(known, causal=1.0, lengths=0.0),
+        'causal, near, legs out of view': replace(known, causal=1.0, near=1.0),
     }
     result = {}
     for name, kind in kinds.items():

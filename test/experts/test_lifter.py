@@ -12,7 +12,9 @@ from hmt_learning.training.keypoint_training import (
     JOINTS,
     DetectorErrors,
     WindowSettings,
+    assembled,
     keypoint_tracks,
+    meet,
     training_windows,
     with_errors,
 )
@@ -324,20 +326,79 @@ def test_training_windows_show_what_the_camera_sees():
     """Without errors the rays of a window are those of the joints that are to be learned."""
     exact = WindowSettings(
         noise=0.0, gravity=1.0, gravity_spread=0.0, lengths=1.0, lengths_spread=0.0, cut=0.0,
-        unusual=0.0,
+        unusual=0.0, near=0.0, recombined=0.0, seated=0.0,
     )  # fmt: skip
     found, rng = tracks(), np.random.default_rng(0)
-    values, joints = training_windows(found, 50, rng, exact, 0)
-    assert values.shape == (50, INPUTS)
-    assert joints.shape == (50, len(JOINTS), 3)
+    values, joints = training_windows(found, 400, rng, exact, 0)
+    assert values.shape == (400, INPUTS)
+    assert joints.shape == (400, len(JOINTS), 3)
     # Knees of the first image lie about where the knees of the pose do.
     count = len(LANDMARKS)
-    plane = values[:, : 2 * count].reshape(50, count, 2)
+    plane = values[:, : 2 * count].reshape(400, count, 2)
     hips = [LANDMARKS.index(name) for name in HIPS]
     knee, of_pose = LANDMARKS.index('left_knee'), JOINTS.index('left_knee')
     seen = plane[:, knee] - plane[:, hips].mean(1)
     assert np.corrcoef(seen[:, 0], joints[:, of_pose, 0])[0, 1] > 0.9
-    assert np.corrcoef(seen[:, 1], joints[:, of_pose, 1])[0, 1] > 0.8
+    assert np.corrcoef(seen[:, 1], joints[:, of_pose, 1])[0, 1] > 0.7
+
+
+def test_parts_of_one_track_make_the_person_again():
+    found = keypoint_tracks(BODY, [procedural_sequence('walk', BODY, 2.0, 0)], [1.0], variants=1)
+    poses = procedural_sequence('walk', BODY, 2.0, 0).poses
+    rows = np.broadcast_to(np.arange(len(poses))[:, None], (3, len(poses), 1))
+    made = assembled(found, found.joints, JOINTS, rows)[:, 0]
+    wanted = BODY.joint_positions(poses)[:, BODY.skeleton.joint_index(JOINTS)]
+    np.testing.assert_allclose(made - made[0, 0], wanted - wanted[0, 0], atol=1e-5)
+
+
+def test_a_person_of_three_tracks_holds_together():
+    found, rng = tracks(), np.random.default_rng(1)
+    which = rng.integers((~found.seated).sum(), size=(3, 40))
+    rows = (found.starts[which] + 5)[..., None]
+    made = dict(zip(JOINTS, assembled(found, found.joints, JOINTS, rows)[:, 0].swapaxes(0, 1)))
+    for above, below, length in (
+        ('shoulder', 'elbow', 'upper_arm'),
+        ('elbow', 'wrist', 'forearm'),
+        ('hip', 'knee', 'thigh'),
+    ):
+        for side in ('left', 'right'):
+            distance = np.linalg.norm(made[f'{side}_{above}'] - made[f'{side}_{below}'], axis=1)
+            np.testing.assert_allclose(distance, BODY.segment_lengths[length], atol=1e-4)
+    # Arms of another track are not those of this one, legs are.
+    own = assembled(found, found.joints, JOINTS, np.repeat(rows[:1], 3, axis=0))[:, 0]
+    other = which[2] != which[0]
+    wrists = np.linalg.norm(own[:, JOINTS.index('left_wrist')] - made['left_wrist'], axis=1)
+    assert np.median(wrists[other]) > 0.01
+    np.testing.assert_allclose(own[:, JOINTS.index('left_knee')], made['left_knee'], atol=1e-6)
+
+
+def test_arms_within_the_trunk_meet():
+    joints = BODY.joint_positions(np.repeat(BODY.prior_mean[None], 2, axis=0))
+    joints = joints[:, BODY.skeleton.joint_index(JOINTS)]
+    middle = 0.5 * (joints[1, JOINTS.index('pelvis')] + joints[1, JOINTS.index('neck')])
+    joints[1, JOINTS.index('left_wrist')] = middle
+    assert meet(joints.astype(np.float32)).tolist() == [False, True]
+
+
+def test_people_sit_in_some_windows():
+    rng, sits = np.random.default_rng(0), WindowSettings(noise=0.0, seated=1.0, unusual=0.0)
+    _, joints = training_windows(tracks(), 200, rng, sits, 0)
+    thigh = joints[:, JOINTS.index('left_knee')] - joints[:, JOINTS.index('left_hip')]
+    # The view looks down a little: a thigh that points ahead is far from upright.
+    assert np.median(np.abs(thigh[:, 1])) < 0.6 * BODY.segment_lengths['thigh']
+
+
+def test_what_is_below_the_border_is_doubted():
+    rng = np.random.default_rng(0)
+    rays = np.zeros((300, len(TIMES), len(LANDMARKS), 2), np.float32)
+    rays[:, :, :5, 1] = 1.0
+    sure = np.ones(rays.shape[:3], np.float32)
+    times, far = np.tile(TIMES, (300, 1)), np.full(300, 1.0, np.float32)
+    seen, confidences = with_errors(rays, sure, far, times, rng, 1.0, np.full(300, 0.8))
+    below, shown = confidences[:, :, :5], confidences[:, :, 5:]
+    assert np.median(below) < 0.5 < 0.8 < np.median(shown)
+    errors = np.abs(seen - rays)
+    assert np.median(errors[:, :, :5]) > 2.0 * np.median(errors[:, :, 5:])
 
 
 def test_errors_of_detectors_are_shares():
