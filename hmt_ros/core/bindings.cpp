@@ -112,7 +112,6 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "correct_states", correct_states,
        "predicted ancestors jumped poses found velocities result");
   bind(m, "fuse", fuse, "a b result");
-  bind(m, "condition", condition, "mean covariance offset found moved left");
   bind(m, "widen_precisions", widen_precisions, "precisions ancestors jumped wandered result");
   bind(m, "whiten_pairs", whiten_pairs,
        "means_a covariances_a means_b covariances_b pairs scales squares log_determinants");

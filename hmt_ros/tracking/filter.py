@@ -53,7 +53,6 @@ from hmt_ros.tracking.misfit import (
     of_silhouette,
 )
 from hmt_ros.tracking.optimisation import Search, is_surprising
-from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
 from hmt_ros.tracking.proposals import proposals_of, propose
@@ -93,7 +92,6 @@ class MixtureFilter:
         dynamics: how modes move by themselves.
         modes: the present ones, heaviest first; none before the start.
         published: the same, where limbs that no image shows are as people hold them.
-        point: the pose of the likeliest motion.
         shape: the estimate of lengths and flesh.
         limbs: which of them the images show.
         misfit: share of the last image that no mode explains.
@@ -114,7 +112,6 @@ class MixtureFilter:
         self.modes = self.published = Modes.blank(0, body.dimension)
         # The mode that each of the published ones comes from.
         self._sources = np.empty(0, dtype=np.intp)
-        self.point = PointEstimate()
         self.limbs = UnseenLimbs(body)
         self.shape = ShapeEstimate(body)
         self.misfit = 0.0
@@ -196,7 +193,6 @@ class MixtureFilter:
         """Takes everything that has a place into the camera frame of the next image."""
         self.modes = motion.modes(self.body, self.modes)
         self.published = motion.modes(self.body, self.published)
-        self.point.carry(self.body, motion)
         if self._by_keypoints.pose is not None:
             self._by_keypoints.pose = motion.poses(self.body, self._by_keypoints.pose)
 

@@ -132,7 +132,8 @@ class Estimate:
         body: the person, with the present estimate of lengths and flesh.
         modes: of the track, heaviest first, as they are carried on; none without a track.
         published: the modes of the posterior: limbs that no image shows are as people hold them.
-        point_estimate: (d,) the pose of the likeliest motion; empty without a track.
+        point_estimate: (d,) the pose of least expected distance of the joints from the person's;
+            empty without a track.
         likelihood: of the last image that was tracked.
         shown: what the last image shows, as far as it is believed; None: nothing of the person.
         foreseen: whether the last image showed nothing of the person: a prediction is published.

@@ -32,7 +32,7 @@ from hmt_ros.image.silhouettes import Silhouettes
 from hmt_ros.image.subject import Subject
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
-from hmt_ros.inference.error_model import TOGETHER, seconds
+from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.appearance import Appearance
 from hmt_ros.tracking.beginning import (
@@ -56,6 +56,8 @@ from hmt_ros.tracking.initialisation import Start, check_box
 from hmt_ros.tracking.laplace_approximation import likelihood_modes
 from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE, of_depth_at_best
 from hmt_ros.tracking.observer import Observer, View
+from hmt_ros.tracking.point_estimate import point_estimate
+from hmt_ros.tracking.prediction import Forecaster
 from hmt_ros.tracking.settings import GIVEN_UP_SIGMA, LIKELY_NATS, RESTING_SHARE, TrackerSettings
 from hmt_ros.tracking.track_state import Estimate, TrackState, no_likelihood
 from hmt_ros.tracking.validity import DEPTH, Validity
@@ -456,15 +458,9 @@ class Tracker:
             # Something else than silhouettes says where the person is.
             likely = modes.poses[modes.log_weights > -LIKELY_NATS]
             self.silhouettes.complete(view.image, track.person, self.camera, likely)
-        dt = state.age(view.stamp)
         if self.settings.ground.on:
             resting = min(self._ground.by_foot(modes).values(), default=RESTING_SHARE)
-            self._ground.update(track.person, modes, resting, dt)
-        # The motion takes in one image after another, so each with its own covariance alone.
-        found = modes.mixture
-        found = replace(found, covariances=found.covariances / TOGETHER)
-        follows = modes.origins.shape[1] > 0
-        track.point.update(track.person, track.dynamics, found, dt if follows else None)
+            self._ground.update(track.person, modes, resting, state.age(view.stamp))
         self._observer.last_image, state.followed = view.image, view.stamp
         if state.existence.last.seen:
             self._meet(view)
@@ -485,7 +481,6 @@ class Tracker:
         if observation is not None:
             shown = SeenImage(posterior.likelihood, observation, posterior.known)
         if foreseen:
-            track.point.expect(track.person, track.dynamics, state.age(stamp))
             observation = Observation()
             # The modes are kept as they are.
             modes = replace(modes, origins=np.eye(len(modes)))
@@ -500,7 +495,11 @@ class Tracker:
         return expected, self._likelihood.mixture
 
     def _estimate(self, shown: SeenImage | None = None, *, foreseen: bool = False) -> Estimate:
-        state, track, ground, pose = self._state, self._track, self._ground, self._track.point.pose
+        state, track, ground = self._state, self._track, self._ground
+        poses = track.modes.mixture
+        if foreseen and state.stamp is not None and state.followed is not None:
+            forecaster = Forecaster(track.modes, track.person, self.settings.motion, state.followed)
+            poses = forecaster.at(state.stamp)
         return Estimate(
             status=state.status,
             reason=state.reason(self.silhouettes.scene.wants, track.misfit),
@@ -510,7 +509,7 @@ class Tracker:
             body=track.person,
             modes=track.modes,
             published=track.published,
-            point_estimate=np.empty(0) if pose is None else pose,
+            point_estimate=point_estimate(track.person, poses),
             likelihood=self._likelihood,
             shown=shown,
             foreseen=foreseen,

@@ -7,7 +7,6 @@ import pytest
 from scipy.linalg import expm
 
 from hmt_ros.core import (
-    condition,
     correct_states,
     fuse,
     predict_damped,
@@ -68,20 +67,6 @@ def test_states_are_conditioned_on_poses(d):
         )
         np.testing.assert_array_equal(result[:d, :d], found)
         np.testing.assert_array_equal(result, result.T)
-
-
-@pytest.mark.parametrize('d', [1, 5, 37])
-def test_a_state_is_conditioned_on_a_pose(d):
-    rng = np.random.default_rng(d)
-    (own,), (found,), mean = positive(rng, 1, 2 * d), positive(rng, 1, d), rng.normal(size=2 * d)
-    offset, moved, left = rng.normal(size=d), np.empty(2 * d), np.empty((2 * d, 2 * d))
-    condition(mean, own, offset, found, moved, left)
-    gain = own[:, :d] @ np.linalg.inv(own[:d, :d] + found)
-    np.testing.assert_allclose(moved, mean + gain @ offset, atol=1e-9)
-    np.testing.assert_allclose(left, own - gain @ own[:d], atol=1e-9)
-    named = {'mean': mean, 'covariance': own, 'offset': offset, 'found': found}
-    named |= {'moved': moved, 'left': left}
-    assert_arguments_are_checked(condition, named, 'moved left')
 
 
 @pytest.mark.parametrize('d', [1, 5, 37])

@@ -19,7 +19,6 @@ from hmt_ros.tracking.camera_motion import CameraMotion, CameraPath
 from hmt_ros.tracking.classes import ways, weigh_ways
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
-from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.prediction import dynamics_of, predicted_states
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
 from hmt_ros.tracking.weighting import Continuity
@@ -113,28 +112,6 @@ def test_carrying_and_predicting_commute(body, walking):
         np.testing.assert_allclose(getattr(first, name), getattr(other, name), atol=1e-7)
     # The same without being carried is another prediction.
     assert np.abs(first.poses - predicted(modes).poses).max() > 0.1
-
-
-def test_the_point_estimate_is_carried_with_its_velocity(body, walking):
-    motion, estimates = motion_of(0.2), (PointEstimate(), PointEstimate())
-    one, other = estimates
-    # No axis of the camera is better known than another: both see the same.
-    dynamics, spread = dynamics_of(body, 'learned'), 1e-3 * np.eye(body.dimension)[None]
-
-    def seen(pose):
-        return GaussianMixture(np.ones(1), pose[None], spread)
-
-    for t in range(5):
-        for estimate in estimates:
-            estimate.update(body, dynamics, seen(walking[t]), 0.1 if t else None)
-    before = other.pose
-    one.carry(body, motion)
-    np.testing.assert_allclose(one.pose, motion.poses(body, before[None])[0], atol=1e-9)
-    for estimate in estimates:
-        estimate.expect(body, dynamics, 0.1)
-    wanted = motion.poses(body, other.pose[None])[0]
-    np.testing.assert_allclose(one.pose, wanted, atol=1e-6)
-    assert np.abs(other.pose - before).max() > 0.01
 
 
 def test_feet_rest_before_a_moving_camera(body):

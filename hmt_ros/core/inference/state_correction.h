@@ -211,37 +211,4 @@ inline void correct_states(const Predicted& predicted, const Places& ancestors,
   }
 }
 
-// Conditions a state (n,) with a covariance (n, n) on its first d variables, found `offset` (d,)
-// from where they were expected, with a covariance (d, d).
-inline void condition(const Numbers& mean, const Table& covariance, const Numbers& offset,
-                      const Table& found, const Vector& moved, const Matrix& left) {
-  using namespace matrices;
-  const Index n = mean.size(), d = offset.size();
-  expect(d <= n, "offset", "no more variables than the mean has");
-  expect_shape("covariance", covariance, {n, n});
-  expect_shape("found", found, {d, d});
-  expect_shape("moved", moved, {n});
-  expect_shape("left", left, {n, n});
-  const Blocks blocks(d, {d, n, 1});
-  for (Index i = 0; i < d; ++i) {
-    for (Index j = 0; j < d; ++j) blocks.row(0, i)[j] = covariance(i, j) + found(i, j);
-    std::copy_n(&covariance(i, 0), n, blocks.row(1, i));
-    *blocks.row(2, i) = offset[i];
-  }
-  // With P_xx + R = U' U the blocks beside it become Y = U'^-1 P_x. and y = U'^-1 offset.
-  expect_factor(factorise(blocks.rows(), d), "covariance");
-  const Scratch<double, 1> room((d + 1) * lanes);
-  multiply<double>(blocks.transposed(1), blocks.matrix(1), rows_of(left.data, n), n, d, n,
-                   room.view().data);
-  multiply<double>(blocks.transposed(1), blocks.matrix(2), rows_of(moved.data, 1), n, d, 1,
-                   room.view().data);
-  for (Index i = 0; i < n; ++i) {
-    moved[i] += mean[i];
-    for (Index j = 0; j <= i; ++j) {
-      const double own = 0.5 * (covariance(i, j) + covariance(j, i)) - left(i, j);
-      left(i, j) = left(j, i) = own;
-    }
-  }
-}
-
 }  // namespace hmt
