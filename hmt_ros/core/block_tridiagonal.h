@@ -71,48 +71,56 @@ inline void hold(const Matrix& columns, const Places& held) {
 // ---- Cholesky factors, in place. Read by rows i and columns c, the band is a matrix [i, c] whose
 // columns begin `width` numbers apart.
 
-inline constexpr Index panel_columns = lanes;  // eliminated at a time
+inline constexpr Index panel_columns = 2 * lanes;  // eliminated at a time
 
-// The numbers of a group, of which only `count` are there.
-HMT_INLINE void take(const double* from, Index count, Group<double>& to) {
-  double each[group_size] = {};
-  std::copy_n(from, count, each);
-  to = matrices::group(each);
-}
-
-// Subtracts from R columns, from row `c` of the first on, the products of the rows of a panel:
-// target[i, c + r] -= sum over k of panel[k, c + r] panel[k, i]. `from` is the panel's column c.
-template <int R>
-HMT_INLINE void subtract_products(double* target, Index width, const double* from, Index stride,
-                                  Index count, Index rows) {
-  for (Index i = 0; i < rows; i += group_size) {
-    const Index here = std::min(group_size, rows - i);
-    const bool whole = here == group_size && i > 0;
-    Group<double> sums[R];
-    for (int r = 0; r < R; ++r) {
-      double* column = target + r * width + i;
-      if (here == group_size) {
-        sums[r] = matrices::group(column);
-      } else {
-        take(column, here, sums[r]);
-      }
-    }
-    for (Index k = 0; k < count; ++k) {
-      const double* row = from + k * stride;
-      const auto right = *reinterpret_cast<const Group<double>*>(row + i);
-      for (int r = 0; r < R; ++r) sums[r] -= row[r] * right;
-    }
-    for (int r = 0; r < R; ++r) {
-      double* column = target + r * width + i;
-      if (whole) {
-        matrices::group(column) = sums[r];
-      } else {  // neither above the diagonal nor below the band
-        double each[group_size];
-        matrices::group(each) = sums[r];
-        for (Index b = i == 0 ? r : 0; b < here; ++b) column[b] = each[b];
-      }
+// Subtracts from R columns, in G groups of rows from i on, where the target is, the products of the
+// rows of a panel: target[i, r] -= sum over k of panel[k, r] panel[k, i].
+template <int R, int G>
+HMT_INLINE void subtract_products(double* target, Index width, const double* panel, Index stride,
+                                  Index count, Index i) {
+  Group<double> sums[R][G];
+  for (int r = 0; r < R; ++r) {
+    for (int g = 0; g < G; ++g) {
+      sums[r][g] = matrices::group(target + r * width + g * group_size);
     }
   }
+  for (Index k = 0; k < count; ++k) {
+    const double* row = panel + k * stride;
+    for (int g = 0; g < G; ++g) {
+      const auto right = *reinterpret_cast<const Group<double>*>(row + i + g * group_size);
+      for (int r = 0; r < R; ++r) sums[r][g] -= row[r] * right;
+    }
+  }
+  for (int r = 0; r < R; ++r) {
+    for (int g = 0; g < G; ++g) {
+      matrices::group(target + r * width + g * group_size) = sums[r][g];
+    }
+  }
+}
+
+// The same of all `rows` of columns from the diagonal of the first on. A group may reach below the
+// rows, where the panel is 0, but neither above the diagonal nor out of the band.
+template <int R>
+HMT_INLINE void subtract_products(double* target, Index width, const double* panel, Index stride,
+                                  Index count, Index rows) {
+  constexpr Index g = group_size;
+  const auto subtract_some = [&](Index i) {
+    double some[R * g] = {};
+    const Index here = std::min(g, rows - i);
+    for (int r = 0; r < R; ++r) std::copy_n(target + r * width + i, here, some + r * g);
+    subtract_products<R, 1>(some, g, panel, stride, count, i);
+    for (int r = 0; r < R; ++r) {
+      for (Index b = i == 0 ? r : 0; b < here; ++b) target[r * width + i + b] = some[r * g + b];
+    }
+  };
+  subtract_some(0);
+  const Index last = std::min(rows, (width + 1) / g * g);
+  Index i = g;
+  for (; i + g < last; i += 2 * g) {
+    subtract_products<R, 2>(target + i, width, panel, stride, count, i);
+  }
+  for (; i < last; i += g) subtract_products<R, 1>(target + i, width, panel, stride, count, i);
+  if (i < rows) subtract_some(i);
 }
 
 // Returns how many columns have a pivot that is positive and finite: all, or the matrix is not
@@ -127,17 +135,14 @@ HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& roo
       double* row = room.data + k * stride;
       std::fill_n(row, stride, 0.0);
       std::copy_n(columns[first + k].data, std::min(width + 1, rows - k), row + k);
-    }
-    for (Index k = 0; k < count; ++k) {
-      double* row = room.data + k * stride;
+      for (Index b = k / panel_columns * panel_columns; b < stride; b += panel_columns) {
+        subtract_products<1, 4>(row + b, 0, room.data + k, stride, k, b - k);
+      }
       const double pivot = row[k];
       if (!(pivot > 0.0 && pivot < infinity)) return first + k;
       const double root = std::sqrt(pivot), inverse = 1.0 / root;
       for (Index b = 0; b < stride; b += group_size) matrices::group(row + b) *= inverse;
       row[k] = root;
-      for (Index p = k + 1; p < count; ++p) {
-        matrices::subtract(room.data + p * stride, row[p], row, 0, stride);
-      }
       std::copy_n(row + k, std::min(width + 1, rows - k), columns[first + k].data);
     }
     Index c = count;
@@ -151,8 +156,8 @@ HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& roo
   return total;
 }
 inline Index factorise_blocks(const Matrix& columns, Index n) {
-  const Index longest = in_whole_lanes(columns.size(1) + panel_columns);
-  const Scratch<double, 2> room(panel_columns, longest + lanes);
+  const Index longest = (columns.size(1) / panel_columns + 3) * panel_columns;
+  const Scratch<double, 2> room(panel_columns, longest);
   return factorise_columns(columns, room.view(), n);
 }
 inline Index factorise_band(const Matrix& columns) {

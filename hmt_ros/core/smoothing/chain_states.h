@@ -49,30 +49,19 @@ inline void add_weighed(const Matrix& columns, Index first, const Table& jacobia
   }
 }
 
-// Factorises the Hessian into columns (T n, 2 n) of a band, from the last state to the first, and
-// fills the states (T, n). Precisions (T, d, d) and means (T, d) are R^-1 and z. Returns how many
-// columns have a pivot, as `factorise_band`; if not all, there are no states.
-inline Index condition_chain(const ChainPrior& prior, const Tables& precisions, const Table& means,
-                             const RestingTable& resting, const Matrix& columns,
-                             const Matrix& states) {
-  const Index times = states.size(), n = states.size(1), d = means.size(1);
+// Fills the Hessian into columns (T n, 2 n) of a band, from the last state to the first, and adds
+// what pulls the states to the right side (T n).
+HMT_WIDE inline void fill_chain(const ChainPrior& prior, const Tables& precisions,
+                                const Table& means, const RestingTable& resting,
+                                const Matrix& columns, const Vector& right) {
+  const Index times = means.size(), d = means.size(1), n = prior.pull.size();
   const Index resting_count = resting.places.size(1);
-  expect(times > 0 && d <= n, "states", "a state at least, with the variables of a pose");
-  expect_shape("prior.pull", prior.pull, {n});
-  expect_shape("prior.which", prior.which, {times - 1});
-  expect_shape("precisions", precisions, {times, d, d});
-  expect_shape("means", means, {times, d});
-  expect_shape("resting.jacobians", resting.jacobians, {times, resting_count, d});
-  expect_shape("resting.places", resting.places, {times, resting_count});
-  expect_shape("resting.weights", resting.weights, {times - 1, resting_count});
-  expect_shape("columns", columns, {times * n, 2 * n});
-  columns.fill(0.0);
-  const Scratch<double, 2> right(1, times * n);
   for (Index t = 0; t < times; ++t) {
     const Index first = (times - 1 - t) * n;
-    double* pull = right[0].data + first;
+    double* pull = right.data + first;
     for (Index b = 0; b < n; ++b) {
       double* column = columns[first + b].data;
+      std::fill_n(column, 2 * n, 0.0);
       if (t == 0) {
         for (Index a = b; a < n; ++a) column[a - b] += prior.known(b, a);
         pull[b] += prior.pull[b];
@@ -111,6 +100,27 @@ inline Index condition_chain(const ChainPrior& prior, const Tables& precisions, 
       }
     }
   }
+}
+
+// Factorises the Hessian into the columns of a band, and fills the states (T, n). Precisions (T, d,
+// d) and means (T, d) are R^-1 and z. Returns how many columns have a pivot, as `factorise_band`;
+// if not all, there are no states.
+inline Index condition_chain(const ChainPrior& prior, const Tables& precisions, const Table& means,
+                             const RestingTable& resting, const Matrix& columns,
+                             const Matrix& states) {
+  const Index times = states.size(), n = states.size(1), d = means.size(1);
+  const Index resting_count = resting.places.size(1);
+  expect(times > 0 && d <= n, "states", "a state at least, with the variables of a pose");
+  expect_shape("prior.pull", prior.pull, {n});
+  expect_shape("prior.which", prior.which, {times - 1});
+  expect_shape("precisions", precisions, {times, d, d});
+  expect_shape("means", means, {times, d});
+  expect_shape("resting.jacobians", resting.jacobians, {times, resting_count, d});
+  expect_shape("resting.places", resting.places, {times, resting_count});
+  expect_shape("resting.weights", resting.weights, {times - 1, resting_count});
+  expect_shape("columns", columns, {times * n, 2 * n});
+  const Scratch<double, 2> right(1, times * n);
+  fill_chain(prior, precisions, means, resting, columns, right[0]);
   const Index done = factorise_blocks(columns, n);
   if (done < times * n) return done;
   solve_band_lower(columns, right);
