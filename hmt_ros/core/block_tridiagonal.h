@@ -253,13 +253,13 @@ inline void invert_block(const Matrix& columns, Index place, const Table& after,
   }
   if (!last) {
     double *gain = left[n].data, *carried = right[n].data;
-    multiply<double>(matrix(below[0].data, side), matrix(left[0].data, side), matrix(gain, side), n,
-                     n, n, room.view().data);
-    multiply<double>(matrix(const_cast<double*>(after.data), n), matrix(gain, side),
-                     matrix(carried, side), n, n, n, room.view().data);
+    multiply(matrix(below[0].data, side), matrix(left[0].data, side), matrix(gain, side), n, n, n,
+             room.view().data);
+    multiply(matrix(const_cast<double*>(after.data), n), matrix(gain, side), matrix(carried, side),
+             n, n, n, room.view().data);
   }
-  multiply<double>(matrix(left[0].data, side, true), matrix(right[0].data, side),
-                   matrix(result.data, n), n, rows, n, room.view().data);
+  multiply(matrix(left[0].data, side, true), matrix(right[0].data, side), matrix(result.data, n), n,
+           rows, n, room.view().data);
   for (Index a = 0; a < n; ++a) {
     for (Index b = 0; b < a; ++b) {
       result(a, b) = result(b, a) = 0.5 * (result(a, b) + result(b, a));

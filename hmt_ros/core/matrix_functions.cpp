@@ -6,6 +6,141 @@
 #include "small_matrix.h"
 #include "ufunc.h"
 
+namespace hmt::matrices {
+
+HMT_WIDE bool factorise(Rows u, Index n) {
+  for (Index a = 0; a < n; ++a) {
+    double* row = u[a];
+    if (!(row[a] > 0.0)) return false;
+    divide(row, std::sqrt(row[a]), a / group_size * group_size, u.stride);
+    for (Index c = a + 1; c < n; ++c)
+      subtract(u[c], row[c], row, c / group_size * group_size, u.stride);
+  }
+  return true;
+}
+
+HMT_WIDE double eliminate(Rows u, Index n) {
+  double sign = 1.0;
+  for (Index j = 0; j < n; ++j) {
+    Index largest = j;
+    for (Index i = j + 1; i < n; ++i) {
+      if (std::abs(u[i][j]) > std::abs(u[largest][j])) largest = i;
+    }
+    double* row = u[j];
+    const Index first = j / group_size * group_size;
+    if (largest != j) {
+      sign = -sign;
+      for (Index b = first; b < u.stride; b += group_size) {
+        const Group<double> other = group(row + b);
+        group(row + b) = group(u[largest] + b);
+        group(u[largest] + b) = other;
+      }
+    }
+    if (row[j] == 0.0) return 0.0;
+    for (Index i = j + 1; i < n; ++i) {
+      if (u[i][j] != 0.0) subtract(u[i], u[i][j] / row[j], row, first, u.stride);
+    }
+  }
+  return sign;
+}
+
+HMT_WIDE void solve_upper(Rows u, Index n, Index first) {
+  for (Index i = n - 1; i >= 0; --i) {
+    for (Index j = i + 1; j < n; ++j) subtract(u[i], u[i][j], u[j], first, u.stride);
+    divide(u[i], u[i][i], first, u.stride);
+  }
+}
+
+HMT_WIDE void solve_lower(Rows l, Index n, Index first) {
+  for (Index i = 0; i < n; ++i) {
+    for (Index j = 0; j < i; ++j) subtract(l[i], l[i][j], l[j], first, l.stride);
+    divide(l[i], l[i][i], first, l.stride);
+  }
+}
+
+// R rows and G groups of columns of a product: sums run along `inner` in order.
+template <class T, int R, int G>
+HMT_INLINE void multiply_rows(Strided<T> a, Index first, const T* b, Index b_stride, Index inner,
+                              Strided<T> result, Index column, Index columns) {
+  constexpr Index count = Lanes<T>::count;
+  Group<T> sums[R][G] = {};
+  for (Index k = 0; k < inner; ++k) {
+    for (int c = 0; c < G; ++c) {
+      const auto right = *reinterpret_cast<const Group<T>*>(b + k * b_stride + c * count);
+      for (int r = 0; r < R; ++r) sums[r][c] += a(first + r, k) * right;
+    }
+  }
+  for (int r = 0; r < R; ++r) {
+    for (int c = 0; c < G; ++c) {
+      T each[count];
+      *reinterpret_cast<Group<T>*>(each) = sums[r][c];
+      const Index start = column + c * count, wanted = std::min(count, columns - c * count);
+      for (Index j = 0; j < wanted; ++j) result(first + r, start + j) = each[j];
+    }
+  }
+}
+template <class T, int G>
+HMT_INLINE void multiply_columns(Strided<T> a, const T* b, Index b_stride, Index m, Index inner,
+                                 Strided<T> result, Index column, Index columns) {
+  Index i = 0;
+  if constexpr (G == 2) {
+    for (; i + 6 <= m; i += 6) {
+      multiply_rows<T, 6, 2>(a, i, b, b_stride, inner, result, column, columns);
+    }
+    for (; i + 2 <= m; i += 2) {
+      multiply_rows<T, 2, 2>(a, i, b, b_stride, inner, result, column, columns);
+    }
+  }
+  for (; i < m; ++i) multiply_rows<T, 1, G>(a, i, b, b_stride, inner, result, column, columns);
+}
+
+template <class T>
+HMT_INLINE void multiply_any(Strided<T> a, Strided<T> b, Strided<T> result, Index m, Index inner,
+                             Index n, T* room) {
+  constexpr Index count = 2 * Lanes<T>::count;
+  if (n == 1) {
+    T* other = room + inner;
+    for (Index k = 0; k < inner; ++k) room[k] = b(k, 0);
+    for (Index i = 0; i < m; ++i) {
+      const T* row = &a(i, 0);
+      if (a.column != sizeof(T)) {
+        for (Index k = 0; k < inner; ++k) other[k] = a(i, k);
+        row = other;
+      }
+      result(i, 0) = dot(row, room, inner);
+    }
+    return;
+  }
+  const bool together = b.column == sizeof(T);
+  const Index stride = b.row / Index(sizeof(T));
+  Index column = 0;
+  for (; together && m < 6 && column + 4 * count <= n; column += 4 * count) {
+    multiply_columns<T, 8>(a, &b(0, column), stride, m, inner, result, column, 4 * count);
+  }
+  for (; together && column + count <= n; column += count) {
+    multiply_columns<T, 2>(a, &b(0, column), stride, m, inner, result, column, count);
+  }
+  for (; column < n; column += count) {
+    const Index columns = std::min(count, n - column);
+    for (Index k = 0; k < inner; ++k) {
+      for (Index j = 0; j < columns; ++j) room[k * count + j] = b(k, column + j);
+      for (Index j = columns; j < count; ++j) room[k * count + j] = T(0);
+    }
+    multiply_columns<T, 2>(a, room, count, m, inner, result, column, columns);
+  }
+}
+
+HMT_WIDE void multiply(Strided<double> a, Strided<double> b, Strided<double> result, Index m,
+                       Index inner, Index n, double* room) {
+  multiply_any(a, b, result, m, inner, n, room);
+}
+HMT_WIDE void multiply(Strided<float> a, Strided<float> b, Strided<float> result, Index m,
+                       Index inner, Index n, float* room) {
+  multiply_any(a, b, result, m, inner, n, room);
+}
+
+}  // namespace hmt::matrices
+
 namespace hmt {
 
 using namespace matrices;
@@ -245,7 +380,7 @@ void product_loop(char** pointers, const Index* counts, const Index* strides, vo
     const Strided<T> a{pointers[0] + i * strides[0], own[0], own[1]};
     const Strided<T> b{pointers[1] + i * strides[1], own[2], own[3]};
     const Strided<T> result{pointers[2] + i * strides[2], own[4], own[5]};
-    multiply<T>(a, b, result, m, inner, n, room.view().data);
+    multiply(a, b, result, m, inner, n, room.view().data);
   }
   report_only(0);
 }
@@ -268,7 +403,7 @@ void exponential_loop(char** pointers, const Index* counts, const Index* strides
                            sizeof(double)};
   };
   const auto times = [&](double* left, double* right, double* to) {
-    multiply<double>(matrix(left), matrix(right), matrix(to), n, n, n, room_of_product.view().data);
+    multiply(matrix(left), matrix(right), matrix(to), n, n, n, room_of_product.view().data);
   };
   double *one = powers[0].data, *two = powers[1].data, *four = powers[2].data;
   double *six = powers[3].data, *odd = room[0].data, *even = odd + area;

@@ -178,30 +178,8 @@ class BoxStep {
 // x, gradient, lower, upper: (N, d). hessian: (N, d, d). lam: (N,) damping; more where the Hessian
 // is not positive definite. metric: (d,) diagonal of W. rows: (n,) the problems.
 // step, predicted: (n, d), (n,) become the steps and the decreases.
-inline void box_steps(const Table& x, const Table& gradient, const Tables& hessian,
-                      const Table& lower, const Table& upper, const Numbers& lam,
-                      const Numbers& metric, const Places& rows, const Matrix& step,
-                      const Vector& predicted) {
-  const Index problems = x.size(), d = x.size(1), count = rows.size();
-  expect_shape("gradient", gradient, {problems, d});
-  expect_shape("hessian", hessian, {problems, d, d});
-  expect_shape("lower", lower, {problems, d});
-  expect_shape("upper", upper, {problems, d});
-  expect_shape("lam", lam, {problems});
-  expect_shape("metric", metric, {d});
-  expect_range("rows", rows, 0, problems);
-  expect_shape("step", step, {count, d});
-  expect_shape("predicted", predicted, {count});
-  const Scratch<double, 1> low(d), high(d);
-  BoxStep box(d);
-  for (Index k = 0; k < count; ++k) {
-    const Index n = rows[k];
-    for (Index i = 0; i < d; ++i) {
-      low[i] = lower(n, i) - x(n, i);
-      high[i] = upper(n, i) - x(n, i);
-    }
-    predicted[k] = box.take(gradient[n], hessian[n], low, high, lam[n], metric, step[k]);
-  }
-}
+void box_steps(const Table& x, const Table& gradient, const Tables& hessian, const Table& lower,
+               const Table& upper, const Numbers& lam, const Numbers& metric, const Places& rows,
+               const Matrix& step, const Vector& predicted);
 
 }  // namespace hmt

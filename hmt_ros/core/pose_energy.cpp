@@ -303,4 +303,142 @@ void record_residuals(const Model& model, const TermInputs& inputs,
   }
 }
 
+// ---- Parts of the energy for Python, here so that they are compiled once.
+
+void box_steps(const Table& x, const Table& gradient, const Tables& hessian, const Table& lower,
+               const Table& upper, const Numbers& lam, const Numbers& metric, const Places& rows,
+               const Matrix& step, const Vector& predicted) {
+  const Index problems = x.size(), d = x.size(1), count = rows.size();
+  expect_shape("gradient", gradient, {problems, d});
+  expect_shape("hessian", hessian, {problems, d, d});
+  expect_shape("lower", lower, {problems, d});
+  expect_shape("upper", upper, {problems, d});
+  expect_shape("lam", lam, {problems});
+  expect_shape("metric", metric, {d});
+  expect_range("rows", rows, 0, problems);
+  expect_shape("step", step, {count, d});
+  expect_shape("predicted", predicted, {count});
+  const Scratch<double, 1> low(d), high(d);
+  BoxStep box(d);
+  for (Index k = 0; k < count; ++k) {
+    const Index n = rows[k];
+    for (Index i = 0; i < d; ++i) {
+      low[i] = lower(n, i) - x(n, i);
+      high[i] = upper(n, i) - x(n, i);
+    }
+    predicted[k] = box.take(gradient[n], hessian[n], low, high, lam[n], metric, step[k]);
+  }
+}
+
+void evaluate_prior_at(const PriorModel& model, const Table& poses, const Vector& value,
+                       const Matrix& gradient, const Tensor& hessian) {
+  const Index n = poses.size(), d = model.dimension();
+  expect_shape("poses", poses, {n, d});
+  expect_shape("value", value, {n});
+  expect_shape("gradient", gradient, {n, d});
+  expect_shape("hessian", hessian, {n, d, d});
+  const PriorRoom room(model);
+  for (Index i = 0; i < n; ++i) {
+    value[i] = evaluate_prior(model, poses[i], false, true, gradient[i], hessian[i], room);
+  }
+}
+
+void add_overlaps_of_pose(const Overlaps& overlaps, const Tables& columns, const Table& origins,
+                          const Table& axes, const Table& dof_origins, bool wanted,
+                          const Vector& value, const Vector& gradient, const Matrix& hessian) {
+  const Index d = overlaps.dof_is_rotation.size();
+  expect_frames(overlaps.moves.size(), d, columns, origins, axes, dof_origins);
+  expect_shape("value", value, {1});
+  expect_shape("gradient", gradient, {d});
+  expect_shape("hessian", hessian, {d, d});
+  const OverlapRoom room(overlaps);
+  add_overlaps(overlaps, columns, origins, axes, dof_origins, wanted, value[0], gradient, hessian,
+               room);
+}
+
+HMT_WIDE double add_ground_energy(const GroundConstants& ground, const Tables& columns,
+                                  const Table& origins, const Table& axes, const Table& dof_origins,
+                                  bool wanted, const Vector& gradient, const Matrix& hessian) {
+  const Index d = ground.dimension();
+  expect_frames(ground.moves.size(), d, columns, origins, axes, dof_origins);
+  expect_shape("gradient", gradient, {d});
+  expect_shape("hessian", hessian, {d, d});
+  const Scratch<double, 1> row(d);
+  double total = 0.0;
+  if (ground.weights[0] > 0.0) {
+    total += add_upright(ground, columns, axes, row, wanted, gradient, hessian);
+  }
+  if (ground.weights[1] > 0.0) {
+    total += add_floor(ground, columns, origins, axes, dof_origins, row, wanted, gradient, hessian);
+  }
+  return total;
+}
+
+void fill_contour(const FleshTable& flesh, const Mask& wanted, const Lens& lens,
+                  const Tables& columns, const Table& origins, const ContourTable& result) {
+  flesh.check_frames(columns, origins);
+  const Index rings = flesh.rings();
+  expect_shape("contour.parts", result.parts, {2 * rings});
+  expect_shape("wanted", wanted, {flesh.parts()});
+  const Scratch<bool, 1> all(flesh.parts());
+  all.fill(true);
+  const RingLanes side_by_side(flesh, all.view());
+  const RingFrames frames(side_by_side);
+  const ContourRoom room(side_by_side);
+  const Contour contour = room.contour();
+  frames.place(side_by_side, columns, origins);
+  trace_contour(side_by_side, frames, lens, contour);
+  for (Index m = 0; m < 2 * rings; ++m) {
+    const Index i = m < rings ? m : m - rings + side_by_side.count();
+    result.parts[m] = contour.parts[i];
+    result.points[m].copy_from({contour.point(i).data(), {3}});
+    result.pixels(m, 0) = contour.u[i];
+    result.pixels(m, 1) = contour.v[i];
+    for (int k = 0; k < 6; ++k) result.projections[m].data[k] = contour.by[k][i];
+    result.normals(m, 0) = contour.nu[i];
+    result.normals(m, 1) = contour.nv[i];
+    result.valid[m] = contour.valid[i] > 0.0 && wanted[contour.parts[i]];
+    result.noise[m] = contour.noise[i];
+  }
+}
+
+void mark_visibility(const FleshTable& flesh, const Mask& occluders, const Tables& columns,
+                     const Table& origins, const Places& parts, const Table& points,
+                     const Mask& valid, const Array<bool, 1>& covered,
+                     const Array<bool, 1>& hidden) {
+  flesh.check_frames(columns, origins);
+  const Index count = flesh.parts(), p = points.size(), whole = in_whole_lanes(p);
+  expect_shape("occluders", occluders, {count});
+  expect_shape("points", points, {p, 3});
+  expect_shape("parts", parts, {p});
+  expect_range("parts", parts, 0, count);
+  expect_shape("valid", valid, {p});
+  expect_shape("covered", covered, {p});
+  expect_shape("hidden", hidden, {p});
+  if (p == 0) return;
+  const Scratch<double, 2> rows(6, whole);
+  const Scratch<double, 1> extents(count);
+  const Scratch<Index, 1> parts_of(whole);
+  for (Index i = 0; i < whole; ++i) {
+    const Index n = std::min(i, p - 1), part = parts[n], s = flesh.part_segments[part];
+    const double *axes = columns[s].data, *middle = flesh.part_centres[part].data;
+    double away[3];
+    for (int k = 0; k < 3; ++k) {
+      rows(k, i) = points(n, k);
+      away[k] = points(n, k) - (origins(s, k) + axes[k] * middle[0] + axes[3 + k] * middle[1] +
+                                axes[6 + k] * middle[2]);
+    }
+    rows(3, i) = valid[n];
+    parts_of[i] = part;
+    extents[part] = most(extents[part], std::sqrt(dot(away, away)));
+  }
+  const auto row = [&](int k) { return rows[k].data; };
+  mark_hidden(flesh, occluders, extents.view().data, columns, origins, Occluders(count),
+              {whole, parts_of.view().data, row(0), row(1), row(2), row(3), row(4), row(5)});
+  for (Index n = 0; n < p; ++n) {
+    covered[n] = rows(4, n) > 0.0;
+    hidden[n] = rows(5, n) > 0.0;
+  }
+}
+
 }  // namespace hmt

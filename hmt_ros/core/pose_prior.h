@@ -145,17 +145,7 @@ HMT_WIDE inline double evaluate_prior(const PriorModel& model, const Numbers& po
 
 // Energies (N,) of poses (N, d), and their gradients (N, d) and positive definite Hessians
 // (N, d, d).
-inline void evaluate_prior_at(const PriorModel& model, const Table& poses, const Vector& value,
-                              const Matrix& gradient, const Tensor& hessian) {
-  const Index n = poses.size(), d = model.dimension();
-  expect_shape("poses", poses, {n, d});
-  expect_shape("value", value, {n});
-  expect_shape("gradient", gradient, {n, d});
-  expect_shape("hessian", hessian, {n, d, d});
-  const PriorRoom room(model);
-  for (Index i = 0; i < n; ++i) {
-    value[i] = evaluate_prior(model, poses[i], false, true, gradient[i], hessian[i], room);
-  }
-}
+void evaluate_prior_at(const PriorModel& model, const Table& poses, const Vector& value,
+                       const Matrix& gradient, const Tensor& hessian);
 
 }  // namespace hmt

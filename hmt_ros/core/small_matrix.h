@@ -39,57 +39,15 @@ HMT_WIDE inline double distance(const double* one, const double* other, Index wi
 
 // Cholesky factorisation, rows of the upper factor in place; reads and leaves right what is not
 // left of the diagonal. False for a matrix that is not positive definite.
-HMT_WIDE inline bool factorise(Rows u, Index n) {
-  for (Index a = 0; a < n; ++a) {
-    double* row = u[a];
-    if (!(row[a] > 0.0)) return false;
-    divide(row, std::sqrt(row[a]), a / group_size * group_size, u.stride);
-    for (Index c = a + 1; c < n; ++c)
-      subtract(u[c], row[c], row, c / group_size * group_size, u.stride);
-  }
-  return true;
-}
+bool factorise(Rows u, Index n);
 
 // Gaussian elimination with partial pivoting of (n, n) and of what stands right of it, in place.
 // Returns the sign of the permutation, or 0 for a singular matrix.
-HMT_WIDE inline double eliminate(Rows u, Index n) {
-  double sign = 1.0;
-  for (Index j = 0; j < n; ++j) {
-    Index largest = j;
-    for (Index i = j + 1; i < n; ++i) {
-      if (std::abs(u[i][j]) > std::abs(u[largest][j])) largest = i;
-    }
-    double* row = u[j];
-    const Index first = j / group_size * group_size;
-    if (largest != j) {
-      sign = -sign;
-      for (Index b = first; b < u.stride; b += group_size) {
-        const Group<double> other = group(row + b);
-        group(row + b) = group(u[largest] + b);
-        group(u[largest] + b) = other;
-      }
-    }
-    if (row[j] == 0.0) return 0.0;
-    for (Index i = j + 1; i < n; ++i) {
-      if (u[i][j] != 0.0) subtract(u[i], u[i][j] / row[j], row, first, u.stride);
-    }
-  }
-  return sign;
-}
+double eliminate(Rows u, Index n);
 
 // Solves for the columns from `first` on, in place: upper triangle, or lower triangle of rows.
-HMT_WIDE inline void solve_upper(Rows u, Index n, Index first) {
-  for (Index i = n - 1; i >= 0; --i) {
-    for (Index j = i + 1; j < n; ++j) subtract(u[i], u[i][j], u[j], first, u.stride);
-    divide(u[i], u[i][i], first, u.stride);
-  }
-}
-HMT_WIDE inline void solve_lower(Rows l, Index n, Index first) {
-  for (Index i = 0; i < n; ++i) {
-    for (Index j = 0; j < i; ++j) subtract(l[i], l[i][j], l[j], first, l.stride);
-    divide(l[i], l[i][i], first, l.stride);
-  }
-}
+void solve_upper(Rows u, Index n, Index first);
+void solve_lower(Rows l, Index n, Index first);
 
 // Inverse of a positive definite matrix, of which it reads what is not left of the diagonal, in
 // place; `room` holds as much. Makes the logarithm of the determinant of the matrix. False, with
@@ -267,78 +225,11 @@ struct Strided {
   }
 };
 
-// R rows and G groups of columns of a product: sums run along `inner` in order.
-template <class T, int R, int G>
-HMT_INLINE void multiply_rows(Strided<T> a, Index first, const T* b, Index b_stride, Index inner,
-                              Strided<T> result, Index column, Index columns) {
-  constexpr Index count = Lanes<T>::count;
-  Group<T> sums[R][G] = {};
-  for (Index k = 0; k < inner; ++k) {
-    for (int c = 0; c < G; ++c) {
-      const auto right = *reinterpret_cast<const Group<T>*>(b + k * b_stride + c * count);
-      for (int r = 0; r < R; ++r) sums[r][c] += a(first + r, k) * right;
-    }
-  }
-  for (int r = 0; r < R; ++r) {
-    for (int c = 0; c < G; ++c) {
-      T each[count];
-      *reinterpret_cast<Group<T>*>(each) = sums[r][c];
-      const Index start = column + c * count, wanted = std::min(count, columns - c * count);
-      for (Index j = 0; j < wanted; ++j) result(first + r, start + j) = each[j];
-    }
-  }
-}
-template <class T, int G>
-HMT_INLINE void multiply_columns(Strided<T> a, const T* b, Index b_stride, Index m, Index inner,
-                                 Strided<T> result, Index column, Index columns) {
-  Index i = 0;
-  if constexpr (G == 2) {
-    for (; i + 6 <= m; i += 6) {
-      multiply_rows<T, 6, 2>(a, i, b, b_stride, inner, result, column, columns);
-    }
-    for (; i + 2 <= m; i += 2) {
-      multiply_rows<T, 2, 2>(a, i, b, b_stride, inner, result, column, columns);
-    }
-  }
-  for (; i < m; ++i) multiply_rows<T, 1, G>(a, i, b, b_stride, inner, result, column, columns);
-}
-
 // Matrix product (m, inner) (inner, n); `room` for inner pairs of groups. The sums of a single
 // column are those of `dot`.
-template <class T>
-HMT_WIDE void multiply(Strided<T> a, Strided<T> b, Strided<T> result, Index m, Index inner, Index n,
-                       T* room) {
-  constexpr Index count = 2 * Lanes<T>::count;
-  if (n == 1) {
-    T* other = room + inner;
-    for (Index k = 0; k < inner; ++k) room[k] = b(k, 0);
-    for (Index i = 0; i < m; ++i) {
-      const T* row = &a(i, 0);
-      if (a.column != sizeof(T)) {
-        for (Index k = 0; k < inner; ++k) other[k] = a(i, k);
-        row = other;
-      }
-      result(i, 0) = dot(row, room, inner);
-    }
-    return;
-  }
-  const bool together = b.column == sizeof(T);
-  const Index stride = b.row / Index(sizeof(T));
-  Index column = 0;
-  for (; together && m < 6 && column + 4 * count <= n; column += 4 * count) {
-    multiply_columns<T, 8>(a, &b(0, column), stride, m, inner, result, column, 4 * count);
-  }
-  for (; together && column + count <= n; column += count) {
-    multiply_columns<T, 2>(a, &b(0, column), stride, m, inner, result, column, count);
-  }
-  for (; column < n; column += count) {
-    const Index columns = std::min(count, n - column);
-    for (Index k = 0; k < inner; ++k) {
-      for (Index j = 0; j < columns; ++j) room[k * count + j] = b(k, column + j);
-      for (Index j = columns; j < count; ++j) room[k * count + j] = T(0);
-    }
-    multiply_columns<T, 2>(a, room, count, m, inner, result, column, columns);
-  }
-}
+void multiply(Strided<double> a, Strided<double> b, Strided<double> result, Index m, Index inner,
+              Index n, double* room);
+void multiply(Strided<float> a, Strided<float> b, Strided<float> result, Index m, Index inner,
+              Index n, float* room);
 
 }  // namespace hmt::matrices

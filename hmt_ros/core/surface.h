@@ -533,74 +533,15 @@ struct ContourTable {
 
 // For Python: fills the contour of one pose, but for what hides it. `wanted` (B,) are the parts
 // whose contour is traced; the others have no valid points.
-inline void fill_contour(const FleshTable& flesh, const Mask& wanted, const Lens& lens,
-                         const Tables& columns, const Table& origins, const ContourTable& result) {
-  flesh.check_frames(columns, origins);
-  const Index rings = flesh.rings();
-  expect_shape("contour.parts", result.parts, {2 * rings});
-  expect_shape("wanted", wanted, {flesh.parts()});
-  const Scratch<bool, 1> all(flesh.parts());
-  all.fill(true);
-  const RingLanes side_by_side(flesh, all.view());
-  const RingFrames frames(side_by_side);
-  const ContourRoom room(side_by_side);
-  const Contour contour = room.contour();
-  frames.place(side_by_side, columns, origins);
-  trace_contour(side_by_side, frames, lens, contour);
-  for (Index m = 0; m < 2 * rings; ++m) {
-    const Index i = m < rings ? m : m - rings + side_by_side.count();
-    result.parts[m] = contour.parts[i];
-    result.points[m].copy_from({contour.point(i).data(), {3}});
-    result.pixels(m, 0) = contour.u[i];
-    result.pixels(m, 1) = contour.v[i];
-    for (int k = 0; k < 6; ++k) result.projections[m].data[k] = contour.by[k][i];
-    result.normals(m, 0) = contour.nu[i];
-    result.normals(m, 1) = contour.nv[i];
-    result.valid[m] = contour.valid[i] > 0.0 && wanted[contour.parts[i]];
-    result.noise[m] = contour.noise[i];
-  }
-}
+void fill_contour(const FleshTable& flesh, const Mask& wanted, const Lens& lens,
+                  const Tables& columns, const Table& origins, const ContourTable& result);
 
 // Marks points (P, 3) with other parts on their rays, and those with parts before them. `occluders`
 // (B,) are the parts that can hide, `parts` (P,) those that a point is of, which do not hide it;
 // points that are not valid are neither covered nor hidden.
-inline void mark_visibility(const FleshTable& flesh, const Mask& occluders, const Tables& columns,
-                            const Table& origins, const Places& parts, const Table& points,
-                            const Mask& valid, const Array<bool, 1>& covered,
-                            const Array<bool, 1>& hidden) {
-  flesh.check_frames(columns, origins);
-  const Index count = flesh.parts(), p = points.size(), whole = in_whole_lanes(p);
-  expect_shape("occluders", occluders, {count});
-  expect_shape("points", points, {p, 3});
-  expect_shape("parts", parts, {p});
-  expect_range("parts", parts, 0, count);
-  expect_shape("valid", valid, {p});
-  expect_shape("covered", covered, {p});
-  expect_shape("hidden", hidden, {p});
-  if (p == 0) return;
-  const Scratch<double, 2> rows(6, whole);
-  const Scratch<double, 1> extents(count);
-  const Scratch<Index, 1> parts_of(whole);
-  for (Index i = 0; i < whole; ++i) {
-    const Index n = std::min(i, p - 1), part = parts[n], s = flesh.part_segments[part];
-    const double *axes = columns[s].data, *middle = flesh.part_centres[part].data;
-    double away[3];
-    for (int k = 0; k < 3; ++k) {
-      rows(k, i) = points(n, k);
-      away[k] = points(n, k) - (origins(s, k) + axes[k] * middle[0] + axes[3 + k] * middle[1] +
-                                axes[6 + k] * middle[2]);
-    }
-    rows(3, i) = valid[n];
-    parts_of[i] = part;
-    extents[part] = most(extents[part], std::sqrt(dot(away, away)));
-  }
-  const auto row = [&](int k) { return rows[k].data; };
-  mark_hidden(flesh, occluders, extents.view().data, columns, origins, Occluders(count),
-              {whole, parts_of.view().data, row(0), row(1), row(2), row(3), row(4), row(5)});
-  for (Index n = 0; n < p; ++n) {
-    covered[n] = rows(4, n) > 0.0;
-    hidden[n] = rows(5, n) > 0.0;
-  }
-}
+void mark_visibility(const FleshTable& flesh, const Mask& occluders, const Tables& columns,
+                     const Table& origins, const Places& parts, const Table& points,
+                     const Mask& valid, const Array<bool, 1>& covered,
+                     const Array<bool, 1>& hidden);
 
 }  // namespace hmt

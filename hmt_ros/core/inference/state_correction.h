@@ -111,8 +111,8 @@ inline void widen_precisions(const Tables& precisions, const Places& ancestors,
       for (Index j = 0; j < d; ++j) blocks.row(1, i)[j] = sigma * own(rows[i], j);
     }
     expect_factor(factorise(blocks.rows(), m), "precisions");
-    multiply<double>(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, m, d,
-                     room.view().data);
+    multiply(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, m, d,
+             room.view().data);
     for (Index i = 0; i < d * d; ++i) to.data[i] -= loss.view().data[i];
   }
 }
@@ -135,8 +135,8 @@ inline void fuse(const Tables& a, const Tables& b, const Tensor& result) {
       }
     }
     expect_factor(factorise(blocks.rows(), d), "a");
-    multiply<double>(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, d, d,
-                     room.view().data);
+    multiply(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, d, d,
+             room.view().data);
     for (Index i = 0; i < d; ++i) {
       for (Index j = 0; j < d; ++j) {
         result(n, i, j) = 0.5 * (a(n, i, j) + a(n, j, i)) - loss(i, j);
@@ -184,13 +184,13 @@ inline void correct_states(const Predicted& predicted, const Places& ancestors,
     }
     // With P_xx = U' U the block beside it becomes Y = U'^-1 P_xv, so that G P_xv = Y' Y; then G'.
     expect_factor(factorise(blocks.rows(), d), "predicted.covariances");
-    multiply<double>(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, d, d,
-                     room.view().data);
+    multiply(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, d, d,
+             room.view().data);
     solve_upper(blocks.rows(), d, blocks.start(1));
-    multiply<double>(blocks.transposed(1), rows_of(const_cast<double*>(found[n].data), d),
-                     rows_of(together[0].data, d), d, d, d, room.view().data);
-    multiply<double>(rows_of(together[0].data, d), blocks.matrix(1), rows_of(gain[0].data, d), d, d,
-                     d, room.view().data);
+    multiply(blocks.transposed(1), rows_of(const_cast<double*>(found[n].data), d),
+             rows_of(together[0].data, d), d, d, d, room.view().data);
+    multiply(rows_of(together[0].data, d), blocks.matrix(1), rows_of(gain[0].data, d), d, d, d,
+             room.view().data);
     const Matrix to = result[n];
     for (Index i = 0; i < d; ++i) {
       double moved = 0.0;

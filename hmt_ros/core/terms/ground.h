@@ -122,23 +122,8 @@ inline double add_floor(const GroundConstants& ground, const Tables& columns, co
 }
 
 // Energy of one pose; adds its gradient (d,) and Hessian (d, d), where wanted.
-HMT_WIDE inline double add_ground_energy(const GroundConstants& ground, const Tables& columns,
-                                         const Table& origins, const Table& axes,
-                                         const Table& dof_origins, bool wanted,
-                                         const Vector& gradient, const Matrix& hessian) {
-  const Index d = ground.dimension();
-  expect_frames(ground.moves.size(), d, columns, origins, axes, dof_origins);
-  expect_shape("gradient", gradient, {d});
-  expect_shape("hessian", hessian, {d, d});
-  const Scratch<double, 1> row(d);
-  double total = 0.0;
-  if (ground.weights[0] > 0.0) {
-    total += add_upright(ground, columns, axes, row, wanted, gradient, hessian);
-  }
-  if (ground.weights[1] > 0.0) {
-    total += add_floor(ground, columns, origins, axes, dof_origins, row, wanted, gradient, hessian);
-  }
-  return total;
-}
+double add_ground_energy(const GroundConstants& ground, const Tables& columns, const Table& origins,
+                         const Table& axes, const Table& dof_origins, bool wanted,
+                         const Vector& gradient, const Matrix& hessian);
 
 }  // namespace hmt

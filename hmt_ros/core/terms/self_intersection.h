@@ -172,19 +172,9 @@ HMT_WIDE inline void add_overlaps(const Overlaps& overlaps, const Tables& column
 }
 
 // For Python: `add_overlaps` of one pose; value (1,) is added to.
-inline void add_overlaps_of_pose(const Overlaps& overlaps, const Tables& columns,
-                                 const Table& origins, const Table& axes, const Table& dof_origins,
-                                 bool wanted, const Vector& value, const Vector& gradient,
-                                 const Matrix& hessian) {
-  const Index d = overlaps.dof_is_rotation.size();
-  expect_frames(overlaps.moves.size(), d, columns, origins, axes, dof_origins);
-  expect_shape("value", value, {1});
-  expect_shape("gradient", gradient, {d});
-  expect_shape("hessian", hessian, {d, d});
-  const OverlapRoom room(overlaps);
-  add_overlaps(overlaps, columns, origins, axes, dof_origins, wanted, value[0], gradient, hessian,
-               room);
-}
+void add_overlaps_of_pose(const Overlaps& overlaps, const Tables& columns, const Table& origins,
+                          const Table& axes, const Table& dof_origins, bool wanted,
+                          const Vector& value, const Vector& gradient, const Matrix& hessian);
 
 // Fills the depths (Q,) of pairs of parts of a pose, m; negative: they are apart.
 inline void overlap_depths(const Capsules& parts, const Places& first, const Places& second,
