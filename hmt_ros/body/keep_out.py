@@ -38,6 +38,9 @@ BARE = 0.07
 SPACING = 1.2
 # Share of a radius that is added to it rather than covered by capsules side by side.
 LITTLE = 0.15
+# Cosines and sines of angles around an axis.
+_ANGLES = np.arange(8) * (np.pi / 4)
+_RING = np.stack([elementary.cos(_ANGLES), elementary.sin(_ANGLES)])
 # Speed, m/s, and reach, m, of a striking hand.
 STRIKING_SPEED, ARM_REACH = 7.0, 0.7
 # Speed that a person hardly exceeds, a runner's, m/s.
@@ -83,7 +86,7 @@ class Capsules:
         some = self[order]
         axes = (np.ascontiguousarray(x) for x in (some.starts, some.ends))
         kept = np.empty(len(some), dtype=np.bool_)
-        find_not_held(*axes, some.radii, some._surfaces(), kept)
+        find_not_held(*axes, some.radii, _RING, kept)
         return self[np.sort(order[kept])]
 
     def grown(self, reach: float) -> Capsules:
@@ -94,27 +97,6 @@ class Capsules:
     def _sizes(self) -> Array:
         lengths = np.linalg.norm(self.ends - self.starts, axis=1)
         return np.asarray(np.pi * self.radii**2 * (lengths + 4.0 / 3.0 * self.radii))
-
-    def _surfaces(self) -> Array:
-        """Points (N, 26, 3) around three places of each axis, and beyond its ends."""
-        axes = self.ends - self.starts
-        lengths = np.linalg.norm(axes, axis=1, keepdims=True)
-        along = np.where(lengths > 1e-9, axes / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])
-        side = np.cross(along, np.eye(3)[np.abs(along).argmin(1)])
-        side /= np.linalg.norm(side, axis=1, keepdims=True)
-        other = np.cross(along, side)
-        angles = np.arange(8) * (np.pi / 4)
-        ring = (
-            elementary.cos(angles)[:, None] * side[:, None]
-            + elementary.sin(angles)[:, None] * other[:, None]
-        )
-        ring *= self.radii[:, None, None]
-        places = self.starts[:, None] + np.array([0.0, 0.5, 1.0])[:, None] * axes[:, None]
-        around = (places[:, :, None] + ring[:, None]).reshape(len(self), -1, 3)
-        tip = self.radii[:, None] * along
-        return np.concatenate(
-            [around, (self.starts - tip)[:, None], (self.ends + tip)[:, None]], axis=1
-        )
 
 
 def reach_after(time: float) -> float:

@@ -63,7 +63,7 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "overlap_depths", overlap_depths, "parts first second columns origins depths");
   bind(m, "add_ground_energy", add_ground_energy,
        "ground columns origins axes dof_origins wanted gradient hessian");
-  bind(m, "find_not_held", find_not_held, "starts ends radii points kept");
+  bind(m, "find_not_held", find_not_held, "starts ends radii ring kept");
   bind(m, "sum_shape_residuals", sum_shape_residuals,
        "table lifts parents dof_segments is_rotation joint_segments columns origins axes "
        "dof_origins of_flesh of_joints gradient curvature mixed");

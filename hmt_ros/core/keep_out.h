@@ -1,7 +1,7 @@
 // Capsules inside of larger ones; see hmt_ros/body/keep_out.py.
 #pragma once
 
-#include "lanes.h"
+#include "small_matrix.h"
 
 namespace hmt {
 
@@ -14,79 +14,130 @@ struct Axis {
       : start{from[0], from[1], from[2]},
         way{to[0] - from[0], to[1] - from[1], to[2] - from[2]},
         squared(most(dot(way, way), 1e-18)) {}
-
-  // Squared distance of a point.
-  double distance_squared(const double* p) const {
-    double away[3] = {p[0] - start[0], p[1] - start[1], p[2] - start[2]};
-    const double along = between(dot(away, way) / squared, 0.0, 1.0);
-    for (int k = 0; k < 3; ++k) away[k] -= along * way[k];
-    return dot(away, away);
-  }
 };
 
-// Marks which points, by coordinate (3, stride), are no more outside of a capsule; how many are.
-HMT_WIDE inline Index leave_outside(const Axis& axis, double limit, const double* points,
-                                    Index stride, double* outside) {
-  double rest = 0.0;  // of numbers 0 and 1
-#pragma omp simd reduction(+ : rest)
-  for (Index p = 0; p < stride; ++p) {
-    const double x = points[p] - axis.start[0], y = points[stride + p] - axis.start[1],
-                 z = points[2 * stride + p] - axis.start[2];
-    const double dots = x * axis.way[0] + y * axis.way[1] + z * axis.way[2];
-    const double share = dots / axis.squared;
-    const double low = share > 0.0 ? share : 0.0, along = low < 1.0 ? low : 1.0;
-    const double dx = x - along * axis.way[0], dy = y - along * axis.way[1],
-                 dz = z - along * axis.way[2];
-    outside[p] = dx * dx + dy * dy + dz * dz > limit ? outside[p] : 0.0;
-    rest += outside[p];
-  }
-  return Index(rest);
+// Squared distances of a group of points from an axis; by coordinate, a stride apart.
+HMT_INLINE void square_distances(const Axis& axis, const double* points, Index stride,
+                                 Group<double>& squares) {
+  const auto at = [&](int k) {
+    return reinterpret_cast<const Group<double>*>(points + k * stride);
+  };
+  const Group<double> x = *at(0) - axis.start[0], y = *at(1) - axis.start[1],
+                      z = *at(2) - axis.start[2], zero{};
+  const Group<double> dots = x * axis.way[0] + y * axis.way[1] + z * axis.way[2];
+  const Group<double> share = dots / axis.squared, low = share > zero ? share : zero;
+  const Group<double> one = zero + 1.0, along = low < one ? low : one;
+  const Group<double> dx = x - along * axis.way[0], dy = y - along * axis.way[1],
+                      dz = z - along * axis.way[2];
+  squares = dx * dx + dy * dy + dz * dz;
 }
 
-// Fills whether each of N capsules, largest first, has points (N, P, 3) outside of those before.
-inline void find_not_held(const Table& starts, const Table& ends, const Numbers& radii,
-                          const Tables& points, const Array<bool, 1>& kept) {
-  const Index n = radii.size(), count = points.size(1);
-  expect_shape("starts", starts, {n, 3});
-  expect_shape("ends", ends, {n, 3});
-  expect_shape("points", points, {n, count, 3});
-  expect_shape("kept", kept, {n});
-  kept.fill(false);
-  const Index stride = in_whole_lanes(count);
-  const Scratch<double, 2> outside(n, stride);
-  const Scratch<double, 3> by_coordinate(n, 3, stride);
-  const Scratch<Index, 1> left(n);
-  left.fill(count);
-  for (Index j = 0; j < n; ++j) {
-    for (Index p = 0; p < count; ++p) {
-      outside(j, p) = 1.0;
-      for (int k = 0; k < 3; ++k) by_coordinate(j, k, p) = points(j, p, k);
+// Marks by 0 which points, whole groups, are not outside of a capsule; whether one still is.
+HMT_WIDE inline bool leave_outside(Axis axis, double radius, const double* points, Index stride,
+                                   double* outside) {
+  const Group<double> zero{}, limit = zero + radius * radius;
+  Group<double> rest{}, squares;
+  for (Index p = 0; p < stride; p += group_size) {
+    Group<double>& own = matrices::group(outside + p);
+    square_distances(axis, points + p, stride, squares);
+    own = squares > limit ? own : zero;
+    rest += own;
+  }
+  return rest[0] + rest[1] + rest[2] + rest[3] > 0.0;
+}
+
+// Lists which balls from `first` on touch a capsule; those whose size is no number do not. Their
+// middles are whole groups. Returns how many do.
+HMT_WIDE inline Index find_touched(Axis axis, double radius, const Matrix& middles,
+                                   const double* sizes, Index first, Index* touched) {
+  Index count = 0;
+  Group<double> squares;
+  for (Index j = first / group_size * group_size; j < middles.size(1); j += group_size) {
+    const Group<double> reach = *reinterpret_cast<const Group<double>*>(sizes + j) + radius;
+    square_distances(axis, middles.data + j, middles.size(1), squares);
+    const auto near = squares <= reach * reach;
+    if (!(near[0] | near[1] | near[2] | near[3])) continue;
+    for (Index k = std::max(first - j, Index(0)); k < group_size; ++k) {
+      if (near[k]) touched[count++] = j + k;
     }
   }
+  return count;
+}
+
+inline Index in_whole_groups(Index count) {
+  return (count + group_size - 1) / group_size * group_size;
+}
+
+// Points around three places of the axis of a capsule, by a ring (2, A) of cosines and sines, and
+// beyond its ends; by coordinate (3, stride).
+inline void fill_around(const Axis& axis, const double* end, double radius, const Table& ring,
+                        double* points, Index stride) {
+  const double length = std::sqrt(dot(axis.way, axis.way));
+  double along[3] = {0.0, 0.0, 1.0}, side[3] = {}, unit[3] = {};
+  for (int k = 0; length > 1e-9 && k < 3; ++k) along[k] = axis.way[k] / length;
+  int least_along = 0;
+  for (int k = 1; k < 3; ++k) {
+    if (std::abs(along[k]) < std::abs(along[least_along])) least_along = k;
+  }
+  unit[least_along] = 1.0;
+  const auto across = cross(along, unit);
+  const double norm = std::sqrt(dot(across.data(), across.data()));
+  for (int k = 0; k < 3; ++k) side[k] = across[k] / norm;
+  const auto other = cross(along, side);
+  const Index angles = ring.size(1);
+  for (int k = 0; k < 3; ++k) {
+    double* point = points + k * stride;
+    for (double share : {0.0, 0.5, 1.0}) {
+      const double place = axis.start[k] + share * axis.way[k];
+      for (Index a = 0; a < angles; ++a) {
+        *point++ = place + (ring(0, a) * side[k] + ring(1, a) * other[k]) * radius;
+      }
+    }
+    *point++ = axis.start[k] - radius * along[k];
+    *point++ = end[k] + radius * along[k];
+  }
+}
+
+// Fills whether each of N capsules, largest first, has points on its surface, by a ring (2, A) of
+// cosines and sines around its axis, outside of those before.
+inline void find_not_held(const Table& starts, const Table& ends, const Numbers& radii,
+                          const Table& ring, const Array<bool, 1>& kept) {
+  const Index n = radii.size(), count = 3 * ring.size(1) + 2;
+  expect_shape("starts", starts, {n, 3});
+  expect_shape("ends", ends, {n, 3});
+  expect_shape("ring", ring, {2, -1});
+  expect_shape("kept", kept, {n});
+  kept.fill(false);
+  const Index stride = in_whole_groups(count), whole = in_whole_groups(n);
+  const Scratch<double, 2> outside(n, stride), points(n, 3 * stride);
   // A ball around each: most pairs are far apart.
-  const Scratch<double, 2> middles(n, 3);
-  const Scratch<double, 1> sizes(n);
+  const Scratch<double, 2> middles(3, whole);
+  const Scratch<double, 1> sizes(whole);
+  const Scratch<Index, 1> touched(whole);
+  const Scratch<bool, 1> held(n);
+  sizes.fill(nan);
   for (Index j = 0; j < n; ++j) {
+    std::fill_n(outside[j].data, count, 1.0);
+    const Axis axis(starts[j].data, ends[j].data);
+    fill_around(axis, ends[j].data, radii[j], ring, points[j].data, stride);
     double half = 0.0;
     for (int k = 0; k < 3; ++k) {
-      middles(j, k) = 0.5 * (starts(j, k) + ends(j, k));
+      middles(k, j) = 0.5 * (starts(j, k) + ends(j, k));
       half += square(0.5 * (ends(j, k) - starts(j, k)));
     }
     sizes[j] = std::sqrt(half) + radii[j];
   }
   for (Index i = 0; i < n; ++i) {
-    if (left[i] == 0) continue;
+    if (held[i]) continue;
     kept[i] = true;
     const Axis axis(starts[i].data, ends[i].data);
-    const double limit = radii[i] * radii[i];
-    const double* middle = middles[i].data;
-    for (Index j = i + 1; j < n; ++j) {
-      if (left[j] == 0) continue;
-      const double* other = middles[j].data;
-      const double away[3] = {other[0] - middle[0], other[1] - middle[1], other[2] - middle[2]};
-      if (dot(away, away) > square(sizes[i] + sizes[j])) continue;
-      if (axis.distance_squared(other) > square(radii[i] + sizes[j])) continue;
-      left[j] = leave_outside(axis, limit, by_coordinate[j].data, stride, outside[j].data);
+    const Index near =
+        find_touched(axis, radii[i], middles, sizes.view().data, i + 1, touched.view().data);
+    for (Index k = 0; k < near; ++k) {
+      const Index j = touched[k];
+      if (leave_outside(axis, radii[i], points[j].data, stride, outside[j].data)) continue;
+      held[j] = true;
+      sizes[j] = nan;
     }
   }
 }
