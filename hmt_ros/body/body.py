@@ -268,8 +268,8 @@ class Body:
         """Derivatives (N, J, 3, d) of the joint positions with respect to the poses (N, d)."""
         frames = kinematics.forward(self.skeleton, poses)
         segments = self.skeleton.joint_segments
-        jacobian = kinematics.point_jacobians(frames, segments, frames.joints())
-        return np.ascontiguousarray(jacobian.transpose(3, 0, 2, 1))
+        points = frames.places(segments, self.skeleton.joint_offsets)
+        return kinematics.point_jacobians(frames, segments, points)
 
     def with_segment_lengths(self, lengths: Mapping[str, float]) -> Body:
         """The same body with other values (m) of some lengths.

@@ -319,8 +319,7 @@ def sole_points(body: Body, poses: Array) -> Array:
 def sole_jacobians(body: Body, poses: Array) -> Array:
     """Derivatives (N, P, 3, d) of the points of the soles with respect to the poses (N, d)."""
     feet, frames = soles(body), forward(body.skeleton, poses)
-    found = point_jacobians(frames, feet.segments, frames.points(feet.segments, feet.local))
-    return np.ascontiguousarray(found.transpose(3, 0, 2, 1))
+    return point_jacobians(frames, feet.segments, frames.places(feet.segments, feet.local))
 
 
 def _down_and_ahead(skeleton: Skeleton, ankle: int, toe: int, carrier: int) -> tuple[Array, Array]:

@@ -125,13 +125,13 @@ def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float =
     wide = _radius(probability)
     segments, local, radii = _parts(body)
     frames = forward(body.skeleton, some.means)
-    ends = frames.points(segments, local)
-    jacobians = point_jacobians(frames, segments, ends).transpose(3, 0, 2, 1)
+    ends = frames.places(segments, local)
+    jacobians = point_jacobians(frames, segments, ends)
     spread = product(product(jacobians, some.covariances[:, None]), jacobians.swapaxes(2, 3))
     variances, directions = symmetric_eigen(spread)
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     # (K, B, 2, ...): both ends of each part.
-    places = ends.transpose(2, 0, 1).reshape(len(some), -1, 2, 3)
+    places = ends.reshape(len(some), -1, 2, 3)
     deep = directions[..., 2].reshape(places.shape)
     across, along = (sigmas[..., i].reshape(places.shape[:3]).max(2) for i in (1, 2))
     # Both ends go the same way.

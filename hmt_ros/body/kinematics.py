@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.skeleton import Skeleton
-from hmt_ros.core import derive_along, lift_origins, place_points, place_poses
+from hmt_ros.core import derive_along, derive_points, lift_origins, place_points, place_poses
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product
 
@@ -190,14 +190,10 @@ def _poses_last(array: Array) -> Array:
 
 
 def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:
-    """Derivatives (P, d, 3, N) of points (P, 3, N) fixed to segments (P,)."""
-    skeleton = frames.skeleton
-    result = np.zeros((len(points), skeleton.dimension, 3, frames.count))
-    moves = skeleton.moves[segments]
-    point, dof = np.nonzero(moves & skeleton.dof_is_rotation)
-    result[point, dof] = _cross(frames.axes[dof], points[point] - frames.dof_origins[dof])
-    point, dof = np.nonzero(moves & ~skeleton.dof_is_rotation)
-    result[point, dof] = frames.axes[dof]
+    """Derivatives (N, P, 3, d) of points (N, P, 3) fixed to segments (P,)."""
+    skeleton, places = frames.skeleton, np.ascontiguousarray(points)
+    result = np.empty((*points.shape, skeleton.dimension))
+    derive_points(skeleton.moves, skeleton.dof_is_rotation, *frames.dofs, segments, places, result)
     return result
 
 

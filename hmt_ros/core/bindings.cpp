@@ -54,6 +54,8 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "find_rays", find_rays, "lens pixels rays");
   bind(m, "derive_along", derive_along,
        "moves is_rotation axes dof_origins segments points directions result");
+  bind(m, "derive_points", derive_points,
+       "moves is_rotation axes dof_origins segments points result");
   bind(m, "lift_origins", lift_origins, "parents basis columns result");
   bind(m, "fill_rings", fill_rings, "parts ring_parts heights centre radius slope lean");
   bind(m, "fill_surface", fill_surface, "parts heights cosines sines points normals");

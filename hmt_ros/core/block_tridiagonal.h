@@ -217,6 +217,16 @@ HMT_WIDE inline void multiply_band_transposed(const Matrix& columns, const Matri
   }
 }
 
+// The inverse of the lower triangle of rows, into rows that are 0.
+HMT_WIDE inline void invert_lower(matrices::Rows l, Index n, matrices::Rows result) {
+  for (Index i = 0; i < n; ++i) {
+    double* row = result[i];
+    row[i] = 1.0;
+    for (Index j = 0; j < i; ++j) matrices::subtract(row, l[i][j], result[j], 0, j + 1);
+    matrices::divide(row, l[i][i], 0, i + 1);
+  }
+}
+
 // The block at `place` on the diagonal of P^-1, (n, n), given the one after it; that of the last
 // place needs none. With the blocks B below L in this column, G = B L^-1 and C of the block after,
 //
@@ -233,24 +243,20 @@ inline void invert_block(const Matrix& columns, Index place, const Table& after,
   const bool last = first + n == columns.size();
   expect_shape("after", after, {last ? 0 : n, n});
   const Index side = in_whole_lanes(n), rows = last ? n : 2 * n;
-  const Scratch<double, 2> own(n, 2 * side), below(n, side), left(rows, side), right(rows, side);
+  const Scratch<double, 2> own(n, side), below(n, side), left(rows, side), right(rows, side);
   const Scratch<double, 1> room((rows + 1) * lanes);
   for (Index b = 0; b < n; ++b) {
     const double* column = columns[first + b].data;
     for (Index a = b; a < n && a - b <= width; ++a) own(a, b) = column[a - b];
     for (Index a = 0; !last && a < n && n + a - b <= width; ++a) below(a, b) = column[n + a - b];
-    own(b, side + b) = 1.0;
   }
-  solve_lower({own[0].data, 2 * side}, n, side);
+  invert_lower({own[0].data, side}, n, {left[0].data, side});
+  std::copy_n(left[0].data, n * side, right[0].data);
   const auto matrix = [](double* data, Index stride, bool turned = false) {
     const Index down = stride * Index(sizeof(double)), across = sizeof(double);
     char* bytes = reinterpret_cast<char*>(data);
     return turned ? Strided<double>{bytes, across, down} : Strided<double>{bytes, down, across};
   };
-  for (Index a = 0; a < n; ++a) {
-    std::copy_n(own[a].data + side, n, left[a].data);
-    std::copy_n(own[a].data + side, n, right[a].data);
-  }
   if (!last) {
     double *gain = left[n].data, *carried = right[n].data;
     multiply(matrix(below[0].data, side), matrix(left[0].data, side), matrix(gain, side), n, n, n,

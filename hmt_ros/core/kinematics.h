@@ -240,6 +240,35 @@ inline void derive_along(const Array<const bool, 2>& moves, const Mask& is_rotat
   }
 }
 
+// Fills the derivatives (N, P, 3, d) of points (N, P, 3) on segments (P,) of N poses; zero where a
+// degree of freedom does not move the point.
+inline void derive_points(const Array<const bool, 2>& moves, const Mask& is_rotation,
+                          const Tables& axes, const Tables& dof_origins, const Places& segments,
+                          const Tables& points, const Array<double, 4>& result) {
+  const Index poses = points.size(), count = segments.size(), d = is_rotation.size();
+  expect_shape("moves", moves, {-1, d});
+  expect_shape("axes", axes, {poses, d, 3});
+  expect_shape("dof_origins", dof_origins, {poses, d, 3});
+  expect_range("segments", segments, 0, moves.size());
+  expect_shape("points", points, {poses, count, 3});
+  expect_shape("result", result, {poses, count, 3, d});
+  result.fill(0.0);
+  for (Index n = 0; n < poses; ++n) {
+    for (Index m = 0; m < count; ++m) {
+      const bool* moved = moves[segments[m]].data;
+      const double* p = points[n][m].data;
+      double* own = result[n][m].data;
+      for (Index j = 0; j < d; ++j) {
+        if (!moved[j]) continue;
+        const double *axis = axes[n][j].data, *o = dof_origins[n][j].data;
+        const double arm[3] = {p[0] - o[0], p[1] - o[1], p[2] - o[2]};
+        const auto turned = cross(axis, arm);
+        for (int k = 0; k < 3; ++k) own[k * d + j] = is_rotation[j] ? turned[k] : axis[k];
+      }
+    }
+  }
+}
+
 // Fills the derivatives (N, S, 3, L) of the origins by the lengths: of those on the segments, the
 // basis (S, 3, L), and of the parents. Columns are (N, S, 3, 3).
 inline void lift_origins(const Places& parents, const Tables& basis,

@@ -140,6 +140,10 @@ def random_points(body: Body, poses: np.ndarray, per_segment: int, seed: int):
     return rng, segments, frames, points
 
 
+def pose_by_pose(points):
+    return np.ascontiguousarray(points.transpose(2, 0, 1))
+
+
 def test_assembled_gradient_and_hessian_equal_the_dense_ones(body, random_poses):
     poses = random_poses(body, 4, 4)
     rng, segments, frames, points = random_points(body, poses, 3, 5)
@@ -148,8 +152,8 @@ def test_assembled_gradient_and_hessian_equal_the_dense_ones(body, random_poses)
     curvature = rng.uniform(0, 2, size=pull.shape)
     sums = segment_sums(segments, points, directions, pull, curvature, len(body.skeleton.parents))
     gradient, hessian = assemble(frames, *sums)
-    jacobian = point_jacobians(frames, segments, points)  # (P, d, 3, N)
-    along = np.einsum('pdin,pin->npd', jacobian, directions)  # derivative of each residual
+    jacobian = point_jacobians(frames, segments, pose_by_pose(points))
+    along = np.einsum('npid,pin->npd', jacobian, directions)  # derivative of each residual
     expected = np.einsum('npd,pn->nd', along, pull)
     dense = np.einsum('npd,pn,npe->nde', along, curvature, along)
     np.testing.assert_allclose(gradient, expected, atol=1e-10)
@@ -163,22 +167,22 @@ def test_point_jacobians_equal_central_differences(body, random_poses):
     segments = np.arange(len(body.skeleton.parents))
     local = rng.normal(0, 0.2, (len(segments), 3))
     frames = forward(body.skeleton, poses)
-    jacobian = point_jacobians(frames, segments, frames.points(segments, local))
+    jacobian = point_jacobians(frames, segments, frames.places(segments, local))
     for k in range(body.dimension):
         step = np.zeros(body.dimension)
         step[k] = STEP
         ahead, behind = (
-            forward(body.skeleton, poses + x).points(segments, local) for x in (step, -step)
+            forward(body.skeleton, poses + x).places(segments, local) for x in (step, -step)
         )
-        np.testing.assert_allclose(jacobian[:, k], (ahead - behind) / (2 * STEP), atol=1e-8)
+        np.testing.assert_allclose(jacobian[..., k], (ahead - behind) / (2 * STEP), atol=1e-8)
 
 
 def test_directed_derivatives_equal_the_jacobians(body, random_poses):
     rng, segments, frames, points = random_points(body, random_poses(body, 1, 11), 3, 12)
     directions = rng.normal(size=(len(segments), 3))
     found = directed_derivatives(frames, segments, points[..., 0], directions)
-    jacobian = point_jacobians(frames, segments, points)[..., 0]
-    np.testing.assert_allclose(found, np.einsum('mdi,mi->md', jacobian, directions), atol=1e-12)
+    jacobian = point_jacobians(frames, segments, pose_by_pose(points))[0]
+    np.testing.assert_allclose(found, np.einsum('mid,mi->md', jacobian, directions), atol=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1), name=st.sampled_from(sorted(BODIES)))

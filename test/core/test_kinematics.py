@@ -59,6 +59,13 @@ def test_derivatives_need_arguments_that_fit():
         'result': np.zeros((2, D)),
     }
     assert_arguments_are_checked(core.derive_along, points, 'result', free='moves')
+    del points['directions']
+    every = {
+        **{name: np.ones((2, D, 3)) for name in ('axes', 'dof_origins')},
+        'points': np.ones((2, 2, 3)),
+        'result': np.zeros((2, 2, 3, D)),
+    }
+    assert_arguments_are_checked(core.derive_points, points | every, 'result', free='moves')
     lengths = SKELETON.offset_basis.shape[2]
     lifts = {
         'parents': np.array(SKELETON.parents),
