@@ -185,6 +185,20 @@ def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str)
     raise MessageError(f'{what} has {names[index]!r} at {index}, wanted {wanted[index]!r}', 'names')
 
 
+def array_of_each(components: Sequence[Any], name: str, shape: tuple[int, ...], what: str) -> Array:
+    """A flat field of each of K components, (K, *shape).
+
+    Raises:
+        MessageError: another number of values.
+    """
+    values, count = [getattr(component, name) for component in components], math.prod(shape)
+    for k, own in enumerate(values):
+        if len(own) != count:
+            text = f'{what}: component {k}: {name} has {len(own)} values, wanted {count}'
+            raise MessageError(text)
+    return np.concatenate([np.empty(0), *values]).reshape(len(values), *shape)
+
+
 def array_of_all(
     components: Sequence[Any], name: str, shape: tuple[int, ...], what: str
 ) -> Array | None:
@@ -193,16 +207,13 @@ def array_of_all(
     Raises:
         MessageError: some have it and others not, or another number of values.
     """
-    values = [getattr(component, name) for component in components]
-    if not any(len(value) for value in values):
+    lengths = [len(getattr(component, name)) for component in components]
+    if not any(lengths):
         return None
-    for k, value in enumerate(values):
-        if len(value) == 0:
-            text = f'{what}: component {k} has no {name}, others have one'
-            raise MessageError(text, 'covariances')
-    return np.array(
-        [numbers(value, shape, f'{what}: component {k}: {name}') for k, value in enumerate(values)]
-    )
+    if not all(lengths):
+        text = f'{what}: component {lengths.index(0)} has no {name}, others have one'
+        raise MessageError(text, 'covariances')
+    return array_of_each(components, name, shape, what)
 
 
 def flat(values: Array | None, component: int) -> Array:

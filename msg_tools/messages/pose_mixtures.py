@@ -24,6 +24,7 @@ from msg_tools.messages.message_error import (
     Array,
     MessageError,
     array_of_all,
+    array_of_each,
     check_covariances,
     check_finite,
     check_names,
@@ -414,20 +415,21 @@ def pose_mixture_of(
             f'mixture has {len(components)} components, the limit is {MAX_COMPONENTS}'
         )
     n, d = len(components), len(names)
-    means, positions = [], []
+    means = array_of_each(components, 'mean', (d,), 'mixture')
+    positions = list[float]()
     for k, component in enumerate(components):
-        what = f'mixture: component {k}'
-        means.append(numbers(component.mean, (d,), f'{what}: mean'))
         points = component.joint_positions
         if len(points) != len(joints):
-            raise MessageError(f'{what} has {len(points)} joint_positions, wanted {len(joints)}')
-        positions.append([(point.x, point.y, point.z) for point in points])
+            text = f'mixture: component {k} has {len(points)} joint_positions'
+            raise MessageError(f'{text}, wanted {len(joints)}')
+        for point in points:
+            positions += (point.x, point.y, point.z)
     state = constant_of(
         TrackState, message.state, f'mixture has the state {message.state}, which is not known'
     )
     return PoseMixture(
         weights=np.array([component.weight for component in components]),
-        means=np.reshape(means, (n, d)),
+        means=means,
         covariances=array_of_all(components, 'covariance', (d, d), 'mixture'),
         body_model=str(message.body_model),
         dof_names=names,
@@ -477,13 +479,10 @@ def _chain(message: Any) -> dict[str, Any]:
     """Weights and ancestry; none where a publisher leaves them alone, and so 0 or empty."""
     weights = np.array([c.posterior_weight for c in message.components])
     told, ids = np.nan_to_num(weights).any(), message.ancestry_ids
-    rows = [
-        numbers(c.ancestry, (len(ids),), f'mixture: component {k}: ancestry')
-        for k, c in enumerate(message.components)
-    ]
+    rows = array_of_each(message.components, 'ancestry', (len(ids),), 'mixture')
     return {
         'posterior_weights': weights if told else None,
-        'ancestry': np.reshape(rows, (len(rows), len(ids))) if told or len(ids) else None,
+        'ancestry': rows if told or len(ids) else None,
         'ancestry_stamp_ns': time_ns(message.ancestry_stamp),
         'ancestry_ids': np.array(ids),
     }

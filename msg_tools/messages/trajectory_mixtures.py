@@ -14,6 +14,7 @@ from msg_tools.messages.message_error import (
     Array,
     MessageError,
     array_of_all,
+    array_of_each,
     check_covariances,
     check_finite,
     check_names,
@@ -23,7 +24,6 @@ from msg_tools.messages.message_error import (
     freeze_arrays,
     lengths_of,
     names_of,
-    numbers,
 )
 from msg_tools.messages.message_types import MessageFactory
 
@@ -153,12 +153,7 @@ def trajectory_mixture_of(
     joints = names_of(message.joint_names, 'trajectories: joint_names')
     return TrajectoryMixture(
         weights=np.array([component.weight for component in components]),
-        means=np.array(
-            [
-                numbers(component.means, (t, d), f'trajectories: component {m}: means')
-                for m, component in enumerate(components)
-            ]
-        ),
+        means=array_of_each(components, 'means', (t, d), 'trajectories'),
         marginal_covariances=array_of_all(
             components, 'marginal_covariances', (t, d, d), 'trajectories'
         ),
