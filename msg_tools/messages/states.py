@@ -45,12 +45,11 @@ def joint_state_message(
 
 
 def heaviest_joint_state(messages: MessageFactory, content: PoseMixture) -> Any:
-    """sensor_msgs/JointState of the heaviest component of a mixture."""
-    mixture = content.mixture
+    """sensor_msgs/JointState of the heaviest component of a mixture that has components."""
     return joint_state_message(
         messages,
         content.dof_names,
-        mixture.means[int(np.argmax(mixture.weights))],
+        content.means[int(np.argmax(content.weights))],
         content.stamp_ns,
         content.frame_id,
     )
