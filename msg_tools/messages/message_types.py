@@ -171,18 +171,15 @@ class RosbagsMessages:
             TypeError: a field that the type does not have.
         """
         defaults = _defaults(msgtype)
-        unknown = fields.keys() - defaults.keys()
-        if unknown:
+        if not fields.keys() <= defaults.keys():
+            unknown = fields.keys() - defaults.keys()
             raise TypeError(f'{msgtype} has no field {sorted(unknown)[0]!r}')
-        values = {}
         for name, (default, dtype) in defaults.items():
             if name not in fields:
-                values[name] = default()
-            elif dtype is None:
-                values[name] = fields[name]
-            else:
-                values[name] = np.ascontiguousarray(fields[name], dtype=dtype)
-        return typestore().types[msgtype](**values)
+                fields[name] = default()
+            elif dtype is not None:
+                fields[name] = np.ascontiguousarray(fields[name], dtype=dtype)
+        return typestore().types[msgtype](**fields)
 
     def points(self, positions: NDArray[np.float64]) -> list[Any]:
         """See `MessageFactory.points`."""
