@@ -64,7 +64,8 @@ inline void fill_rings(const Superquadrics& parts, const Places& ring_parts, con
 }
 
 // Fills points and outward unit normals (P, G + 2, 3) of each part: at G heights and angles, whose
-// cosines and sines are given, and the two tips.
+// cosines and sines are given, and the two tips. Equal heights one after the other, and angles that
+// come back after as many, are raised to their powers once.
 inline void fill_surface(const Superquadrics& parts, const Numbers& heights, const Numbers& cosines,
                          const Numbers& sines, const Tensor& points, const Tensor& normals) {
   const Index count = heights.size();
@@ -72,18 +73,30 @@ inline void fill_surface(const Superquadrics& parts, const Numbers& heights, con
   expect_shape("sines", sines, {count});
   expect_shape("points", points, {parts.count(), count + 2, 3});
   expect_shape("normals", normals, {parts.count(), count + 2, 3});
+  const Index round =
+      std::find_if(heights.begin(), heights.end(), [&](double s) { return s != heights[0]; }) -
+      heights.begin();
+  const Scratch<double, 2> powers(count, 4);
   for (Index p = 0; p < parts.count(); ++p) {
     const double exponent = parts.exponents(p, 1);
+    Section section{};
     const auto raised = [](double x, double power) {
       return sign(x) * elementary::pow(std::abs(x), power);
     };
     for (Index g = 0; g < count; ++g) {
-      const Section section = section_of(parts, p, heights[g]);
+      if (g == 0 || heights[g] != heights[g - 1]) section = section_of(parts, p, heights[g]);
       const double around[2] = {cosines[g], sines[g]};
+      const Index before = std::max(g - round, Index(0));
+      const bool known = g >= round && cosines[before] == around[0] && sines[before] == around[1];
+      double* power = powers[g].data;
+      for (int k = 0; k < 2; ++k) {
+        power[k] = known ? powers(before, k) : raised(around[k], exponent);
+        power[2 + k] = known ? powers(before, 2 + k) : raised(around[k], 2.0 - exponent);
+      }
       double *point = points[p][g].data, *normal = normals[p][g].data, along[2];
       for (int k = 0; k < 2; ++k) {
-        point[k] = section.centre[k] + section.radius[k] * raised(around[k], exponent);
-        normal[k] = raised(around[k], 2.0 - exponent) / section.radius[k];
+        point[k] = section.centre[k] + section.radius[k] * power[k];
+        normal[k] = power[2 + k] / section.radius[k];
         along[k] = section.slope[k] * around[k] * around[k] + normal[k] * section.lean[k];
       }
       point[2] = section.centre[2];
