@@ -73,7 +73,7 @@ PYBIND11_MODULE(_compiled, m) {
   // image
   bind(m, "solve", solve,
        "first last compiled point free rows exact limits descent x value gradient hessian by_cue "
-       "status iterations");
+       "status iterations moving");
   bind(m, "record_residuals", record_residuals, "model inputs columns origins residuals");
   bind(m, "trace_contour", fill_contour, "flesh wanted lens columns origins contour");
   bind(m, "mark_visibility", mark_visibility,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import cv2
@@ -56,8 +57,17 @@ def without_ipp() -> Iterator[None]:
         cv2.ipp.setUseIPP(before)
 
 
-class FlowTerm(NamedTuple):
-    """The energy of poses against the flow, as compiled code reads it.
+class FlowInputs(NamedTuple):
+    """A `FlowTerm` as compiled code reads it."""
+
+    points: SurfacePoints
+    flow: ImageMap
+    weight: float
+
+
+@dataclass(frozen=True, eq=False)
+class FlowTerm:
+    """The energy of poses against the flow.
 
     Attributes:
         points: of K poses in the image before, one for each problem.
@@ -70,6 +80,6 @@ class FlowTerm(NamedTuple):
     weight: float
 
     @property
-    def compiled(self) -> FlowTerm:
+    def compiled(self) -> FlowInputs:
         """The term as compiled code reads it."""
-        return self
+        return FlowInputs(self.points, self.flow, self.weight)

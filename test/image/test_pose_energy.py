@@ -234,7 +234,7 @@ def test_a_pose_that_has_no_energy_is_left_where_it_is(terms, poses):
     ('x', 'message'),
     [
         (np.zeros((2, 5)), r'poses must have shape \(N, 37\), saw \(2, 5\)'),
-        (np.full((1, 37), np.nan), 'poses must be finite'),
+        (np.full((1, 37), np.nan), 'x: wanted finite numbers'),
     ],
 )
 def test_poses_that_are_none_are_refused(terms, x, message):
