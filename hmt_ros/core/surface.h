@@ -438,8 +438,9 @@ struct Visible {
 
 // Room for parts that may hide points of others.
 struct Occluders {
-  explicit Occluders(Index parts) : ellipsoids(parts), near(parts) {}
+  explicit Occluders(Index parts) : ellipsoids(parts), cones(parts), near(parts) {}
   Scratch<Ellipsoid, 1> ellipsoids;
+  Scratch<Cone, 1> cones;  // of the points of the parts
   Scratch<bool, 1> near;  // parts that one occluder may hide
 };
 
@@ -480,11 +481,13 @@ HMT_WIDE inline void mark_hidden(const FleshTable& flesh, const Mask& occluders,
   std::fill_n(points.covered, points.count, 0.0);
   std::fill_n(points.hidden, points.count, 0.0);
   Ellipsoid* all = room.ellipsoids.view().data;
+  Cone* cones = room.cones.view().data;
   bool* near = room.near.view().data;
   for (Index b = 0; b < count; ++b) {
     const Index s = flesh.part_segments[b];
     all[b] = placed_ellipsoid(flesh.part_centres[b].data, flesh.part_radii[b].data,
                               columns.data + 9 * s, origins.data + 3 * s);
+    cones[b] = cone_of(extents[b], all[b].distance);
   }
   for (Index b = 0; b < count; ++b) {
     if (!occluders[b]) continue;
@@ -492,7 +495,7 @@ HMT_WIDE inline void mark_hidden(const FleshTable& flesh, const Mask& occluders,
     // Balls whose cones do not touch, by a hair for rounding, hide nothing of each other.
     const Cone own = cone_of(e.largest, e.distance);
     for (Index a = 0; a < count; ++a) {
-      const Cone other = cone_of(extents[a], all[a].distance);
+      const Cone& other = cones[a];
       const double limit = own.cosine * other.cosine - own.sine * other.sine - 1e-9;
       const bool apart = dot(all[a].centre, e.centre) < all[a].distance * e.distance * limit;
       near[a] = a != b && !(apart && own.sine < 1.0);
