@@ -98,10 +98,11 @@ PYBIND11_MODULE(_compiled, m) {
        "chain columns origins poses targets slack given_stays angles valid");
   bind(m, "fill_torso_flips", fill_torso_flips, "tree torso poses result parents");
   bind(m, "fill_configurations", fill_configurations,
-       "tree limbs modes found found_counts flipped price apart result");
+       "tree limbs modes found found_counts flipped price apart most result");
   bind(m, "place_alone", place_alone, "limbs found poses rows");
   bind(m, "combine", combine,
-       "limbs modes found energies log_weights trunk_weights share count poses parents values");
+       "limbs modes found energies log_weights exchanged exchange flip share count poses parents "
+       "values");
 
   // inference
   bind(m, "box_steps", box_steps, "x gradient hessian lower upper lam metric rows step predicted");

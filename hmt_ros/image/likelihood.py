@@ -31,7 +31,7 @@ from hmt_ros.core import record_residuals
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of
-from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
+from hmt_ros.image.terms.image_term import TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
 from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
@@ -221,38 +221,41 @@ class ObservedImage:
     @cached_property
     def compiled(self) -> dict[str, Any]:
         """What compiled code reads of them: members of `pose_energy.Compiled`."""
-        inputs = self.inputs(0)
-        running = [term for term, one in zip(TERMS, inputs, strict=True) if one.term.weight > 0]
-        return {
-            'model': self.likelihood.model,
-            'inputs': inputs,
-            'image': bool(running),
-            'contour': any(term.needs_contour for term in running),
-        }
-
-    def inputs(self, poses: int) -> tuple[Any, ...]:
-        """The inputs of all terms, with room for the results of so many poses."""
-        observation, beliefs = self.observation, self.observation.beliefs
-        request = Request(poses, self.explained)
-        result = []
-        for term in TERMS:
-            s: TermSettings = getattr(self.likelihood.settings, term.name)
-            evidence = observation.evidence.get(term.name)
-            weight = 0.0 if evidence is None else float(s.weight)
-            if beliefs is not None:
-                weight *= beliefs.of_term(term.name)
-            weighting = Weighting(
-                weight,
-                float(s.sigma),
-                float(s.scale),
-                float(observation.magnification),
-                float(s.growth),
-            )
-            result.append(term.inputs(weighting, evidence, request))
-        return tuple(result)
+        found = _inputs(self.likelihood.settings, self.observation)
+        if self.explained is not None:
+            found = found | {'inputs': with_member(found['inputs'], 'explained', self.explained)}
+        return found | {'model': self.likelihood.model}
 
 
-# An image is compared with many sets of poses.
+def with_member(inputs: tuple[Any, ...], name: str, value: Any) -> tuple[Any, ...]:
+    """Inputs of terms, with another member of this name in those that have one."""
+    return tuple(x._replace(**{name: value}) if hasattr(x, name) else x for x in inputs)
+
+
+# An image is compared with many sets of poses, and with parts of the body.
+@lru_cache(maxsize=4)
+def _inputs(settings: LikelihoodSettings, observation: Observation) -> dict[str, Any]:
+    """The inputs of all terms of an image, and which of them are on."""
+    beliefs, result = observation.beliefs, []
+    for term in TERMS:
+        s: TermSettings = getattr(settings, term.name)
+        evidence = observation.evidence.get(term.name)
+        weight = 0.0 if evidence is None else float(s.weight)
+        if beliefs is not None:
+            weight *= beliefs.of_term(term.name)
+        weighting = Weighting(
+            weight,
+            float(s.sigma),
+            float(s.scale),
+            float(observation.magnification),
+            float(s.growth),
+        )
+        result.append(term.inputs(weighting, evidence))
+    running = [term for term, one in zip(TERMS, result, strict=True) if one.term.weight > 0]
+    contour = any(term.needs_contour for term in running)
+    return {'inputs': tuple(result), 'image': bool(running), 'contour': contour}
+
+
 @lru_cache(maxsize=4)
 def usual_keypoints(
     likelihood: ImageLikelihood, observation: Observation, lifted_share: float

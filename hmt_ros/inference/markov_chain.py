@@ -10,7 +10,7 @@ q_10). Time can be divided at will, so that no result counts images.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,10 +59,7 @@ class MarkovChain:
 
     def transition(self, dt: float) -> Array:
         """Probabilities (n, n) of state j a time dt, s, after state i."""
-        if len(self.rates) == 2:
-            share = -elementary.expm1(-self._rate * dt)
-            return np.asarray((1.0 - share) * np.eye(2) + share * self.usual)
-        return exponential(self.generator * dt)
+        return _transition(self, dt)
 
     def predict(self, p: ArrayLike, dt: float) -> Array:
         """Probabilities (..., n) a time dt, s, after p (..., n)."""
@@ -71,6 +68,18 @@ class MarkovChain:
     def closed(self, p: ArrayLike, dt: float) -> Array:
         """The same for two states, by the closed form: probabilities (...) of the second one."""
         return np.asarray(p + (p - self.usual[1]) * elementary.expm1(-self._rate * dt))
+
+
+# Images often come at equal times.
+@lru_cache(maxsize=64)
+def _transition(chain: MarkovChain, dt: float) -> Array:
+    if len(chain.rates) == 2:
+        share = -elementary.expm1(-chain._rate * dt)
+        result = np.asarray((1.0 - share) * np.eye(2) + share * chain.usual)
+    else:
+        result = exponential(chain.generator * dt)
+    result.flags.writeable = False
+    return result
 
 
 def update(p: ArrayLike, log_likelihoods: ArrayLike) -> Array:

@@ -25,7 +25,6 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.keypoints import groups_of
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Student
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_algebra import cholesky, inverse, product
@@ -99,19 +98,18 @@ def _drawn(
     return np.clip(result, body.lower[own], body.upper[own])
 
 
-def jumped_poses(
-    search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
-) -> Hypotheses:
+def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) -> Hypotheses:
     """Poses far from those that are known, which fit the image as well."""
     posterior, observation, plan = search.posterior, search.observation, search.plan
+    base = search.base
     body, limbs = posterior.body, limbs_not_shown(posterior, observation, plan.surprising)
     left = plan.rated if limbs else plan.rated_alone
     share = ERRORS['image'].share(search.dt)
     price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
     everything: list[tuple[Array, Index, Array]] = []
     image = posterior.of_image(observation)
-    prior = search.rated(base.x, base.value)
-    groups = _groups(body, base)
+    prior = search.base_rated
+    groups = _groups(search)
     for group in groups[: plan.groups]:
         likely = prior[group].max() > prior.max() - LIKELY_NATS
         first = group[0]
@@ -124,7 +122,8 @@ def jumped_poses(
             price['limb_flip'],
             apart=SAME_LIMB_DISTANCE,
             most=plan.alternatives,
-        ).at_most(left)
+            poses=left,
+        )
         alone, rows = products.alone
         left -= len(rows)
         best = products.best(
@@ -148,13 +147,15 @@ def jumped_poses(
     return sources.proposed(members, poses, jumped)
 
 
-def _groups(body: Body, base: Minimum) -> list[Index]:
+def _groups(search: Search) -> list[Index]:
     """Modes with nearly the same trunk, each group with its best mode first."""
-    trunk = body.joint_positions(base.x)[:, body.skeleton.joint_index(body.trunk_joints)]
-    left = np.argsort(base.value, kind='stable')
+    body = search.posterior.body
+    trunk = search.base_joints[:, body.skeleton.joint_index(body.trunk_joints)]
+    left = np.argsort(search.base.value, kind='stable')
     groups = []
     while len(left):
-        near = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1) < SAME_TRUNK_DISTANCE
+        away = trunk[left] - trunk[left[0]]
+        near = np.sqrt((away * away).sum(2)).max(1) < SAME_TRUNK_DISTANCE
         groups.append(left[near])
         left = left[~near]
     return groups
