@@ -155,6 +155,7 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "resize_bones", resize_bones, "order factors joints result");
 
   // constants
+  m.attr("LANES") = int(lanes);
   m.attr("RECORDED") = int(Sums::recorded);
   m.attr("FEWEST") = fewest;
   m.attr("COVER") = cover;
