@@ -452,7 +452,7 @@ void mark_visibility(const FleshTable& flesh, const Mask& occluders, const Table
     extents[part] = most(extents[part], std::sqrt(dot(away, away)));
   }
   const auto row = [&](int k) { return rows[k].data; };
-  mark_hidden(flesh, occluders, extents.view().data, columns, origins, Occluders(count),
+  mark_hidden(flesh, occluders, extents.view().data, columns, origins, Occluders(count, whole),
               {whole, parts_of.view().data, row(0), row(1), row(2), row(3), row(4), row(5)});
   for (Index n = 0; n < p; ++n) {
     covered[n] = rows(4, n) > 0.0;

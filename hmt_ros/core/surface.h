@@ -436,12 +436,14 @@ struct Visible {
   double *covered, *hidden;
 };
 
-// Room for parts that may hide points of others.
+// Room for parts that may hide points of others, which are so many whole lanes.
 struct Occluders {
-  explicit Occluders(Index parts) : ellipsoids(parts), cones(parts), near(parts) {}
+  Occluders(Index parts, Index points)
+      : ellipsoids(parts), cones(parts), near(parts + 1), ends(points / lanes, 2) {}
   Scratch<Ellipsoid, 1> ellipsoids;
   Scratch<Cone, 1> cones;  // of the points of the parts
-  Scratch<bool, 1> near;  // parts that one occluder may hide
+  Scratch<Index, 1> near;  // number of parts before each that one occluder may hide
+  Scratch<Index, 2> ends;  // first and last part of each group of lanes
 };
 
 // Marks points from `first` on, as many as there are lanes, that an ellipsoid of part b hides: it
@@ -482,7 +484,13 @@ HMT_WIDE inline void mark_hidden(const FleshTable& flesh, const Mask& occluders,
   std::fill_n(points.hidden, points.count, 0.0);
   Ellipsoid* all = room.ellipsoids.view().data;
   Cone* cones = room.cones.view().data;
-  bool* near = room.near.view().data;
+  Index *near = room.near.view().data, *ends = room.ends.view().data;
+  for (Index first = 0; first < points.count; first += lanes, ends += 2) {
+    const auto [low, high] =
+        std::minmax_element(points.parts + first, points.parts + first + lanes);
+    ends[0] = *low;
+    ends[1] = *high;
+  }
   for (Index b = 0; b < count; ++b) {
     const Index s = flesh.part_segments[b];
     all[b] = placed_ellipsoid(flesh.part_centres[b].data, flesh.part_radii[b].data,
@@ -498,12 +506,11 @@ HMT_WIDE inline void mark_hidden(const FleshTable& flesh, const Mask& occluders,
       const Cone& other = cones[a];
       const double limit = own.cosine * other.cosine - own.sine * other.sine - 1e-9;
       const bool apart = dot(all[a].centre, e.centre) < all[a].distance * e.distance * limit;
-      near[a] = a != b && !(apart && own.sine < 1.0);
+      near[a + 1] = near[a] + (a != b && !(apart && own.sine < 1.0));
     }
-    for (Index first = 0; first < points.count; first += lanes) {
-      bool any = false;
-      for (Index i = first; i < first + lanes; ++i) any |= near[points.parts[i]];
-      if (any) mark_lanes(e, b, points, first);
+    ends = room.ends.view().data;
+    for (Index first = 0; first < points.count; first += lanes, ends += 2) {
+      if (near[ends[1] + 1] > near[ends[0]]) mark_lanes(e, b, points, first);
     }
   }
 }
