@@ -223,13 +223,12 @@ class ObservedImage:
         """What compiled code reads of them: members of `pose_energy.Compiled`."""
         found = _inputs(self.likelihood.settings, self.observation)
         if self.explained is not None:
-            found = found | {'inputs': with_member(found['inputs'], 'explained', self.explained)}
+            inputs = (
+                x._replace(explained=self.explained) if hasattr(x, 'explained') else x
+                for x in found['inputs']
+            )
+            found = found | {'inputs': tuple(inputs)}
         return found | {'model': self.likelihood.model}
-
-
-def with_member(inputs: tuple[Any, ...], name: str, value: Any) -> tuple[Any, ...]:
-    """Inputs of terms, with another member of this name in those that have one."""
-    return tuple(x._replace(**{name: value}) if hasattr(x, name) else x for x in inputs)
 
 
 # An image is compared with many sets of poses, and with parts of the body.

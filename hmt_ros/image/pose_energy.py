@@ -26,7 +26,7 @@ from hmt_ros.body.pose_prior import AnglePrior, MixturePrior, PriorModel
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.body.self_intersection import Overlaps, SelfIntersection
 from hmt_ros.core import solve
-from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage, observed, with_member
+from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage, observed
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.optical_flow import FlowInputs, FlowTerm
 from hmt_ros.image.surface_points import SurfacePoints
@@ -367,9 +367,12 @@ def _summed(likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, 
 
 def _with_costs(compiled: Compiled, poses: int) -> tuple[Compiled, Array]:
     """The terms with room for the energies (N, M) of the samples of an outline, and that room."""
-    samples = max(x.costs.shape[1] for x in compiled.inputs if hasattr(x, 'costs'))
-    costs = np.zeros((poses, samples))
-    return compiled._replace(inputs=with_member(compiled.inputs, 'costs', costs)), costs
+    inputs, costs = list(compiled.inputs), np.zeros((poses, 0))
+    for i, own in enumerate(inputs):
+        if hasattr(own, 'costs'):
+            costs = np.zeros((poses, own.costs.shape[1]))
+            inputs[i] = own._replace(costs=costs)
+    return compiled._replace(inputs=tuple(inputs)), costs
 
 
 def _expected(motion: Quadratic | Student) -> tuple[Array, Array, float]:

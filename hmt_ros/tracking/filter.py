@@ -390,7 +390,7 @@ class MixtureFilter:
             return False
         best = slice(SHAPE_MODES)
         poses, weights = self.modes.poses, elementary.exp(self.modes.log_weights[best])
-        gradients, covariances = self.posterior.fit(poses, observation).given_way()
+        gradients, covariances = self.posterior.fit(poses, observation).given_way
         body = self.shape.update(
             self.posterior.likelihood,
             observation,

@@ -41,6 +41,9 @@ from hmt_ros.tracking.settings import (
     EvaluationPlan,
 )
 
+# A variable that changes less has not jumped.
+STILL = float(np.sqrt(np.finfo(np.float64).eps))
+
 
 def find_limb(
     posterior: Posterior,
@@ -64,7 +67,7 @@ def find_limb(
     """
     body, s = posterior.body, posterior.settings.search
     own: Index = np.asarray(body.skeleton.chain_dofs[chain])
-    block = covariance[np.ix_(own, own)]
+    block = covariance[own[:, None], own]
     samples = _drawn(body, own, pose[own], block, s.stretch, plan.samples, rng)
     of_limb, of_rest = posterior.divided[chain]
     others = PoseEnergy(of_rest, (ObservedImage(of_rest, observation),))
@@ -143,7 +146,7 @@ def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) 
     kept = search.best(poses, energies)
     poses, members = poses[kept], members[kept]
     # A chain that jumped is expected where it landed, the rest where it was predicted.
-    jumped = np.abs(poses - base.x[members]) > np.sqrt(np.finfo(np.float64).eps)
+    jumped = np.abs(poses - base.x[members]) > STILL
     return sources.proposed(members, poses, jumped)
 
 
