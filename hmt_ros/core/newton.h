@@ -47,16 +47,22 @@ class BoxStep {
   }
 
  private:
+  static double least_shift(const Table& hessian, const Numbers& metric) {
+    double largest = 0.0, smallest = infinity;
+    for (Index i = 0; i < metric.size(); ++i) {
+      smallest = least(smallest, metric[i]);
+      for (double entry : hessian[i]) largest = most(largest, std::abs(entry));
+    }
+    return 1e-3 * largest / smallest;
+  }
+
   void minimise(const Numbers& gradient, const Table& hessian, const Numbers& low,
                 const Numbers& high, double shift, const Numbers& metric, const Vector& step) {
     const Index d = gradient.size();
     best_.fill(0.0);
-    double largest = 0.0, smallest = infinity;
     for (Index i = 0; i < d; ++i) {
       bound_[i] = rests(low[i], high[i], gradient[i]);
       step[i] = bound_[i] ? between(0.0, low[i], high[i]) : 0.0;
-      smallest = least(smallest, metric[i]);
-      for (Index j = 0; j < d; ++j) largest = most(largest, std::abs(hessian(i, j)));
     }
     double best_gain = -infinity;
     for (Index turn = 0; turn < 3 * d + 3; ++turn) {
@@ -66,7 +72,7 @@ class BoxStep {
       }
       while (!solve(gradient, hessian, shift, metric, count, step)) {
         // Not positive definite: the least shift that Gershgorin asks for is far too careful.
-        const double more = most(4.0 * shift, 1e-3 * largest / smallest);
+        const double more = most(4.0 * shift, least_shift(hessian, metric));
         if (shift > damping_limit || !(more > shift)) break;
         shift = more;
       }
