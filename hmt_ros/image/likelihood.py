@@ -106,7 +106,6 @@ class ImageLikelihood:
     def seen(
         self,
         observation: Observation,
-        explained: Array | None = None,
         exchanges: Array | None = None,
         share: float = 1.0,
         lifted_share: float = 1.0,
@@ -115,14 +114,9 @@ class ImageLikelihood:
 
         Args:
             observation: of the image.
-            explained: as for `ObservedImage`.
             exchanges, share, lifted_share: as for `keypoint_term`.
         """
-        image = (
-            observed(self, observation)
-            if explained is None
-            else ObservedImage(self, observation, explained)
-        )
+        image = observed(self, observation)
         if observation.keypoints is None or self.settings.keypoints.weight == 0:
             return (image,)
         return (image, self.keypoint_term(observation, exchanges, share, lifted_share))

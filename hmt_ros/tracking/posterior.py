@@ -161,7 +161,7 @@ class Posterior:
         """All terms; arguments as for `of_image` and `ImageLikelihood.keypoint_term`."""
         if exchanges is not None:
             exchanges = None if observation.keypoints is None else known_exchanges(exchanges)
-        seen = self.likelihood.seen(observation, None, exchanges, share, lifted_share)
+        seen = self.likelihood.seen(observation, exchanges, share, lifted_share)
         return (*seen, *self.likelihood.priors, *self.known)
 
     @property

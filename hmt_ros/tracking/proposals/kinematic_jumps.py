@@ -72,8 +72,9 @@ def find_limb(
     of_limb, of_rest = posterior.divided[chain]
     others = PoseEnergy(of_rest, (ObservedImage(of_rest, observation),))
     explained = others.by_cue(pose[None], derivatives=False).outline_costs
-    seen = of_limb.seen(observation, explained=explained)
-    terms = (*seen, posterior.likelihood.pose_prior, *posterior.known)
+    seen = ObservedImage(of_limb, observation, explained)
+    keypoints = posterior.likelihood.seen(observation)[1:]
+    terms = (seen, *keypoints, posterior.likelihood.pose_prior, *posterior.known)
     motion = Student(pose[own], inverse(block), LIMB_TAILS)
     term = PoseEnergy(of_limb, terms, motion, pose, own)
     best = samples[np.argsort(term.values(samples), kind='stable')[: plan.refined]]
