@@ -90,9 +90,7 @@ def root_rotation_dofs(skeleton: Skeleton) -> Index:
     own, axes = rotations_of(skeleton, 0)
     if axes != ROOT_AXES:
         raise ValueError(f'the root of {skeleton.name} turns about {axes!r}, wanted {ROOT_AXES!r}')
-    found = np.array(own, dtype=np.intp)
-    found.flags.writeable = False
-    return found
+    return np.array(own, dtype=np.intp)
 
 
 def rotations_of(skeleton: Skeleton, segment: int) -> tuple[list[int], str]:

@@ -47,11 +47,10 @@ class AnglePrior:
     @cached_property
     def compiled(self) -> PriorModel:
         """As compiled code reads it."""
-        nothing = np.zeros((1, 0))
         return PriorModel(
             np.zeros((1, 0, 0)),
             np.zeros((1, 0, 0)),
-            nothing,
+            np.zeros((1, 0)),
             np.zeros(1),
             np.zeros((1, 0, 0)),
             np.zeros(0, dtype=np.int64),

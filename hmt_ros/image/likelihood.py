@@ -217,11 +217,12 @@ class ObservedImage:
         """What compiled code reads of them: members of `pose_energy.Compiled`."""
         found = _inputs(self.likelihood.settings, self.observation)
         if self.explained is not None:
-            inputs = (
-                x._replace(explained=self.explained) if hasattr(x, 'explained') else x
-                for x in found['inputs']
-            )
-            found = found | {'inputs': tuple(inputs)}
+            found = found | {
+                'inputs': tuple(
+                    x._replace(explained=self.explained) if hasattr(x, 'explained') else x
+                    for x in found['inputs']
+                )
+            }
         return found | {'model': self.likelihood.model}
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -57,14 +57,6 @@ def without_ipp() -> Iterator[None]:
         cv2.ipp.setUseIPP(before)
 
 
-class FlowInputs(NamedTuple):
-    """A `FlowTerm` as compiled code reads it."""
-
-    points: SurfacePoints
-    flow: ImageMap
-    weight: float
-
-
 @dataclass(frozen=True, eq=False)
 class FlowTerm:
     """The energy of poses against the flow.
@@ -80,6 +72,6 @@ class FlowTerm:
     weight: float
 
     @property
-    def compiled(self) -> FlowInputs:
+    def compiled(self) -> tuple[SurfacePoints, ImageMap, float]:
         """The term as compiled code reads it."""
-        return FlowInputs(self.points, self.flow, self.weight)
+        return self.points, self.flow, self.weight

@@ -28,7 +28,8 @@ from hmt_ros.body.self_intersection import Overlaps, SelfIntersection
 from hmt_ros.core import solve
 from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage, observed
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.optical_flow import FlowInputs, FlowTerm
+from hmt_ros.image.optical_flow import FlowTerm
+from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import NO_MAP
 from hmt_ros.image.terms.keypoints import KeypointInputs, Keypoints, KeypointTerm
@@ -83,7 +84,7 @@ class Compiled(NamedTuple):
     prior: PriorModel
     overlaps: Overlaps
     ground: Constants
-    flow: FlowInputs
+    flow: tuple[SurfacePoints, ImageMap, float]
     centres: Array
     precisions: Array
     tails: float
@@ -147,10 +148,15 @@ class PoseEnergy:
     point: Array | None = None
     free: Index | None = None
     counted: Callable[[int], None] | None = None
-    _sum: TermSum = field(init=False, repr=False)
+    _sum: tuple[Compiled, tuple[FrameTerm, ...]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, '_sum', _summed(self.likelihood, self.terms))
+
+    @property
+    def _strange(self) -> tuple[FrameTerm, ...]:
+        """Terms without a kernel here."""
+        return self._sum[1]
 
     def energy(
         self,
@@ -195,7 +201,7 @@ class PoseEnergy:
         if self.counted is not None:
             self.counted(len(x))
         found = energy if derivatives else Energy(energy.value)
-        if not self._sum.others:
+        if not self._strange:
             return found, *parts
         others = self._others(x, np.arange(len(x)) if rows is None else rows, derivatives)
         if apart:
@@ -227,7 +233,7 @@ class PoseEnergy:
         body = self.likelihood.body
         step_scale = scale_of(body) if step_scale is None else step_scale
         scale = np.full(body.dimension, step_scale, dtype=np.float64)
-        if self._sum.others:
+        if self._strange:
             lower, upper = _limits(body)[:, self._free]
             return minimise(
                 self,
@@ -290,7 +296,7 @@ class PoseEnergy:
 
     @property
     def _point(self) -> Array:
-        return _origin(self.likelihood.body) if self.point is None else self.point
+        return np.zeros(self.likelihood.body.dimension) if self.point is None else self.point
 
     @property
     def _free(self) -> Index:
@@ -302,8 +308,7 @@ class PoseEnergy:
     def _checked(self, x: ArrayLike) -> Array:
         result = np.array(x, dtype=np.float64, order='C', ndmin=2)
         if result.ndim != 2 or result.shape[1] != len(self._free):
-            wanted = f'(N, {len(self._free)})'
-            raise ValueError(f'poses must have shape {wanted}, saw {result.shape}')
+            raise ValueError(f'poses must have shape (N, {len(self._free)}), saw {result.shape}')
         return result
 
     def _others(self, x: Array, rows: Index, derivatives: Derivatives) -> list[Energy]:
@@ -313,7 +318,7 @@ class PoseEnergy:
         frames = forward(self.likelihood.body.skeleton, poses)
         own = np.ix_(self._free, self._free)
         result = []
-        for term in self._sum.others:
+        for term in self._strange:
             found = term.energy(frames, rows, derivatives=derivatives)
             if derivatives:
                 slope, curve = found.derivatives()
@@ -324,7 +329,7 @@ class PoseEnergy:
     @cached_property
     def _compiled(self) -> Compiled:
         """The terms as compiled code reads them; they return their energies alone."""
-        known = self._sum.compiled
+        known = self._sum[0]
         if self.motion is not None:
             centres, precisions, tails = _expected(self.motion)
             return known._replace(centres=centres, precisions=precisions, tails=tails)
@@ -334,17 +339,12 @@ class PoseEnergy:
         return known._replace(centres=np.zeros((0, f)), precisions=np.zeros((0, f, f)))
 
 
-class TermSum(NamedTuple):
-    """Some terms: those with a kernel here, as compiled code reads them, and all others."""
-
-    compiled: Compiled
-    others: tuple[FrameTerm, ...]
-
-
 # An image is compared with many sets of poses.
 @lru_cache(maxsize=8)
-def _summed(likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, ...]) -> TermSum:
-    """Some terms, the same at each call.
+def _summed(
+    likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, ...]
+) -> tuple[Compiled, tuple[FrameTerm, ...]]:
+    """Terms with a kernel here, as compiled code reads them, and all others; the same at each call.
 
     Raises:
         ValueError: two terms of one kind that has a kernel.
@@ -362,7 +362,7 @@ def _summed(likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, 
             known[name] = term
     image = known.pop('image', None) or observed(likelihood, NOTHING_SEEN)
     compiled = {name: term.compiled for name, term in known.items()} | image.compiled
-    return TermSum(_absent(likelihood.body)._replace(**compiled), tuple(others))
+    return _absent(likelihood.body)._replace(**compiled), tuple(others)
 
 
 def _with_costs(compiled: Compiled, poses: int) -> tuple[Compiled, Array]:
@@ -414,11 +414,6 @@ def _limits(body: Body) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _origin(body: Body) -> Array:
-    return np.zeros(body.dimension)
-
-
-@lru_cache(maxsize=16)
 def _every_variable(body: Body) -> Index:
     return np.arange(body.dimension)
 
@@ -442,7 +437,7 @@ def _absent(body: Body) -> Compiled:
         prior=AnglePrior(body, 0.0).compiled,
         overlaps=SelfIntersection(body, np.inf).compiled,
         ground=GroundTerm(body, GroundSettings(0.0, 0.0), no_floor).compiled,
-        flow=FlowInputs(no_points, NO_MAP, 0.0),
+        flow=FlowTerm(no_points, NO_MAP, 0.0).compiled,
         centres=np.zeros((0, d)),
         precisions=np.zeros((0, d, d)),
         tails=0.0,

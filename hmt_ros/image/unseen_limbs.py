@@ -15,7 +15,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, sided_pairs
 from hmt_ros.image.observation import Observation
-from hmt_ros.inference.arrays import Array, Index, Mask
+from hmt_ros.inference.arrays import Array, Mask
 
 # Confidence below which a keypoint is a guess.
 GUESSED = 0.02
@@ -50,7 +50,12 @@ class UnseenLimbs:
 
     def of_dofs(self, body: Body) -> Array:
         """Time (d,) since the degrees of freedom were shown: the joint beyond tells of them."""
-        return np.append(self.times, 0.0)[_telling(body.skeleton)]
+        beyond = np.arange(len(self.times))
+        for chain in body.chains.values():
+            beyond[list(chain[:-1])] = chain[1:]
+        times = self.times[beyond]
+        times[list(body.skeleton.spine)], times[0] = self.times[0], 0.0
+        return times[body.skeleton.dof_segments]
 
     def shown_joints(self, body: Body) -> Mask:
         """Joints (J,) that an image has shown a short time ago."""
@@ -60,16 +65,6 @@ class UnseenLimbs:
         """The body, whose unseen joints err more: bones may be longer, and joints move on arcs."""
         hidden = self.times > 0.0
         return _told(body, tuple(hidden.tolist())) if hidden.any() else body
-
-
-@lru_cache(maxsize=16)
-def _telling(skeleton: Skeleton) -> Index:
-    """Segments (d,) that tell of the degrees of freedom; S: they are always told of."""
-    beyond = np.arange(len(skeleton.parents))
-    for chain in skeleton.chains.values():
-        beyond[list(chain[:-1])] = chain[1:]
-    beyond[list(skeleton.spine)], beyond[0] = 0, len(beyond)
-    return beyond[skeleton.dof_segments]
 
 
 @lru_cache(maxsize=8)

@@ -57,9 +57,13 @@ class MarkovChain:
         """Rate at which two states forget which one it was, 1/s."""
         return float(self.rates[0, 1] + self.rates[1, 0])
 
+    @lru_cache(maxsize=64)  # noqa: B019 - chains are few, and images often come at equal times
     def transition(self, dt: float) -> Array:
         """Probabilities (n, n) of state j a time dt, s, after state i."""
-        return _transition(self, dt)
+        if len(self.rates) == 2:
+            share = -elementary.expm1(-self._rate * dt)
+            return np.asarray((1.0 - share) * np.eye(2) + share * self.usual)
+        return exponential(self.generator * dt)
 
     def predict(self, p: ArrayLike, dt: float) -> Array:
         """Probabilities (..., n) a time dt, s, after p (..., n)."""
@@ -68,18 +72,6 @@ class MarkovChain:
     def closed(self, p: ArrayLike, dt: float) -> Array:
         """The same for two states, by the closed form: probabilities (...) of the second one."""
         return np.asarray(p + (p - self.usual[1]) * elementary.expm1(-self._rate * dt))
-
-
-# Images often come at equal times.
-@lru_cache(maxsize=64)
-def _transition(chain: MarkovChain, dt: float) -> Array:
-    if len(chain.rates) == 2:
-        share = -elementary.expm1(-chain._rate * dt)
-        result = np.asarray((1.0 - share) * np.eye(2) + share * chain.usual)
-    else:
-        result = exponential(chain.generator * dt)
-    result.flags.writeable = False
-    return result
 
 
 def update(p: ArrayLike, log_likelihoods: ArrayLike) -> Array:

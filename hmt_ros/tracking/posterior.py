@@ -159,8 +159,11 @@ class Posterior:
         lifted_share: float = 1.0,
     ) -> tuple[CompiledTerm | FrameTerm, ...]:
         """All terms; arguments as for `of_image` and `ImageLikelihood.keypoint_term`."""
-        if exchanges is not None:
-            exchanges = None if observation.keypoints is None else known_exchanges(exchanges)
+        exchanges = (
+            None
+            if exchanges is None or observation.keypoints is None
+            else known_exchanges(exchanges)
+        )
         seen = self.likelihood.seen(observation, exchanges, share, lifted_share)
         return (*seen, *self.likelihood.priors, *self.known)
 

@@ -105,22 +105,20 @@ def _drawn(
 def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) -> Hypotheses:
     """Poses far from those that are known, which fit the image as well."""
     posterior, observation, plan = search.posterior, search.observation, search.plan
-    base = search.base
-    body, limbs = posterior.body, limbs_not_shown(posterior, observation, plan.surprising)
+    base, body = search.base, posterior.body
+    limbs = limbs_not_shown(posterior, observation, plan.surprising)
     left = plan.rated if limbs else plan.rated_alone
     share = ERRORS['image'].share(search.dt)
     price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
     everything: list[tuple[Array, Index, Array]] = []
-    image = posterior.of_image(observation)
+    image, groups = posterior.of_image(observation), _groups(search)
     prior = search.base_rated
-    groups = _groups(search)
     for group in groups[: plan.groups]:
         likely = prior[group].max() > prior.max() - LIKELY_NATS
-        first = group[0]
         products = LimbProducts.of(
             body,
             base.x[group],
-            _search_limbs(limbs, search, base.x[first], sources.ancestors[first], rng)
+            _search_limbs(limbs, search, base.x[group[0]], sources.ancestors[group[0]], rng)
             if likely
             else {},
             price['limb_flip'],
@@ -153,8 +151,8 @@ def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) 
 
 def _groups(search: Search) -> list[Index]:
     """Modes with nearly the same trunk, each group with its best mode first."""
-    body = search.posterior.body
-    trunk = search.base_joints[:, body.skeleton.joint_index(body.trunk_joints)]
+    skeleton = search.posterior.body.skeleton
+    trunk = search.base_joints[:, skeleton.joint_index(skeleton.trunk_joints)]
     left = np.argsort(search.base.value, kind='stable')
     groups = []
     while len(left):
