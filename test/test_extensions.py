@@ -109,7 +109,7 @@ class Inputs(NamedTuple):
 BRIGHTNESS = ImageTerm(
     'brightness', 'Brightness of the image', TermSettings(2.0, 1.0, 1.0),
     lambda window: float(window.image.mean()),
-    lambda term, evidence, request: Inputs(term, float(evidence or 0.0)),
+    lambda term, evidence: Inputs(term, float(evidence or 0.0)),
 )
 """
 HEADER = """

@@ -80,7 +80,8 @@ def reverse_depth(body: Body, poses: ArrayLike) -> Array:
     return np.clip(result, body.lower, body.upper)
 
 
-def root_rotation_dofs(skeleton: Skeleton) -> list[int]:
+@lru_cache(maxsize=16)
+def root_rotation_dofs(skeleton: Skeleton) -> Index:
     """The rotations of the root, about z, y and x in this order.
 
     Raises:
@@ -89,7 +90,7 @@ def root_rotation_dofs(skeleton: Skeleton) -> list[int]:
     own, axes = rotations_of(skeleton, 0)
     if axes != ROOT_AXES:
         raise ValueError(f'the root of {skeleton.name} turns about {axes!r}, wanted {ROOT_AXES!r}')
-    return own
+    return np.array(own, dtype=np.intp)
 
 
 def rotations_of(skeleton: Skeleton, segment: int) -> tuple[list[int], str]:
@@ -151,7 +152,7 @@ def turn_jacobians(
     )
     result = np.tile(np.eye(body.dimension), (len(before), 1, 1))
     moved = old if rotation is None else product(rotation, old)
-    result[np.ix_(range(len(before)), root, root)] = solve(new, moved)
+    result[np.ix_(np.arange(len(before)), root, root)] = solve(new, moved)
     return result
 
 

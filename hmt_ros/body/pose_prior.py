@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hmt_ros import core
 from hmt_ros.body.angle_mixture import AngleMixture, shipped_prior
 from hmt_ros.body.body import Body
 from hmt_ros.core import elementary, evaluate_prior_at
@@ -46,10 +47,10 @@ class AnglePrior:
     @cached_property
     def compiled(self) -> PriorModel:
         """As compiled code reads it."""
-        nothing = np.zeros((1, 0))
         return PriorModel(
             np.zeros((1, 0, 0)),
-            nothing,
+            np.zeros((1, 0, 0)),
+            np.zeros((1, 0)),
             np.zeros(1),
             np.zeros((1, 0, 0)),
             np.zeros(0, dtype=np.int64),
@@ -82,8 +83,11 @@ class MixturePrior:
         log_weights = elementary.log(whole.weights)
         rest = 1.0 / self.body.prior_sigma**2
         rest[mixture.indices] = 0.0
+        wide = np.zeros((2, len(log_weights), n, n + -n % core.LANES))
+        wide[..., :n] = mixture.whitening, mixture.whitening.swapaxes(1, 2)
         return PriorModel(
-            mixture.whitening,
+            wide[0],
+            wide[1],
             product(mixture.whitening, whole.means[..., None])[..., 0],
             log_weights - log_det - 0.5 * n * elementary.log(2.0 * math.pi) - mixture.highest,
             mixture.precisions,
@@ -134,7 +138,9 @@ class PriorModel(NamedTuple):
     """The prior as the compiled code reads it.
 
     Attributes:
-        whitening: (C, n, n) inverse Cholesky factors W of the covariances, lower triangular.
+        whitening: (C, n, m) inverse Cholesky factors W of the covariances, lower triangular, in
+            rows of whole lanes.
+        columns: (C, n, m) the same of the transposed W.
         centres: (C, n) W m.
         constants: (C,) log of the weight times the normalisation, over the highest density.
         precisions: (C, n, n).
@@ -144,6 +150,7 @@ class PriorModel(NamedTuple):
     """
 
     whitening: Array
+    columns: Array
     centres: Array
     constants: Array
     precisions: Array

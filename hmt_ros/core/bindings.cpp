@@ -73,7 +73,7 @@ PYBIND11_MODULE(_compiled, m) {
   // image
   bind(m, "solve", solve,
        "first last compiled point free rows exact limits descent x value gradient hessian by_cue "
-       "status iterations");
+       "status iterations moving");
   bind(m, "record_residuals", record_residuals, "model inputs columns origins residuals");
   bind(m, "trace_contour", fill_contour, "flesh wanted lens columns origins contour");
   bind(m, "mark_visibility", mark_visibility,
@@ -98,10 +98,11 @@ PYBIND11_MODULE(_compiled, m) {
        "chain columns origins poses targets slack given_stays angles valid");
   bind(m, "fill_torso_flips", fill_torso_flips, "tree torso poses result parents");
   bind(m, "fill_configurations", fill_configurations,
-       "tree limbs modes found found_counts flipped price apart result");
+       "tree limbs modes found found_counts flipped price apart most result");
   bind(m, "place_alone", place_alone, "limbs found poses rows");
   bind(m, "combine", combine,
-       "limbs modes found energies log_weights trunk_weights share count poses parents values");
+       "limbs modes found energies log_weights exchanged exchange flip share count poses parents "
+       "values");
 
   // inference
   bind(m, "box_steps", box_steps, "x gradient hessian lower upper lam metric rows step predicted");
@@ -154,6 +155,7 @@ PYBIND11_MODULE(_compiled, m) {
   bind(m, "resize_bones", resize_bones, "order factors joints result");
 
   // constants
+  m.attr("LANES") = int(lanes);
   m.attr("RECORDED") = int(Sums::recorded);
   m.attr("FEWEST") = fewest;
   m.attr("COVER") = cover;

@@ -47,16 +47,22 @@ class BoxStep {
   }
 
  private:
+  static double least_shift(const Table& hessian, const Numbers& metric) {
+    double largest = 0.0, smallest = infinity;
+    for (Index i = 0; i < metric.size(); ++i) {
+      smallest = least(smallest, metric[i]);
+      for (double entry : hessian[i]) largest = most(largest, std::abs(entry));
+    }
+    return 1e-3 * largest / smallest;
+  }
+
   void minimise(const Numbers& gradient, const Table& hessian, const Numbers& low,
                 const Numbers& high, double shift, const Numbers& metric, const Vector& step) {
     const Index d = gradient.size();
     best_.fill(0.0);
-    double largest = 0.0, smallest = infinity;
     for (Index i = 0; i < d; ++i) {
       bound_[i] = rests(low[i], high[i], gradient[i]);
       step[i] = bound_[i] ? between(0.0, low[i], high[i]) : 0.0;
-      smallest = least(smallest, metric[i]);
-      for (Index j = 0; j < d; ++j) largest = most(largest, std::abs(hessian(i, j)));
     }
     double best_gain = -infinity;
     for (Index turn = 0; turn < 3 * d + 3; ++turn) {
@@ -66,7 +72,7 @@ class BoxStep {
       }
       while (!solve(gradient, hessian, shift, metric, count, step)) {
         // Not positive definite: the least shift that Gershgorin asks for is far too careful.
-        const double more = most(4.0 * shift, 1e-3 * largest / smallest);
+        const double more = most(4.0 * shift, least_shift(hessian, metric));
         if (shift > damping_limit || !(more > shift)) break;
         shift = more;
       }
@@ -117,25 +123,24 @@ class BoxStep {
       }
       solution_[a] = right;
     }
-    bool positive = true;
-    for (Index a = 0; a < count; ++a) {
-      double* row = factor_[a].data;
-      double pivot = row[a];
-      if (!(pivot > 0.0)) {
-        positive = false;
-        pivot = 1.0;
-      }
-      const double root = 1.0 / std::sqrt(pivot);
-      for (Index b = a; b < count; ++b) row[b] *= root;
-      solution_[a] *= root;
-      for (Index c = a + 1; c < count; ++c) {
-        const double scale = row[c];
-        solution_[c] -= scale * solution_[a];
-        if (scale == 0.0) continue;
-        double* other = factor_[c].data;
-        add_scaled(-scale, row + c, other + c, count - c);
+    // Two rows at a time, each one's part after the other's.
+    for (Index a = 0; a < count; a += 2) {
+      const Index b = a + 1;
+      const double *row = factor_[a].data, *next = row;
+      bool positive = scale_row(a, count);
+      if (b < count) {
+        next = factor_[b].data;
+        subtract(row, a, b, count);
+        positive &= scale_row(b, count);
       }
       if (!positive) return false;
+      for (Index c = b + 1; c < count; ++c) {
+        const double first = row[c], second = next[c];
+        solution_[c] = solution_[c] - first * solution_[a] - second * solution_[b];
+        double* other = factor_[c].data;
+#pragma omp simd
+        for (Index i = c; i < count; ++i) other[i] = other[i] - first * row[i] - second * next[i];
+      }
     }
     for (Index a = count - 1; a >= 0; --a) {
       const double* row = factor_[a].data;
@@ -143,6 +148,21 @@ class BoxStep {
           (solution_[a] - dot(row + a + 1, &solution_[0] + a + 1, count - a - 1)) / row[a];
     }
     return true;
+  }
+
+  // Divides row a of the factor by the root of its pivot; false where that is not positive.
+  bool scale_row(Index a, Index count) {
+    double* row = factor_[a].data;
+    if (!(row[a] > 0.0)) return false;
+    const double root = 1.0 / std::sqrt(row[a]);
+    for (Index i = a; i < count; ++i) row[i] *= root;
+    solution_[a] *= root;
+    return true;
+  }
+  // Subtracts from row b what row a says of it.
+  void subtract(const double* row, Index a, Index b, Index count) {
+    solution_[b] -= row[b] * solution_[a];
+    add_scaled(-row[b], row + b, factor_[b].data + b, count - b);
   }
 
   // Steepest descent in the metric, projected onto the box; returns its gain.

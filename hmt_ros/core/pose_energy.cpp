@@ -186,19 +186,25 @@ void try_step(const Numbers& x, const Numbers& step, const Numbers& low, const N
 void check(Index first, Index last, const Terms& terms, const Numbers& point, const Places& free,
            const Places& rows, const Table& limits, const Descent& descent, const Matrix& x,
            const Vector& value, const Matrix& gradient, const Tensor& hessian, const ByCue& by_cue,
-           const Array<std::int8_t, 1>& status, const Array<std::int32_t, 1>& iterations) {
+           const Array<std::int8_t, 1>& status, const Array<std::int32_t, 1>& iterations,
+           const Array<bool, 2>& moving) {
   const Index n = x.size(), f = free.size(), d = terms.placing.dimension();
   expect(0 <= first && first <= last && last <= n, "last", "a range of the points x");
   expect_shape("point", point, {d});
   expect_range("free", free, 0, d);
   expect_shape("x", x, {n, f});
-  expect_shape("rows", rows, {n});
+  for (Index i = first; i < last; ++i) {
+    for (double number : x[i]) expect(std::isfinite(number), "x", "finite numbers");
+  }
+  expect_shape("rows", rows, {rows.empty() ? 0 : n});
   expect_range("rows", rows, 0, terms.problems());
-  expect_shape("limits", limits, {2, f});
-  expect_shape("descent.metric", descent.metric, {descent.most > 0 ? f : -1});
+  expect(!rows.empty() || n <= terms.problems(), "rows", "the problem of each point");
+  expect_shape("limits", limits, {2, d});
+  expect_shape("moving", moving, {moving.size() > 0 ? n : 0, f});
+  expect_shape("descent.scale", descent.scale, {moving.size() > 0 ? d : -1});
   expect_shape("value", value, {n});
   const Index wanted = gradient.size() > 0 ? n : 0;
-  expect(wanted || descent.most == 0, "gradient", "room for derivatives, which minima need");
+  expect(wanted || moving.size() == 0, "gradient", "room for derivatives, which minima need");
   expect_shape("gradient", gradient, {wanted, f});
   expect_shape("hessian", hessian, {wanted, f, f});
   const auto& [values, hessians] = by_cue;
@@ -219,35 +225,43 @@ void solve(Index first, Index last, const Terms& terms, const Numbers& point, co
            const Places& rows, bool exact, const Table& limits, const Descent& descent,
            const Matrix& x, const Vector& value, const Matrix& gradient, const Tensor& hessian,
            const ByCue& by_cue, const Array<std::int8_t, 1>& status,
-           const Array<std::int32_t, 1>& iterations) {
+           const Array<std::int32_t, 1>& iterations, const Array<bool, 2>& moving) {
   check(first, last, terms, point, free, rows, limits, descent, x, value, gradient, hessian, by_cue,
-        status, iterations);
-  const Index f = free.size();
+        status, iterations, moving);
+  const Index f = free.size(), most_turns = moving.size() > 0 ? descent.most : 0;
   const auto& [values, hessians] = by_cue;
   const bool apart = values.size() > 0, wanted = gradient.size() > 0;
   PoseEnergy energy(terms, point, free, apart);
   BoxStep box(f);
-  Scratch<double, 1> slope(f), low(f), high(f), step(f), trial(f);
-  Scratch<double, 2> curve(f, f);
+  Scratch<double, 1> slope(f), low(f), high(f), step(f), trial(f), metric(f);
+  Scratch<double, 2> curve(f, f), ends(2, f);
+  for (Index i = 0; i < f && moving.size() > 0; ++i) {
+    metric[i] = 1.0 / square(descent.scale[free[i]]);
+    for (int end = 0; end < 2; ++end) ends(end, i) = limits(end, free[i]);
+  }
   for (Index n = first; n < last; ++n) {
+    for (Index i = 0; i < f && moving.size() > 0; ++i) {
+      x(n, i) = between(x(n, i), ends(0, i), ends(1, i));
+    }
     double shift = descent.damping, growth = 2.0, predicted = 0.0;
     Status result = Status::iteration_limit;
-    for (Index turn = 0; turn <= descent.most; ++turn) {
+    for (Index turn = 0; turn <= most_turns; ++turn) {
       if (turn == 0) {
         trial.view().copy_from(x[n]);
       } else {
         for (Index i = 0; i < f; ++i) {
-          low[i] = limits(0, i) - x(n, i);
-          high[i] = limits(1, i) - x(n, i);
+          low[i] = ends(0, i) - x(n, i);
+          high[i] = ends(1, i) - x(n, i);
         }
-        predicted = box.take(gradient[n], hessian[n], low, high, shift, descent.metric, step);
+        predicted = box.take(gradient[n], hessian[n], low, high, shift, metric, step);
         if (predicted < descent.tolerance) {
           result = Status::converged;
           break;
         }
-        try_step(x[n], step, low, high, limits, trial);
+        try_step(x[n], step, low, high, ends, trial);
       }
-      const double found = energy.at(n, rows[n], trial, exact, wanted, slope, curve);
+      const double found =
+          energy.at(n, rows.empty() ? n : rows[n], trial, exact, wanted, slope, curve);
       if (apart) {
         values[n].copy_from(energy.values());
         if (wanted) hessians[n].copy_from(energy.hessians());
@@ -280,6 +294,11 @@ void solve(Index first, Index last, const Terms& terms, const Numbers& point, co
       if (result != Status::iteration_limit) break;
     }
     status[n] = static_cast<std::int8_t>(result);
+    for (Index i = 0; i < f && moving.size() > 0; ++i) {
+      const double at = x(n, i), slope_there = gradient(n, i);
+      moving(n, i) =
+          !((at <= ends(0, i) && slope_there > 0.0) || (at >= ends(1, i) && slope_there < 0.0));
+    }
   }
 }
 
@@ -433,7 +452,7 @@ void mark_visibility(const FleshTable& flesh, const Mask& occluders, const Table
     extents[part] = most(extents[part], std::sqrt(dot(away, away)));
   }
   const auto row = [&](int k) { return rows[k].data; };
-  mark_hidden(flesh, occluders, extents.view().data, columns, origins, Occluders(count),
+  mark_hidden(flesh, occluders, extents.view().data, columns, origins, Occluders(count, whole),
               {whole, parts_of.view().data, row(0), row(1), row(2), row(3), row(4), row(5)});
   for (Index n = 0; n < p; ++n) {
     covered[n] = rows(4, n) > 0.0;

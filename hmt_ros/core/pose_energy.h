@@ -61,7 +61,7 @@ struct Terms {
 struct Descent {
   Index most;  // evaluations per problem after the first one
   double damping, tolerance;
-  Numbers metric;  // (f,) diagonal of W
+  Numbers scale;  // (d,) length of a moderate step of each variable: W = diag(scale^-2)
 };
 
 // Energies (n, 3) and Hessians (n, 3, d, d) of image, keypoints and all other terms; of no point:
@@ -74,14 +74,15 @@ enum class Status : std::int8_t { converged, iteration_limit, stalled, not_finit
 
 // Energies at the points `first` to `last` - 1, or minima from there.
 //
-// `point`, `free`, `rows`, `exact` are as for `PoseEnergy.energy`, `limits` (2, f) the lower and
-// the upper ones. The points x (n, f) become minima, where evaluations after the first are asked
-// for; value (n,), gradient (n, f), hessian (n, f, f), status (n,) and iterations (n,) are results;
-// no gradients: no derivatives are wanted, and no minima.
+// `point`, `free`, `rows`, `exact` are as for `PoseEnergy.energy`; without rows point i belongs to
+// problem i. `limits` (2, d) are the lower and the upper ones. Value (n,), gradient (n, f), hessian
+// (n, f, f), status (n,) and iterations (n,) are results; no gradients: no derivatives are wanted.
+// `moving` (n, f) become the variables that do not rest on a limit, and the points x (n, f) minima
+// between the limits; without `moving` they stay.
 void solve(Index first, Index last, const Terms& terms, const Numbers& point, const Places& free,
            const Places& rows, bool exact, const Table& limits, const Descent& descent,
            const Matrix& x, const Vector& value, const Matrix& gradient, const Tensor& hessian,
            const ByCue& by_cue, const Array<std::int8_t, 1>& status,
-           const Array<std::int32_t, 1>& iterations);
+           const Array<std::int32_t, 1>& iterations, const Array<bool, 2>& moving);
 
 }  // namespace hmt

@@ -19,9 +19,10 @@ inline constexpr double negligible = 40.0;
 // Responsibility below which a component adds nothing to the derivatives.
 inline constexpr double faint = 1e-12;
 
-// C components over n angles.
+// C components over n angles, in rows of m >= n, which are whole lanes; 0 beyond n.
 struct PriorModel {
-  Tables whitening;   // (C, n, n) inverse Cholesky factors W of the covariances, lower triangular
+  Tables whitening;   // (C, n, m) inverse Cholesky factors W of the covariances, lower triangular
+  Tables columns;     // (C, n, m) the transposed W
   Table centres;      // (C, n) W m
   Numbers constants;  // (C,) log of the weight times the normalisation, over the highest density
   Tables precisions;  // (C, n, n)
@@ -32,10 +33,12 @@ struct PriorModel {
 
   Index components() const { return centres.size(); }
   Index angles() const { return places.size(); }
+  Index width() const { return whitening.size(2); }
   Index dimension() const { return means.size(); }
   void check() const {
     const Index c = components(), n = angles();
-    expect_shape("whitening", whitening, {c, n, n});
+    expect_shape("whitening", whitening, {c, n, in_whole_lanes(n)});
+    expect_shape("columns", columns, {c, n, in_whole_lanes(n)});
     expect_shape("centres", centres, {c, n});
     expect_shape("constants", constants, {c});
     expect_shape("precisions", precisions, {c, n, n});
@@ -50,9 +53,21 @@ struct PriorRoom {
       : angles(model.angles()),
         whitened(model.components(), model.angles()),
         log(model.components()),
-        pull(model.angles()),
+        pull(model.width()),
         pulls(model.angles()),
-        curvature(model.angles(), model.angles()) {}
+        curvature(model.angles(), model.angles()) {
+    for (Index i = 0; i < model.angles(); ++i) {
+      const Index place = model.places[i];
+      if (i == 0 || place != model.places[i - 1] + 1) runs.push_back({i, place, 0});
+      ++runs.back().length;
+    }
+  }
+
+  // Angles whose places follow one another.
+  struct Run {
+    Index first, place, length;
+  };
+  std::vector<Run> runs;
 
   Scratch<double, 1> angles;
   Scratch<double, 2> whitened;  // W (a - m)
@@ -61,22 +76,38 @@ struct PriorRoom {
   Scratch<double, 2> curvature;
 };
 
+// Sets sums of one group of lanes over the rows from `first` to `end` - 1 of a table, times
+// factors.
+HMT_INLINE void add_rows(const double* table, Index width, const double* factors, Index first,
+                         Index end, double* sums) {
+  Group<double> low{}, high{};
+  for (Index i = first; i < end; ++i) {
+    const auto* row = reinterpret_cast<const Group<double>*>(table + i * width);
+    low += row[0] * factors[i];
+    high += row[1] * factors[i];
+  }
+  auto* result = reinterpret_cast<Group<double>*>(sums);
+  result[0] = low;
+  result[1] = high;
+}
+
 // The log density of component c at the angles in the room, or -inf far below the best before.
 inline double component_log_density(const PriorModel& model, Index c, double best,
                                     const PriorRoom& room) {
   const Index n = model.angles();
   const double limit = 2.0 * (model.constants[c] - best + negligible);
-  const double *row = model.whitening[c].data, *centre = model.centres[c].data;
-  const double* angles = room.angles.view().data;
+  const double *centre = model.centres[c].data, *angles = room.angles.view().data;
   double* z = room.whitened[c].data;
   double distance = 0.0;
-  for (Index i = 0; i < n; ++i, row += n) {
-    double s = 0.0;
-    for (Index j = 0; j <= i; ++j) s += row[j] * angles[j];
-    s -= centre[i];
-    z[i] = s;
-    distance += s * s;
-    if (distance > limit) return -infinity;  // it only grows
+  for (Index first = 0; first < n; first += lanes) {
+    const Index end = std::min(first + lanes, n);
+    double sums[lanes];
+    add_rows(model.columns[c].data + first, model.width(), angles, 0, end, sums);
+    for (Index i = first; i < end; ++i) {
+      z[i] = sums[i - first] - centre[i];
+      distance += z[i] * z[i];
+      if (distance > limit) return -infinity;  // it only grows
+    }
   }
   return model.constants[c] - 0.5 * distance;
 }
@@ -86,10 +117,10 @@ inline void add_component(const PriorModel& model, Index c, double share, bool e
                           const PriorRoom& room) {
   const Index n = model.angles();
   double *pull = room.pull.view().data, *pulls = room.pulls.view().data;
-  const double *w = model.whitening[c].data, *precision = model.precisions[c].data;
-  const double* z = room.whitened[c].data;
-  room.pull.fill(0.0);
-  for (Index i = 0; i < n; ++i, w += n) add_scaled(z[i], w, pull, n);  // 0 above the diagonal
+  const double *precision = model.precisions[c].data, *z = room.whitened[c].data;
+  for (Index j = 0; j < n; j += lanes) {  // 0 above the diagonal
+    add_rows(model.whitening[c].data + j, model.width(), z, j, n, pull + j);
+  }
   double* curve = room.curvature.view().data;
   add_scaled(share, pull, pulls, n);
   add_scaled(share, precision, curve, n * n);
@@ -134,10 +165,12 @@ HMT_WIDE inline double evaluate_prior(const PriorModel& model, const Numbers& po
   for (Index i = 0; i < n; ++i) {
     gradient[model.places[i]] += weight * room.pulls[i];
     double* row = hessian[model.places[i]].data;
-    for (Index j = 0; j < n; ++j) {
-      double& entry = row[model.places[j]];
-      entry = weight * room.curvature(i, j);
-      if (exact) entry += weight * room.pulls[i] * room.pulls[j];
+    for (const auto& run : room.runs) {
+      const double* curve = room.curvature[i].data + run.first;
+      for (Index j = 0; j < run.length; ++j) row[run.place + j] = weight * curve[j];
+    }
+    for (Index j = 0; j < n && exact; ++j) {
+      row[model.places[j]] += weight * room.pulls[i] * room.pulls[j];
     }
   }
   return weight * energy;

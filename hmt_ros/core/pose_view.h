@@ -55,7 +55,7 @@ class PoseView {
         contour(room_.contour()),
         front(front_room_.contour()),
         pixel_sums(contour.count),
-        occluders(body.flesh.parts()) {}
+        occluders(body.flesh.parts(), contour.count) {}
 
   const Model& model;
   Index number = 0;            // of the pose, of those of a call

@@ -436,11 +436,14 @@ struct Visible {
   double *covered, *hidden;
 };
 
-// Room for parts that may hide points of others.
+// Room for parts that may hide points of others, which are so many whole lanes.
 struct Occluders {
-  explicit Occluders(Index parts) : ellipsoids(parts), near(parts) {}
+  Occluders(Index parts, Index points)
+      : ellipsoids(parts), cones(parts), near(parts + 1), ends(points / lanes, 2) {}
   Scratch<Ellipsoid, 1> ellipsoids;
-  Scratch<bool, 1> near;  // parts that one occluder may hide
+  Scratch<Cone, 1> cones;  // of the points of the parts
+  Scratch<Index, 1> near;  // number of parts before each that one occluder may hide
+  Scratch<Index, 2> ends;  // first and last part of each group of lanes
 };
 
 // Marks points from `first` on, as many as there are lanes, that an ellipsoid of part b hides: it
@@ -480,11 +483,19 @@ HMT_WIDE inline void mark_hidden(const FleshTable& flesh, const Mask& occluders,
   std::fill_n(points.covered, points.count, 0.0);
   std::fill_n(points.hidden, points.count, 0.0);
   Ellipsoid* all = room.ellipsoids.view().data;
-  bool* near = room.near.view().data;
+  Cone* cones = room.cones.view().data;
+  Index *near = room.near.view().data, *ends = room.ends.view().data;
+  for (Index first = 0; first < points.count; first += lanes, ends += 2) {
+    const auto [low, high] =
+        std::minmax_element(points.parts + first, points.parts + first + lanes);
+    ends[0] = *low;
+    ends[1] = *high;
+  }
   for (Index b = 0; b < count; ++b) {
     const Index s = flesh.part_segments[b];
     all[b] = placed_ellipsoid(flesh.part_centres[b].data, flesh.part_radii[b].data,
                               columns.data + 9 * s, origins.data + 3 * s);
+    cones[b] = cone_of(extents[b], all[b].distance);
   }
   for (Index b = 0; b < count; ++b) {
     if (!occluders[b]) continue;
@@ -492,15 +503,14 @@ HMT_WIDE inline void mark_hidden(const FleshTable& flesh, const Mask& occluders,
     // Balls whose cones do not touch, by a hair for rounding, hide nothing of each other.
     const Cone own = cone_of(e.largest, e.distance);
     for (Index a = 0; a < count; ++a) {
-      const Cone other = cone_of(extents[a], all[a].distance);
+      const Cone& other = cones[a];
       const double limit = own.cosine * other.cosine - own.sine * other.sine - 1e-9;
       const bool apart = dot(all[a].centre, e.centre) < all[a].distance * e.distance * limit;
-      near[a] = a != b && !(apart && own.sine < 1.0);
+      near[a + 1] = near[a] + (a != b && !(apart && own.sine < 1.0));
     }
-    for (Index first = 0; first < points.count; first += lanes) {
-      bool any = false;
-      for (Index i = first; i < first + lanes; ++i) any |= near[points.parts[i]];
-      if (any) mark_lanes(e, b, points, first);
+    ends = room.ends.view().data;
+    for (Index first = 0; first < points.count; first += lanes, ends += 2) {
+      if (near[ends[1] + 1] > near[ends[0]]) mark_lanes(e, b, points, first);
     }
   }
 }

@@ -12,6 +12,7 @@ poses. Everything is compiled, a call a group; the energies are evaluated betwee
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,7 +28,6 @@ from hmt_ros.core import combine, fill_configurations, place_alone
 from hmt_ros.flips.chain_links import chain_links
 from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.linear_algebra import log_sum_exp
 
 
 class Limbs(NamedTuple):
@@ -166,6 +166,7 @@ class LimbProducts:
         *,
         apart: float,
         most: int,
+        poses: int = sys.maxsize,
     ) -> LimbProducts:
         """Configurations of all limbs in a group.
 
@@ -175,25 +176,26 @@ class LimbProducts:
             found: further angles (F, chain dofs) of some chains.
             price: of a configuration that is not a mode's own, nats.
             apart: configurations are distinct when some joint is as far apart, m.
+            most: configurations of a limb on a trunk.
+            poses: to evaluate at most; the last trunks are left out. That of the group stays.
         """
         limbs, skeleton = limbs_of(body.skeleton), body.skeleton
         modes = np.ascontiguousarray(modes, dtype=np.float64)
-        flipped = np.ascontiguousarray(flip_torso(body, modes[:1])[0], dtype=np.float64)
+        flipped = flip_torso(body, modes[:1])[0]
         counts = np.zeros(len(limbs.links), dtype=np.int64)
         more = np.zeros((len(counts), max(map(len, found.values()), default=0), limbs.own.shape[1]))
         for c, chain in enumerate(skeleton.chains):
             if chain in found:
                 counts[c] = len(found[chain])
                 more[c, : counts[c], : limbs.dofs[c]] = found[chain]
-        pairs = int((limbs.siblings >= 0).sum()) // 2
-        trunks = 1 + pairs + len(flipped)
+        trunks = 1 + len(body.chain_pairs) + len(flipped)
         result = Configurations(
             np.zeros((trunks, skeleton.dimension)),
             np.zeros((trunks, len(counts), most, limbs.own.shape[1])),
             np.zeros((trunks, len(counts)), dtype=np.int64),
             np.full((len(modes), len(counts), most), np.inf),
         )
-        exchanged = fill_configurations(
+        used, exchanged = fill_configurations(
             placing_of(skeleton),
             limbs,
             modes,
@@ -202,26 +204,13 @@ class LimbProducts:
             flipped,
             float(price),
             float(apart),
+            poses,
             result,
         )
-        used = slice(1 + exchanged + len(flipped))
         result = result._replace(
-            trunks=result.trunks[used], angles=result.angles[used], counts=result.counts[used]
+            trunks=result.trunks[:used], angles=result.angles[:used], counts=result.counts[:used]
         )
-        return cls(body, modes, result, int(exchanged))
-
-    def at_most(self, poses: int) -> LimbProducts:
-        """The products without the last trunks, so that about so many poses are to be evaluated.
-
-        The trunk of the group stays in any case.
-        """
-        found = self.configurations
-        used = max(int((np.cumsum(1 + found.counts.sum(1)) <= poses).sum()), 1)
-        kept = found._replace(
-            trunks=found.trunks[:used], angles=found.angles[:used], counts=found.counts[:used]
-        )
-        exchanged = min(self.exchanged, used - 1)
-        return LimbProducts(self.body, self.modes, kept, exchanged)
+        return cls(body, modes, result, exchanged)
 
     @property
     def alone(self) -> tuple[Array, Index]:
@@ -256,8 +245,6 @@ class LimbProducts:
             share: of the energy that counts.
         """
         found = self.configurations
-        prices = np.full(len(found.trunks), flip)
-        prices[0], prices[1 : 1 + self.exchanged] = 0.0, exchange
         most = len(found.trunks) * count
         poses, parents, values = (
             np.empty((most, self.body.dimension)),
@@ -270,7 +257,9 @@ class LimbProducts:
             found,
             np.ascontiguousarray(energies, dtype=np.float64),
             np.ascontiguousarray(log_weights, dtype=np.float64),
-            log_sum_exp(log_weights) - prices,
+            self.exchanged,
+            float(exchange),
+            float(flip),
             float(share),
             int(count),
             poses,

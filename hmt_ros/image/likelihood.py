@@ -31,7 +31,7 @@ from hmt_ros.core import record_residuals
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of
-from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
+from hmt_ros.image.terms.image_term import TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
 from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
@@ -106,7 +106,6 @@ class ImageLikelihood:
     def seen(
         self,
         observation: Observation,
-        explained: Array | None = None,
         exchanges: Array | None = None,
         share: float = 1.0,
         lifted_share: float = 1.0,
@@ -115,14 +114,9 @@ class ImageLikelihood:
 
         Args:
             observation: of the image.
-            explained: as for `ObservedImage`.
             exchanges, share, lifted_share: as for `keypoint_term`.
         """
-        image = (
-            observed(self, observation)
-            if explained is None
-            else ObservedImage(self, observation, explained)
-        )
+        image = observed(self, observation)
         if observation.keypoints is None or self.settings.keypoints.weight == 0:
             return (image,)
         return (image, self.keypoint_term(observation, exchanges, share, lifted_share))
@@ -221,38 +215,41 @@ class ObservedImage:
     @cached_property
     def compiled(self) -> dict[str, Any]:
         """What compiled code reads of them: members of `pose_energy.Compiled`."""
-        inputs = self.inputs(0)
-        running = [term for term, one in zip(TERMS, inputs, strict=True) if one.term.weight > 0]
-        return {
-            'model': self.likelihood.model,
-            'inputs': inputs,
-            'image': bool(running),
-            'contour': any(term.needs_contour for term in running),
-        }
-
-    def inputs(self, poses: int) -> tuple[Any, ...]:
-        """The inputs of all terms, with room for the results of so many poses."""
-        observation, beliefs = self.observation, self.observation.beliefs
-        request = Request(poses, self.explained)
-        result = []
-        for term in TERMS:
-            s: TermSettings = getattr(self.likelihood.settings, term.name)
-            evidence = observation.evidence.get(term.name)
-            weight = 0.0 if evidence is None else float(s.weight)
-            if beliefs is not None:
-                weight *= beliefs.of_term(term.name)
-            weighting = Weighting(
-                weight,
-                float(s.sigma),
-                float(s.scale),
-                float(observation.magnification),
-                float(s.growth),
-            )
-            result.append(term.inputs(weighting, evidence, request))
-        return tuple(result)
+        found = _inputs(self.likelihood.settings, self.observation)
+        if self.explained is not None:
+            found = found | {
+                'inputs': tuple(
+                    x._replace(explained=self.explained) if hasattr(x, 'explained') else x
+                    for x in found['inputs']
+                )
+            }
+        return found | {'model': self.likelihood.model}
 
 
-# An image is compared with many sets of poses.
+# An image is compared with many sets of poses, and with parts of the body.
+@lru_cache(maxsize=4)
+def _inputs(settings: LikelihoodSettings, observation: Observation) -> dict[str, Any]:
+    """The inputs of all terms of an image, and which of them are on."""
+    beliefs, result = observation.beliefs, []
+    for term in TERMS:
+        s: TermSettings = getattr(settings, term.name)
+        evidence = observation.evidence.get(term.name)
+        weight = 0.0 if evidence is None else float(s.weight)
+        if beliefs is not None:
+            weight *= beliefs.of_term(term.name)
+        weighting = Weighting(
+            weight,
+            float(s.sigma),
+            float(s.scale),
+            float(observation.magnification),
+            float(s.growth),
+        )
+        result.append(term.inputs(weighting, evidence))
+    running = [term for term, one in zip(TERMS, result, strict=True) if one.term.weight > 0]
+    contour = any(term.needs_contour for term in running)
+    return {'inputs': tuple(result), 'image': bool(running), 'contour': contour}
+
+
 @lru_cache(maxsize=4)
 def usual_keypoints(
     likelihood: ImageLikelihood, observation: Observation, lifted_share: float

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -56,8 +57,9 @@ def without_ipp() -> Iterator[None]:
         cv2.ipp.setUseIPP(before)
 
 
-class FlowTerm(NamedTuple):
-    """The energy of poses against the flow, as compiled code reads it.
+@dataclass(frozen=True, eq=False)
+class FlowTerm:
+    """The energy of poses against the flow.
 
     Attributes:
         points: of K poses in the image before, one for each problem.
@@ -70,6 +72,6 @@ class FlowTerm(NamedTuple):
     weight: float
 
     @property
-    def compiled(self) -> FlowTerm:
+    def compiled(self) -> tuple[SurfacePoints, ImageMap, float]:
         """The term as compiled code reads it."""
-        return self
+        return self.points, self.flow, self.weight

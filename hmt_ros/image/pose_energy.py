@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,16 +29,16 @@ from hmt_ros.core import solve
 from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage, observed
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.optical_flow import FlowTerm
+from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import NO_MAP
 from hmt_ros.image.terms.keypoints import KeypointInputs, Keypoints, KeypointTerm
 from hmt_ros.image.terms.registry import Model
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
+from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, add_energies
 from hmt_ros.inference.threads import in_threads
 
-Parts = tuple[Array, Array]
 CompiledTerm = (
     ObservedImage
     | KeypointTerm
@@ -84,7 +84,7 @@ class Compiled(NamedTuple):
     prior: PriorModel
     overlaps: Overlaps
     ground: Constants
-    flow: FlowTerm
+    flow: tuple[SurfacePoints, ImageMap, float]
     centres: Array
     precisions: Array
     tails: float
@@ -96,16 +96,17 @@ class Descent(NamedTuple):
     Attributes:
         most: evaluations per problem after the first one.
         damping, tolerance: first lambda, and gain of a step that ends a descent.
-        metric: (f,) diagonal of W.
+        scale: (d,) length of a moderate step of each variable.
     """
 
     most: int
     damping: float
     tolerance: float
-    metric: Array
+    scale: Array
 
 
 NO_DESCENT = Descent(0, 1.0, 0.0, np.zeros(0))
+NO_ROWS = np.zeros(0, dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,6 @@ class PoseEnergy:
         point: (d,) values of all variables; None: all are free.
         free: (f,) variables that may move, where there is a point.
         counted: called with the number of poses that were evaluated; None: not called.
-        _known: terms with a kernel here, by the name of their inputs.
 
     Raises:
         ValueError: two terms of one kind that has a kernel.
@@ -148,18 +148,15 @@ class PoseEnergy:
     point: Array | None = None
     free: Index | None = None
     counted: Callable[[int], None] | None = None
-    _known: dict[str, Any] = field(init=False, repr=False)
+    _sum: tuple[Compiled, tuple[FrameTerm, ...]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        known: dict[str, Any] = {}
-        for term in self.terms:
-            name = KINDS.get(type(term), '')
-            if name in known:
-                found = f'{type(known[name]).__name__} and {type(term).__name__}'
-                raise ValueError(f'a sum has one term of a kind at most, saw {found}')
-            if name:
-                known[name] = term
-        object.__setattr__(self, '_known', known)
+        object.__setattr__(self, '_sum', _summed(self.likelihood, self.terms))
+
+    @property
+    def _strange(self) -> tuple[FrameTerm, ...]:
+        """Terms without a kernel here."""
+        return self._sum[1]
 
     def energy(
         self,
@@ -191,30 +188,28 @@ class PoseEnergy:
             seen = 'a motion' if self.point is None else 'variables that are fixed'
             raise ValueError(f'by_cue wants the terms of a whole pose alone, saw {seen}')
         asked = Derivatives.POSITIVE if derivatives else Derivatives.NONE
-        energy, parts, compiled = self._evaluated(x, None, asked, apart=True)
-        costs = next((y.costs for y in compiled.inputs if hasattr(y, 'costs')), None)
-        return ByCue(energy, *parts, np.zeros((len(x), 0)) if costs is None else costs)
+        return ByCue(*self._evaluated(x, None, asked, apart=True))
 
     def _evaluated(
         self, x: Array, rows: Index | None, derivatives: Derivatives, *, apart: bool
-    ) -> tuple[Energy, Parts, Compiled]:
+    ) -> tuple[Energy, Array, Array, Array]:
         x = self._checked(x)
-        rows = np.arange(len(x)) if rows is None else np.asarray(rows, dtype=np.intp)
         exact = derivatives == Derivatives.EXACT
-        limits = np.zeros((2, x.shape[1]))
-        energy, parts, compiled, *_ = self._solved(
-            x, rows, limits, NO_DESCENT, 8, exact=exact, wanted=bool(derivatives), apart=apart
+        energy, parts, *_ = self._solved(
+            x, rows, NO_DESCENT, 8, exact=exact, wanted=bool(derivatives), apart=apart
         )
         if self.counted is not None:
             self.counted(len(x))
-        others = self._others(x, rows, derivatives)
+        found = energy if derivatives else Energy(energy.value)
+        if not self._strange:
+            return found, *parts
+        others = self._others(x, np.arange(len(x)) if rows is None else rows, derivatives)
         if apart:
             for other in others:
                 parts[0][:, 2] += other.value
                 if derivatives:
                     parts[1][:, 2] += other.derivatives()[1]
-        found = energy if derivatives else Energy(energy.value)
-        return add_energies([found, *others]), parts, compiled
+        return add_energies([found, *others]), *parts
 
     def minimise(
         self,
@@ -229,92 +224,79 @@ class PoseEnergy:
 
         Args:
             x: starts.
-            step_scale: (f,) or a scalar; None: that of the body.
+            step_scale: (d,) or a scalar; None: that of the body.
             damping, max_iterations, tolerance: as for `bounded_newton.minimise`.
 
         Raises:
             ValueError: x has not f columns, or is not finite.
         """
-        limits = _limits(self.likelihood.body)
-        if self.point is not None:
-            limits = limits.take(self._free, axis=1)
-        lower, upper = limits
-        if step_scale is None:
-            step_scale = scale_of(self.likelihood.body)[self._free]
+        body = self.likelihood.body
+        step_scale = scale_of(body) if step_scale is None else step_scale
+        scale = np.full(body.dimension, step_scale, dtype=np.float64)
         if self._strange:
+            lower, upper = _limits(body)[:, self._free]
             return minimise(
                 self,
                 x,
                 lower,
                 upper,
-                step_scale=step_scale,
+                step_scale=scale[self._free],
                 damping=damping,
                 max_iterations=max_iterations,
                 tolerance=tolerance,
             )
-        inside: Array = np.minimum(np.maximum(self._checked(x), lower), upper)
-        n, f = inside.shape
-        metric = np.full(f, 1.0 / np.asarray(step_scale, dtype=np.float64) ** 2)
-        descent = Descent(max_iterations, float(damping), float(tolerance), metric)
-        energy, _, _, status, iterations = self._solved(inside, np.arange(n), limits, descent, 2)
+        inside = self._checked(x)
+        descent = Descent(max_iterations, float(damping), float(tolerance), scale)
+        energy, _, status, iterations, moving = self._solved(inside, None, descent, 2)
         if self.counted is not None:
-            self.counted(n + int(iterations.sum()))
+            self.counted(len(inside) + int(iterations.sum()))
         gradient, hessian = energy.derivatives()
-        free = ~resting(inside, gradient, lower, upper)
-        return Minimum(inside, energy.value, gradient, hessian, free, status, iterations)
+        return Minimum(inside, energy.value, gradient, hessian, moving, status, iterations)
 
     def _solved(
         self,
         x: Array,
-        rows: Index,
-        limits: Array,
+        rows: Index | None,
         descent: Descent,
         together: int,
         *,
         exact: bool = False,
         wanted: bool = True,
         apart: bool = False,
-    ) -> tuple[Energy, Parts, Compiled, NDArray[np.int8], NDArray[np.int32]]:
-        """Energies of points x (n, f), which become minima; arguments and results as for `solve`.
+    ) -> tuple[
+        Energy, tuple[Array, Array, Array], NDArray[np.int8], NDArray[np.int32], NDArray[np.bool_]
+    ]:
+        """Energies of points x (n, f), or minima that they become; results as for `solve`.
 
         Args:
+            rows: (n,) the problem of each; None: its own.
+            descent: towards a minimum; `NO_DESCENT`: the points stay.
             together: number of points that a thread takes at once.
             wanted: whether derivatives are wanted.
-            apart: whether the parts by cue are.
+            apart: whether values and Hessians by cue, and costs of the outline are.
         """
         n, f = x.shape
         asked, values = n if wanted else 0, n if apart else 0
-        energy = np.empty(n), np.empty((asked, f)), np.empty((asked, f, f))
+        energy = Energy(np.empty(n), np.empty((asked, f)), np.empty((asked, f, f)))
         parts = np.empty((values, 3)), np.empty((asked if apart else 0, 3, f, f))
         status, iterations = np.empty(n, dtype=np.int8), np.zeros(n, dtype=np.int32)
-        compiled = self._compiled
+        moving = np.empty((0 if descent is NO_DESCENT else n, f), dtype=np.bool_)
+        compiled, costs = self._compiled, np.zeros((values, 0))
         if apart:
-            compiled = compiled._replace(inputs=self._image.inputs(n))
+            compiled, costs = _with_costs(compiled, n)
+        before = compiled, self._point, self._free, NO_ROWS if rows is None else rows, exact
+        limits = _limits(self.likelihood.body)
+        after = limits, descent, x, *energy, parts, status, iterations, moving
 
         def work(first: int, last: int) -> None:
-            solve(
-                first,
-                last,
-                compiled,
-                self._point,
-                self._free,
-                rows,
-                exact,
-                limits,
-                descent,
-                x,
-                *energy,
-                parts,
-                status,
-                iterations,
-            )
+            solve(first, last, *before, *after)
 
         in_threads(work, n, together, self.likelihood.threads)
-        return Energy(*energy), parts, compiled, status, iterations
+        return energy, (*parts, costs), status, iterations, moving
 
     @property
     def _point(self) -> Array:
-        return _origin(self.likelihood.body) if self.point is None else self.point
+        return np.zeros(self.likelihood.body.dimension) if self.point is None else self.point
 
     @property
     def _free(self) -> Index:
@@ -324,25 +306,13 @@ class PoseEnergy:
         return np.asarray(self.free, dtype=np.intp)
 
     def _checked(self, x: ArrayLike) -> Array:
-        result = np.array(x, dtype=np.float64, ndmin=2)
+        result = np.array(x, dtype=np.float64, order='C', ndmin=2)
         if result.ndim != 2 or result.shape[1] != len(self._free):
-            wanted = f'(N, {len(self._free)})'
-            raise ValueError(f'poses must have shape {wanted}, saw {result.shape}')
-        if not np.isfinite(result).all():
-            raise ValueError('poses must be finite')
+            raise ValueError(f'poses must have shape (N, {len(self._free)}), saw {result.shape}')
         return result
-
-    @property
-    def _strange(self) -> tuple[FrameTerm, ...]:
-        """Terms without a kernel here."""
-        if len(self._known) == len(self.terms):
-            return ()
-        return tuple(x for x in self.terms if not isinstance(x, CompiledTerm))
 
     def _others(self, x: Array, rows: Index, derivatives: Derivatives) -> list[Energy]:
         """Energies of the terms without a kernel, over the free variables."""
-        if not self._strange:
-            return []
         poses = np.repeat(self._point[None], len(x), axis=0)
         poses[:, self._free] = x
         frames = forward(self.likelihood.body.skeleton, poses)
@@ -356,21 +326,53 @@ class PoseEnergy:
             result.append(found)
         return result
 
-    @property
-    def _image(self) -> ObservedImage:
-        return self._known.get('image') or observed(self.likelihood, NOTHING_SEEN)
-
     @cached_property
     def _compiled(self) -> Compiled:
         """The terms as compiled code reads them; they return their energies alone."""
-        found = {name: term.compiled for name, term in self._known.items() if name != 'image'}
-        found |= self._image.compiled
+        known = self._sum[0]
         if self.motion is not None:
-            found |= zip(('centres', 'precisions', 'tails'), _expected(self.motion), strict=True)
-        elif self.point is not None:
-            f = len(self._free)
-            found |= {'centres': np.zeros((0, f)), 'precisions': np.zeros((0, f, f))}
-        return _absent(self.likelihood.body)._replace(**found)
+            centres, precisions, tails = _expected(self.motion)
+            return known._replace(centres=centres, precisions=precisions, tails=tails)
+        if self.point is None:
+            return known
+        f = len(self._free)
+        return known._replace(centres=np.zeros((0, f)), precisions=np.zeros((0, f, f)))
+
+
+# An image is compared with many sets of poses.
+@lru_cache(maxsize=8)
+def _summed(
+    likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, ...]
+) -> tuple[Compiled, tuple[FrameTerm, ...]]:
+    """Terms with a kernel here, as compiled code reads them, and all others; the same at each call.
+
+    Raises:
+        ValueError: two terms of one kind that has a kernel.
+    """
+    known: dict[str, Any] = {}
+    others: list[FrameTerm] = []
+    for term in terms:
+        name = KINDS.get(type(term))
+        if name is None:
+            others.append(cast(FrameTerm, term))
+        elif name in known:
+            found = f'{type(known[name]).__name__} and {type(term).__name__}'
+            raise ValueError(f'a sum has one term of a kind at most, saw {found}')
+        else:
+            known[name] = term
+    image = known.pop('image', None) or observed(likelihood, NOTHING_SEEN)
+    compiled = {name: term.compiled for name, term in known.items()} | image.compiled
+    return _absent(likelihood.body)._replace(**compiled), tuple(others)
+
+
+def _with_costs(compiled: Compiled, poses: int) -> tuple[Compiled, Array]:
+    """The terms with room for the energies (N, M) of the samples of an outline, and that room."""
+    inputs, costs = list(compiled.inputs), np.zeros((poses, 0))
+    for i, own in enumerate(inputs):
+        if hasattr(own, 'costs'):
+            costs = np.zeros((poses, own.costs.shape[1]))
+            inputs[i] = own._replace(costs=costs)
+    return compiled._replace(inputs=tuple(inputs)), costs
 
 
 def _expected(motion: Quadratic | Student) -> tuple[Array, Array, float]:
@@ -412,11 +414,6 @@ def _limits(body: Body) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _origin(body: Body) -> Array:
-    return np.zeros(body.dimension)
-
-
-@lru_cache(maxsize=16)
 def _every_variable(body: Body) -> Index:
     return np.arange(body.dimension)
 
@@ -440,7 +437,7 @@ def _absent(body: Body) -> Compiled:
         prior=AnglePrior(body, 0.0).compiled,
         overlaps=SelfIntersection(body, np.inf).compiled,
         ground=GroundTerm(body, GroundSettings(0.0, 0.0), no_floor).compiled,
-        flow=FlowTerm(no_points, NO_MAP, 0.0),
+        flow=FlowTerm(no_points, NO_MAP, 0.0).compiled,
         centres=np.zeros((0, d)),
         precisions=np.zeros((0, d, d)),
         tails=0.0,

@@ -13,6 +13,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
+from hmt_ros.body.skeleton import Skeleton, sided_pairs
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Mask
 
@@ -87,14 +88,22 @@ def shown_segments(body: Body, camera: Camera, observation: Observation, pose: A
         joints = skeleton.joint_index(tuple(keypoints.names[i] for i in np.flatnonzero(found)))
         shown = np.zeros(len(skeleton.parents), dtype=np.bool_)
         shown[skeleton.joint_segments[joints]] = True
-    result = np.ones_like(shown)
-    for left_or_right in body.chain_pairs:
-        for chain in left_or_right:
-            outwards = list(body.chains[chain])
-            result[outwards] = np.logical_or.accumulate(shown[outwards][::-1])[::-1]
+    by = _showing(skeleton)
+    return np.asarray((by & shown).any(1) | ~by.any(1))
+
+
+@lru_cache(maxsize=16)
+def _showing(skeleton: Skeleton) -> Mask:
+    """Segments (S, S) that show another one, each a row; none shows what always counts as shown."""
+    result = np.zeros((len(skeleton.parents),) * 2, dtype=np.bool_)
+    for chain in (chain for pair in sided_pairs(skeleton.chains) for chain in pair):
+        outwards = list(skeleton.chains[chain])
+        for place, segment in enumerate(outwards):
+            result[segment, outwards[place:]] = True
     # The pelvis is shown by a leg.
-    hung = [own[0] for own in body.chains.values() if skeleton.parents[own[0]] == 0]
-    result[0] = not hung or result[hung].any()
+    hung = [own[0] for own in skeleton.chains.values() if skeleton.parents[own[0]] == 0]
+    if result[hung].any(1).all():
+        result[0] = result[hung].any(0)
     return result
 
 

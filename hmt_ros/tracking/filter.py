@@ -226,8 +226,9 @@ class MixtureFilter:
             modes,
             self._by_keypoints.contradicted,
             prediction,
+            base,
         )
-        candidates = propose(self._proposals, search, base, predicted, self._rng)
+        candidates = propose(self._proposals, search, predicted, self._rng)
         # Every mode goes on, whatever else is proposed.
         found = search.optimise(candidates).joined(Optimised(predicted, base))
         self._select(*self._weigh(search, found), observation, search)
@@ -389,7 +390,7 @@ class MixtureFilter:
             return False
         best = slice(SHAPE_MODES)
         poses, weights = self.modes.poses, elementary.exp(self.modes.log_weights[best])
-        gradients, covariances = self.posterior.fit(poses, observation).given_way()
+        gradients, covariances = self.posterior.fit(poses, observation).given_way
         body = self.shape.update(
             self.posterior.likelihood,
             observation,

@@ -200,13 +200,13 @@ class Identities:
         """
         if before is None:
             return self.new(len(hypotheses))
-        ancestors, jumped = hypotheses.ancestors, hypotheses.jumped
+        ancestors, jumped = hypotheses.ancestors.tolist(), hypotheses.jumped
         heirs: dict[int, int] = {}
         for candidates in (~jumped.any(1), ~jumped.all(1)):
             taken = set(heirs)
-            for k in np.flatnonzero(candidates):
-                if int(ancestors[k]) not in taken:
-                    heirs.setdefault(int(ancestors[k]), int(k))
+            for k in np.flatnonzero(candidates).tolist():
+                if ancestors[k] not in taken:
+                    heirs.setdefault(ancestors[k], k)
         result = np.zeros(len(ancestors), dtype=np.intp)
         for ancestor, heir in heirs.items():
             result[heir] = before.identities[ancestor]

@@ -108,7 +108,7 @@ def posterior_modes(
     if measured:
         alone = fit.lasting(solved.free, dt)
         covariances = TOGETHER * alone + shape.considered(
-            posterior.likelihood, observation, poses, fit.given_way()[1]
+            posterior.likelihood, observation, poses, fit.given_way[1]
         )
     if states is None:
         velocities = np.zeros_like(poses)
@@ -169,8 +169,9 @@ def likelihood_modes(
     mixture = GaussianMixture(weights[order], means[order], covariances[order])
     seen = PoseEnergy(posterior.likelihood, posterior.likelihood.seen(observation))
     values = -seen.energy(mixture.means, derivatives=Derivatives.NONE).value
-    gives_way = fit.given_way()[1][:1]
-    unknown = shape.considered(posterior.likelihood, observation, poses[:1], gives_way)[0]
+    (unknown,) = shape.considered(
+        posterior.likelihood, observation, poses[:1], fit.given_way[1][:1]
+    )
     stamp, ancestral = before
     follows = modes.origins.shape[1] > 0
     columns = slice(None if follows else 0)

@@ -15,11 +15,13 @@ the information in the image, so with the time between two images.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_algebra import product, solve
 from hmt_ros.inference.motion_states import PredictedStates
@@ -44,6 +46,7 @@ class Search:
         modes: of the image before.
         contradicted: whether these missed more than a quarter of the keypoints there.
         prediction: pose hypotheses from an external predictor, if any.
+        base: optima of the image, one for each mode.
     """
 
     posterior: Posterior
@@ -55,16 +58,22 @@ class Search:
     modes: Modes
     contradicted: bool
     prediction: PosePrediction | None
+    base: Minimum
 
     @property
     def dt(self) -> float:
         """Time since the image before, s."""
         return self.continuity.dt
 
-    def rated(self, poses: Array, energies: Array) -> Array:
-        """About the log weights (N,) that poses (N, d) of these energies (N,) would have."""
-        joints = self.posterior.body.joint_positions(poses)
-        return self._rated(joints, energies)
+    @cached_property
+    def base_joints(self) -> Array:
+        """Joints (K, J, 3) of the optima, m."""
+        return self.posterior.body.joint_positions(self.base.x)
+
+    @cached_property
+    def base_rated(self) -> Array:
+        """About the log weights (K,) that the optima would have."""
+        return self._rated(self.base_joints, self.base.value)
 
     def _rated(self, joints: Array, energies: Array) -> Array:
         return self.continuity.rated(joints) - ERRORS['image'].share(self.dt) * energies

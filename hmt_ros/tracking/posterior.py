@@ -60,13 +60,12 @@ class ImageFit:
     covariances: Array
     log_determinants: Array
 
+    @cached_property
     def given_way(self) -> tuple[Array, Array]:
         """Response of the poses to other changes.
 
-        Returns:
-            Gradients (K, d) of the energy of the image and of the prior of the body, 0 for
-            variables that rest on a limit, and inverse Hessians (K, d, d), in which they do not
-            move.
+        Gradients (K, d) of the energy of the image and of the prior of the body, 0 for variables
+        that rest on a limit, and inverse Hessians (K, d, d), in which they do not move.
         """
         gradient = self.energy.derivatives()[0]
         moving = self.free[:, :, None] & self.free[:, None, :]
@@ -160,8 +159,12 @@ class Posterior:
         lifted_share: float = 1.0,
     ) -> tuple[CompiledTerm | FrameTerm, ...]:
         """All terms; arguments as for `of_image` and `ImageLikelihood.keypoint_term`."""
-        exchanges = None if exchanges is None else known_exchanges(exchanges)
-        seen = self.likelihood.seen(observation, None, exchanges, share, lifted_share)
+        exchanges = (
+            None
+            if exchanges is None or observation.keypoints is None
+            else known_exchanges(exchanges)
+        )
+        seen = self.likelihood.seen(observation, exchanges, share, lifted_share)
         return (*seen, *self.likelihood.priors, *self.known)
 
     @property

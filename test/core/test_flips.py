@@ -115,6 +115,7 @@ def test_configurations_need_arguments_that_fit():
         'flipped': flipped,
         'price': 3.0,
         'apart': 0.1,
+        'most': 1000,
         'result': found._replace(
             trunks=np.zeros((trunks, D)),
             angles=np.zeros((trunks, count, 4, width)),
@@ -144,7 +145,9 @@ def test_poses_alone_and_products_need_arguments_that_fit():
         'found': found,
         'energies': np.zeros(len(rows)),
         'log_weights': np.zeros(2),
-        'trunk_weights': np.zeros(trunks),
+        'exchanged': 1,
+        'exchange': 1.0,
+        'flip': 2.0,
         'share': 0.5,
         'count': count,
         'poses': np.zeros((trunks * count, D)),

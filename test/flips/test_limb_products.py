@@ -157,6 +157,20 @@ def test_limbs_change_places_and_the_torso_flips_somewhere(body):
     assert max(len(one.configurations.trunks) - one.exchanged for one in found) > 1
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_the_last_trunks_are_left_out(body, seed):
+    modes = modes_of(body, 2, seed)
+    every = LimbProducts.of(body, modes, {}, PRICE, apart=APART, most=MOST)
+    ends = np.cumsum(1 + every.configurations.counts.sum(1))
+    for poses in (-1, 0, *(ends - 1), *ends):
+        some = LimbProducts.of(body, modes, {}, PRICE, apart=APART, most=MOST, poses=int(poses))
+        used = max(int((ends <= poses).sum()), 1)
+        assert some.exchanged == min(every.exchanged, used - 1)
+        for name in ('trunks', 'angles', 'counts'):
+            wanted = getattr(every.configurations, name)[:used]
+            assert np.array_equal(getattr(some.configurations, name), wanted)
+
+
 def test_poses_alone(body):
     products = LimbProducts.of(
         body, modes_of(body, 2, 3), found_by_search(body, 3), PRICE, apart=APART, most=MOST

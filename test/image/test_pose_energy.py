@@ -14,7 +14,7 @@ from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
 from hmt_ros.body.kinematics import forward
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, ObservedImage
 from hmt_ros.image.observation import observe
 from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.pose_energy import PoseEnergy
@@ -74,14 +74,14 @@ def terms(body, seen):
         seen_points(body, CAMERA, forward(body.skeleton, before)),
         ImageMap(rng.normal(0.0, 3.0, (2, 240, 320)).astype(np.float32)), 5.0,
     )  # fmt: skip
-    explained = np.full((1, samples), 0.2)
+    of_limb = ObservedImage(limb, seen[0], np.full((1, samples), 0.2))
     return {
         'all': (likelihood, (image, keypoints, *likelihood.priors, ground)),
         'image': (likelihood, (image,)),
         'keypoints and prior': (likelihood, (keypoints, likelihood.pose_prior)),
         'flow and prior': (likelihood, (flow, likelihood.pose_prior)),
         'independent angles': (angles, (image, *angles.priors)),
-        'limb': (limb, (*limb.seen(seen[0], explained=explained), likelihood.pose_prior)),
+        'limb': (limb, (of_limb, *likelihood.seen(seen[0])[1:], likelihood.pose_prior)),
     }
 
 
@@ -234,7 +234,7 @@ def test_a_pose_that_has_no_energy_is_left_where_it_is(terms, poses):
     ('x', 'message'),
     [
         (np.zeros((2, 5)), r'poses must have shape \(N, 37\), saw \(2, 5\)'),
-        (np.full((1, 37), np.nan), 'poses must be finite'),
+        (np.full((1, 37), np.nan), 'x: wanted finite numbers'),
     ],
 )
 def test_poses_that_are_none_are_refused(terms, x, message):

@@ -280,7 +280,7 @@ def test_gradient_and_covariance_of_poses_that_give_way(human37, poses, observat
     near[1, elbow] = human37.upper[elbow]
     energy = posterior.fit(near, observation).energy
     gradient, hessian = energy.derivatives()
-    found, covariances = posterior.fit(near, observation).given_way()
+    found, covariances = posterior.fit(near, observation).given_way
     held = np.diagonal(covariances, axis1=1, axis2=2) == 0
     assert not found[held].any()
     assert np.allclose(found[~held], gradient[~held])
@@ -305,7 +305,7 @@ def fitted(model, person, poses, rounds=2):
         for pose, image in zip(poses, seen(person, poses)):
             posterior = Posterior(estimate.body, CAMERA, settings)
             pose = posterior.minimise(posterior.of_image(image), pose[None], 6).x
-            gradients, covariances = posterior.fit(pose, image).given_way()
+            gradients, covariances = posterior.fit(pose, image).given_way
             estimate.update(
                 posterior.likelihood, image, pose, np.ones(1), gradients, covariances,
                 trust=0.35,
@@ -354,7 +354,7 @@ def test_lengths_come_nearer_to_the_true_ones_with_keypoints(human37, poses):
         image = Observation(keypoints=exact_keypoints(person, pose))
         pose = posterior.minimise(posterior.of_image(image), pose[None], 6).x
         estimate.update(
-            posterior.likelihood, image, pose, np.ones(1), *posterior.fit(pose, image).given_way(),
+            posterior.likelihood, image, pose, np.ones(1), *posterior.fit(pose, image).given_way,
             trust=0.35,
         )  # fmt: skip
     for name, true in long.items():
@@ -365,7 +365,7 @@ def test_lengths_come_nearer_to_the_true_ones_with_keypoints(human37, poses):
 def test_what_is_considered_is_that_of_the_uncertain_shape(human37, poses, observation):
     posterior = Posterior(human37, CAMERA, TrackerSettings())
     estimate = ShapeEstimate(human37)
-    _, covariances = posterior.fit(poses[:2], observation).given_way()
+    _, covariances = posterior.fit(poses[:2], observation).given_way
     found = estimate.considered(posterior.likelihood, observation, poses[:2], covariances)
     for k in range(2):
         pose = poses[k : k + 1]
@@ -390,7 +390,7 @@ def test_keypoints_tell_nothing_of_the_size(human37, poses):
     n = len(pixels)
     seen = Keypoints(human37.joint_names, pixels, np.tile(9.0 * np.eye(2), (n, 1, 1)), np.ones(n))
     observation = Observation(keypoints=seen)
-    (gradient,), (covariance,) = posterior.fit(poses[:1], observation).given_way()
+    (gradient,), (covariance,) = posterior.fit(poses[:1], observation).given_way
     estimate = ShapeEstimate(human37)
     found = estimate.linearised(posterior.likelihood, observation, poses[:1])
     linear = Linearised(*(x[0] for x in found))

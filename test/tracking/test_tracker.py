@@ -283,8 +283,9 @@ def test_a_mode_goes_on_whatever_is_proposed(
 ):
     """A limb and its flip have one image; only where the first one is anything is proposed."""
 
-    def first_alone(search, base, sources, rng):
-        return sources.proposed(np.zeros(1, dtype=int), base.x[:1], np.zeros((1, 32), dtype=bool))
+    def first_alone(search, sources, rng):
+        still = np.zeros((1, 32), dtype=bool)
+        return sources.proposed(np.zeros(1, dtype=int), search.base.x[:1], still)
 
     flips = enumerate_flips(human32, motion[6:7], 'left_arm')[0]
     wrists = human32.relative_joints(flips)[:, human32.joint_names.index('left_wrist')]

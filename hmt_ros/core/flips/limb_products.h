@@ -5,6 +5,7 @@
 #pragma once
 
 #include "../kinematics.h"
+#include "../log_sum_exp.h"
 #include "distinct.h"
 #include "tree_growth.h"
 
@@ -305,12 +306,16 @@ class ConfigurationFiller {
 };
 
 // Fills the configurations of G modes (G, d), see `LimbProducts.of`: found (C, F, D) are further
-// angles of the limbs, as many as found_counts (C,) say; flipped (M, d) have other torsos. Returns
-// the number of trunks with limbs that have changed places, which follow the first.
-inline Index fill_configurations(const Placing& tree, const Limbs& limbs, const Table& modes,
-                                 const Tables& found, const Places& found_counts,
-                                 const Table& flipped, double price, double apart,
-                                 const NewConfigurations& result) {
+// angles of the limbs, as many as found_counts (C,) say; flipped (M, d) have other torsos. The last
+// trunks are left out, so that no more than `most` poses with one configuration each are there, but
+// for those of the first. Returns the numbers of trunks and of those with limbs that have changed
+// places, which follow the first.
+inline std::tuple<Index, Index> fill_configurations(const Placing& tree, const Limbs& limbs,
+                                                    const Table& modes, const Tables& found,
+                                                    const Places& found_counts,
+                                                    const Table& flipped, double price,
+                                                    double apart, Index most,
+                                                    const NewConfigurations& result) {
   const Index d = tree.dimension(), c = limbs.size(), segments = tree.segments();
   expect_shape("modes", modes, {-1, d});
   expect(modes.size() > 0, "modes", "at least one");
@@ -328,14 +333,26 @@ inline Index fill_configurations(const Placing& tree, const Limbs& limbs, const 
   expect(result.trunks.size() >= trunks, "result.trunks",
          "one for each exchange and each flip of a torso");
   ConfigurationFiller filler(tree, limbs, modes, found, found_counts, price, apart, result);
+  Index left = std::max<Index>(most, 0);
+  const auto fits = [&](Index t) {
+    --left;
+    for (Index count : result.counts[t]) left -= count;
+    return left >= 0;
+  };
   filler.fill_first();
+  if (!fits(0)) return {1, 0};
   Index t = 1;
   for (Index i = 0; i < c; ++i) {
-    if (limbs.siblings[i] > i && filler.fill_exchanged(t, i)) ++t;
+    if (limbs.siblings[i] <= i || !filler.fill_exchanged(t, i)) continue;
+    if (!fits(t)) return {t, t - 1};
+    ++t;
   }
   const Index exchanged = t - 1;
-  for (Index f = 0; f < flipped.size(); ++f) filler.fill_flipped(t++, flipped[f]);
-  return exchanged;
+  for (Index f = 0; f < flipped.size(); ++f, ++t) {
+    filler.fill_flipped(t, flipped[f]);
+    if (!fits(t)) break;
+  }
+  return {t, exchanged};
 }
 
 // Fills poses (R, d) with each trunk, and with each configuration that its trunk does not have;
@@ -519,11 +536,11 @@ class Combiner {
 
 // Fills poses (T count, d), parents and values (T count,) with the best products on each trunk, see
 // `LimbProducts.best`; returns how many there are. Energies (R,) are those of the poses alone,
-// log_weights (G,) those of the modes (G, d), trunk_weights (T,) those of the trunks after the
-// first.
+// log_weights (G,) those of the modes (G, d). After the first trunk follow `exchanged` ones, at a
+// price, and then those with another torso, at another.
 inline Index combine(const Limbs& limbs, const Table& modes, const Configurations& found,
-                     const Numbers& energies, const Numbers& log_weights,
-                     const Numbers& trunk_weights, double share, Index count, const Matrix& poses,
+                     const Numbers& energies, const Numbers& log_weights, Index exchanged,
+                     double exchange, double flip, double share, Index count, const Matrix& poses,
                      const Array<Index, 1>& parents, const Vector& values) {
   const Index group = modes.size(), d = modes.size(1), trunks = found.size();
   expect(group > 0, "modes", "at least one");
@@ -532,16 +549,18 @@ inline Index combine(const Limbs& limbs, const Table& modes, const Configuration
   expect_shape("found.penalties", found.penalties, {group, -1, -1});
   expect_shape("energies", energies, {poses_alone(found)});
   expect_shape("log_weights", log_weights, {group});
-  expect_shape("trunk_weights", trunk_weights, {trunks});
   expect_shape("poses", poses, {trunks * count, d});
   expect_shape("parents", parents, {trunks * count});
   expect_shape("values", values, {trunks * count});
   Combiner combiner(limbs, modes, found, energies, share, count);
+  const Scratch<double, 1> weights(group);
+  weights.view().copy_from(log_weights);
+  const double all = log_sum_exp(weights.view().data, group);
   Index n = 0;
   for (Index t = 0; t < trunks; ++t) {
     const Index own = t == 0 ? group : 1;
     for (Index g = 0; g < own; ++g) {
-      combiner.find(t, g, t == 0 ? log_weights[g] : trunk_weights[t]);
+      combiner.find(t, g, t == 0 ? log_weights[g] : all - (t <= exchanged ? exchange : flip));
     }
     n += combiner.merge(t, own, poses.rows(n, n + count), parents.rows(n, n + count),
                         values.rows(n, n + count));

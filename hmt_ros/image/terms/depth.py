@@ -25,7 +25,6 @@ from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.image_term import (
     ImageTerm,
     ImageWindow,
-    Request,
     TermSettings,
     Weighting,
 )
@@ -60,7 +59,7 @@ def depth_map(window: ImageWindow) -> ImageMap | None:
     return window.as_map(depths[None]) if depths.any() else None
 
 
-def _inputs(term: Weighting, evidence: Any, _request: Request) -> DepthInputs:
+def _inputs(term: Weighting, evidence: Any) -> DepthInputs:
     return DepthInputs(term, evidence or NO_DEPTHS)
 
 

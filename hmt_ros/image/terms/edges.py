@@ -19,7 +19,6 @@ from hmt_ros.image.terms.image_term import (
     NOTHING,
     ImageTerm,
     ImageWindow,
-    Request,
     TermSettings,
     Weighting,
 )
@@ -61,7 +60,7 @@ def edge_distances(window: ImageWindow) -> ImageMap:
     return window.as_map(result)
 
 
-def _inputs(term: Weighting, evidence: Any, _request: Request) -> EdgeInputs:
+def _inputs(term: Weighting, evidence: Any) -> EdgeInputs:
     return EdgeInputs(term, evidence or NO_MAP)
 
 

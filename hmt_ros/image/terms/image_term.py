@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.inference.arrays import Array, Image
+from hmt_ros.inference.arrays import Image
 
 # A mask that is not there, and a map.
 NOTHING = np.zeros((0, 0), np.uint8)
@@ -100,20 +100,6 @@ class Weighting(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Request:
-    """Arguments of a call, the same for all terms.
-
-    Attributes:
-        poses: number of poses whose results beside the energy are wanted, N; 0: they are not.
-        explained: (N, M) or (1, M) maximum energy of each sample of the outline, because something
-            else explains it; None: unlimited.
-    """
-
-    poses: int
-    explained: Array | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class ImageTerm:
     """One term of the image likelihood.
 
@@ -132,5 +118,5 @@ class ImageTerm:
     meaning: str
     settings: TermSettings
     evidence: Callable[[ImageWindow], Any]
-    inputs: Callable[[Weighting, Any, Request], Any]
+    inputs: Callable[[Weighting, Any], Any]
     needs_contour: bool = False

@@ -19,7 +19,6 @@ from hmt_ros.image.terms.image_term import (
     NOTHING,
     ImageTerm,
     ImageWindow,
-    Request,
     TermSettings,
     Weighting,
 )
@@ -89,15 +88,12 @@ def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
 NO_OUTLINE = Outline(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
 
 
-def _coverage_inputs(term: Weighting, evidence: Any, request: Request) -> CoverageInputs:
+def _coverage_inputs(term: Weighting, evidence: Any) -> CoverageInputs:
     found: Outline = evidence or NO_OUTLINE
     samples = len(found.pixels)
     if samples == 0:
         term = term._replace(weight=0.0)
-    explained = request.explained
-    if explained is None:
-        explained = np.full((1, samples), np.inf)
-    return CoverageInputs(term, found, explained, np.zeros((request.poses, samples)))
+    return CoverageInputs(term, found, np.full((1, samples), np.inf), np.zeros((0, samples)))
 
 
 COVERAGE = ImageTerm(

@@ -8,7 +8,6 @@ from typing import Protocol
 
 import numpy as np
 
-from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.hypotheses import Hypotheses, joined
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.proposals.kinematic_jumps import jumped_poses
@@ -20,14 +19,13 @@ class Proposal(Protocol):
     """Something that proposes hypotheses for an image."""
 
     def __call__(
-        self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator, /
+        self, search: Search, sources: Hypotheses, rng: np.random.Generator, /
     ) -> Hypotheses:
         """Hypotheses that are to be optimised, if any; a proposal does not set their weights.
 
         Args:
             search: of the image.
-            base: optima of the image, one for each of
-            sources: the hypotheses that they were optimised from.
+            sources: the hypotheses that its base was optimised from.
             rng: source of randomness.
         """
         ...
@@ -55,9 +53,8 @@ def proposals_of(selected: str) -> tuple[Proposal, ...]:
 def propose(
     proposals: Sequence[Proposal],
     search: Search,
-    base: Minimum,
     sources: Hypotheses,
     rng: np.random.Generator,
 ) -> Hypotheses:
     """All hypotheses of some proposals; the other arguments as for each of them."""
-    return joined([each(search, base, sources, rng) for each in proposals])
+    return joined([each(search, sources, rng) for each in proposals])

@@ -25,7 +25,6 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.keypoints import groups_of
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Student
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_algebra import cholesky, inverse, product
@@ -41,6 +40,9 @@ from hmt_ros.tracking.settings import (
     SAME_TRUNK_DISTANCE,
     EvaluationPlan,
 )
+
+# A variable that changes less has not jumped.
+STILL = float(np.sqrt(np.finfo(np.float64).eps))
 
 
 def find_limb(
@@ -65,13 +67,14 @@ def find_limb(
     """
     body, s = posterior.body, posterior.settings.search
     own: Index = np.asarray(body.skeleton.chain_dofs[chain])
-    block = covariance[np.ix_(own, own)]
+    block = covariance[own[:, None], own]
     samples = _drawn(body, own, pose[own], block, s.stretch, plan.samples, rng)
     of_limb, of_rest = posterior.divided[chain]
     others = PoseEnergy(of_rest, (ObservedImage(of_rest, observation),))
     explained = others.by_cue(pose[None], derivatives=False).outline_costs
-    seen = of_limb.seen(observation, explained=explained)
-    terms = (*seen, posterior.likelihood.pose_prior, *posterior.known)
+    seen = ObservedImage(of_limb, observation, explained)
+    keypoints = posterior.likelihood.seen(observation)[1:]
+    terms = (seen, *keypoints, posterior.likelihood.pose_prior, *posterior.known)
     motion = Student(pose[own], inverse(block), LIMB_TAILS)
     term = PoseEnergy(of_limb, terms, motion, pose, own)
     best = samples[np.argsort(term.values(samples), kind='stable')[: plan.refined]]
@@ -99,32 +102,30 @@ def _drawn(
     return np.clip(result, body.lower[own], body.upper[own])
 
 
-def jumped_poses(
-    search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
-) -> Hypotheses:
+def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) -> Hypotheses:
     """Poses far from those that are known, which fit the image as well."""
     posterior, observation, plan = search.posterior, search.observation, search.plan
-    body, limbs = posterior.body, limbs_not_shown(posterior, observation, plan.surprising)
+    base, body = search.base, posterior.body
+    limbs = limbs_not_shown(posterior, observation, plan.surprising)
     left = plan.rated if limbs else plan.rated_alone
     share = ERRORS['image'].share(search.dt)
     price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
     everything: list[tuple[Array, Index, Array]] = []
-    image = posterior.of_image(observation)
-    prior = search.rated(base.x, base.value)
-    groups = _groups(body, base)
+    image, groups = posterior.of_image(observation), _groups(search)
+    prior = search.base_rated
     for group in groups[: plan.groups]:
         likely = prior[group].max() > prior.max() - LIKELY_NATS
-        first = group[0]
         products = LimbProducts.of(
             body,
             base.x[group],
-            _search_limbs(limbs, search, base.x[first], sources.ancestors[first], rng)
+            _search_limbs(limbs, search, base.x[group[0]], sources.ancestors[group[0]], rng)
             if likely
             else {},
             price['limb_flip'],
             apart=SAME_LIMB_DISTANCE,
             most=plan.alternatives,
-        ).at_most(left)
+            poses=left,
+        )
         alone, rows = products.alone
         left -= len(rows)
         best = products.best(
@@ -144,17 +145,19 @@ def jumped_poses(
     kept = search.best(poses, energies)
     poses, members = poses[kept], members[kept]
     # A chain that jumped is expected where it landed, the rest where it was predicted.
-    jumped = np.abs(poses - base.x[members]) > np.sqrt(np.finfo(np.float64).eps)
+    jumped = np.abs(poses - base.x[members]) > STILL
     return sources.proposed(members, poses, jumped)
 
 
-def _groups(body: Body, base: Minimum) -> list[Index]:
+def _groups(search: Search) -> list[Index]:
     """Modes with nearly the same trunk, each group with its best mode first."""
-    trunk = body.joint_positions(base.x)[:, body.skeleton.joint_index(body.trunk_joints)]
-    left = np.argsort(base.value, kind='stable')
+    skeleton = search.posterior.body.skeleton
+    trunk = search.base_joints[:, skeleton.joint_index(skeleton.trunk_joints)]
+    left = np.argsort(search.base.value, kind='stable')
     groups = []
     while len(left):
-        near = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1) < SAME_TRUNK_DISTANCE
+        away = trunk[left] - trunk[left[0]]
+        near = np.sqrt((away * away).sum(2)).max(1) < SAME_TRUNK_DISTANCE
         groups.append(left[near])
         left = left[~near]
     return groups

@@ -13,7 +13,6 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.linear_algebra import cholesky, log_determinant
 from hmt_ros.inference.random_numbers import standard_normals
 from hmt_ros.tracking.hypotheses import Hypotheses
@@ -64,23 +63,20 @@ def _noise(shape: tuple[int, ...], scale: float, rng: np.random.Generator) -> Ar
 
 
 def covariance_scaled_poses(
-    search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
+    search: Search, sources: Hypotheses, rng: np.random.Generator
 ) -> Hypotheses:
     """Covariance-scaled samples around the predictions."""
-    return _sampled(covariance_scaled_samples, search, base, sources, rng)
+    return _sampled(covariance_scaled_samples, search, sources, rng)
 
 
-def spherical_poses(
-    search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
-) -> Hypotheses:
+def spherical_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) -> Hypotheses:
     """Spherical samples of the same volume around the predictions."""
-    return _sampled(spherical_samples, search, base, sources, rng)
+    return _sampled(spherical_samples, search, sources, rng)
 
 
 def _sampled(
     draw: Callable[[Body, Array, Array, int, float, np.random.Generator], Array],
     search: Search,
-    base: Minimum,
     sources: Hypotheses,
     rng: np.random.Generator,
 ) -> Hypotheses:
@@ -89,7 +85,7 @@ def _sampled(
     s, body = posterior.settings, posterior.body
     each = max(s.samples // k, 1)
     drawn = draw(body, sources.expected, search.states.searched, each, s.sample_scale, rng)
-    poses = np.concatenate([base.x, drawn.reshape(-1, body.dimension)])
+    poses = np.concatenate([search.base.x, drawn.reshape(-1, body.dimension)])
     rows = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
     kept = search.best(poses, posterior.of_image(search.observation).values(poses))
     still = np.zeros((len(kept), body.dimension), dtype=np.bool_)

@@ -26,7 +26,6 @@ import numpy as np
 from hmt_ros.body.mirror import reverse_depth
 from hmt_ros.image.terms.keypoints import KeypointTerm
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Quadratic
 from hmt_ros.tracking.classes import lost_a_facing
 from hmt_ros.tracking.hypotheses import Hypotheses
@@ -78,9 +77,7 @@ class PoseByKeypoints:
         return ByKeypoints(of_keypoints(term, pose), gain)
 
 
-def predicted_poses(
-    search: Search, _base: Minimum, sources: Hypotheses, _rng: np.random.Generator
-) -> Hypotheses:
+def predicted_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
     """The means of a prediction, if there is one, each as a jump from the nearest mode."""
     if search.prediction is None:
         return sources[:0]
@@ -90,9 +87,7 @@ def predicted_poses(
     return sources.proposed(nearest, poses, np.ones(poses.shape, dtype=np.bool_))
 
 
-def keypoint_poses(
-    search: Search, _base: Minimum, sources: Hypotheses, _rng: np.random.Generator
-) -> Hypotheses:
+def keypoint_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
     """The pose to which keypoints alone would move the heaviest mode.
 
     There is one where the modes missed more than a quarter of the keypoints of the image before.
@@ -104,15 +99,13 @@ def keypoint_poses(
     return sources.proposed(first, pose, np.zeros(pose.shape, dtype=np.bool_), expected=pose)
 
 
-def reversed_poses(
-    search: Search, base: Minimum, sources: Hypotheses, _rng: np.random.Generator
-) -> Hypotheses:
+def reversed_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
     """The reversal of the best mode where a way to face is lost."""
-    log_weights = search.rated(base.x, base.value)
+    log_weights = search.base_rated
     if not lost_a_facing(search.modes.back, log_weights):
         return sources[:0]
     best = np.argsort(-log_weights, kind='stable')[:1]
-    turned = reverse_depth(search.posterior.body, base.x[best])
+    turned = reverse_depth(search.posterior.body, search.base.x[best])
     term = search.posterior.of_image(search.observation)
     moved = search.posterior.minimise(term, turned, REVERSAL_ITERATIONS).x
     return sources.proposed(best, moved, np.ones(moved.shape, dtype=np.bool_))
