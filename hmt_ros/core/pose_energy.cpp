@@ -216,7 +216,7 @@ void check(Index first, Index last, const Terms& terms, const Numbers& point, co
   if (terms.centres.size() > 0) expect_shape("terms.centres", terms.centres, {-1, f});
   expect_shape("status", status, {n});
   expect_shape("iterations", iterations, {n});
-  check_poses("compiled.inputs", terms.inputs, n);
+  check_inputs("compiled.inputs", terms.inputs, terms.placing.segments(), n);
 }
 
 }  // namespace
@@ -311,7 +311,7 @@ void record_residuals(const Model& model, const TermInputs& inputs,
   expect_shape("residuals", residuals, {n, -1, Sums::recorded});
   expect(residuals.size(1) > 0, "residuals", "a row that counts the residuals");
   for (Index i = 0; i < n; ++i) expect(residuals(i, 0, 0) == 0.0, "residuals", "counts of 0");
-  check_poses("inputs", inputs, n);
+  check_inputs("inputs", inputs, segments, n);
   PoseView view(model);
   Scratch<double, 1> energies(term_count);
   for (Index i = 0; i < n; ++i) {

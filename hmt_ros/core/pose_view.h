@@ -12,6 +12,7 @@ struct Weighting {
   double weight, sigma, scale;
   double magnification;  // px for a metre at the person: turns errors of the body into pixels
   double growth;         // of the deviation of a depth with its square, 1/m
+  Numbers segments;      // (S,) factors on the energies at each segment; none: 1
 };
 
 // Body and camera.
@@ -77,6 +78,10 @@ class PoseView {
   Frames frames() const { return {columns.view(), origins.view()}; }
   // Segment of a part of the flesh.
   Index owner(Index part) const { return model.flesh.part_segments[part]; }
+  // Factor of a term on the energy at a point of a part.
+  double factor(const Weighting& term, Index part) const {
+    return factor_of(term.segments, owner(part));
+  }
   // Room for a term, of so many rows; the next term gets the same.
   Matrix rows(Index count, Index length) const {
     rows_.resize(std::max<std::size_t>(rows_.size(), count * length));

@@ -36,6 +36,17 @@ struct Tree {
   }
 };
 
+// Factors on the energies at S segments: of this name they are finite, for a body of so many.
+inline void expect_factors(const char* name, const Numbers& factors, Index segments) {
+  if (!factors.empty()) expect_shape(name, factors, {segments});
+  for (double x : factors) expect(0.0 <= x && x < infinity, name, "finite factors, none below 0");
+}
+
+// The factor of a segment; where there are none it is 1.
+inline double factor_of(const Numbers& factors, Index segment) {
+  return factors.empty() ? 1.0 : factors[segment];
+}
+
 struct Robust {
   double value, pull, curvature;
 };

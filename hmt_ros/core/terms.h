@@ -19,9 +19,12 @@ using TermInputs = std::tuple<CoverageInputs,  //
                               DepthInputs>;
 inline constexpr Index term_count = std::tuple_size_v<TermInputs>;
 
-// Inputs, an argument of this name, must have room for the results of so many poses.
-inline void check_poses(const char* name, const TermInputs& inputs, Index poses) try {
+// Inputs, an argument of this name, must be for a body of so many segments, and have room for the
+// results of so many poses.
+inline void check_inputs(const char* name, const TermInputs& inputs, Index segments,
+                         Index poses) try {
   const auto one = [&](const auto& own) {
+    expect_factors("term.segments", own.term.segments, segments);
     if constexpr (requires { own.check_poses(poses); }) own.check_poses(poses);
   };
   std::apply([&](const auto&... own) { (one(own), ...); }, inputs);

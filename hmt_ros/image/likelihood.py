@@ -31,7 +31,7 @@ from hmt_ros.core import record_residuals
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of
-from hmt_ros.image.terms.image_term import TermSettings, Weighting
+from hmt_ros.image.terms.image_term import NO_FACTORS, TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
 from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
@@ -138,7 +138,7 @@ class ImageLikelihood:
         if exchanges is None and share == 1.0:
             return usual_keypoints(self, observation, lifted_share)
         assert observation.keypoints is not None
-        s = self.settings.keypoints
+        s, beliefs = self.settings.keypoints, observation.beliefs
         return KeypointTerm(
             self.body.skeleton,
             self.camera,
@@ -146,8 +146,9 @@ class ImageLikelihood:
             s if share == 1.0 else replace(s, weight=share * s.weight),
             observation.magnification,
             usual_exchanges() if exchanges is None else exchanges,
-            None if observation.beliefs is None else observation.beliefs.keypoints,
+            None if beliefs is None else beliefs.keypoints,
             lifted_share,
+            NO_FACTORS if beliefs is None else beliefs.of_segments('keypoints'),
         )
 
     @cached_property
@@ -243,6 +244,7 @@ def _inputs(settings: LikelihoodSettings, observation: Observation) -> dict[str,
             float(s.scale),
             float(observation.magnification),
             float(s.growth),
+            NO_FACTORS if beliefs is None else beliefs.of_segments(term.name),
         )
         result.append(term.inputs(weighting, evidence))
     running = [term for term, one in zip(TERMS, result, strict=True) if one.term.weight > 0]

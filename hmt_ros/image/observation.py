@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.image.optical_flow import optical_flow
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.terms.image_term import ImageWindow
+from hmt_ros.image.terms.image_term import NO_FACTORS, ImageWindow
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.image.terms.silhouette import Outline
@@ -34,15 +34,22 @@ class Beliefs:
         silhouette: that of the silhouette.
         keypoints: (G,) of the groups of keypoints, see `terms.keypoints`.
         depth: of the depths.
+        segments: (S,) by the name of an image term, or of the keypoints, of its parts that belong
+            to each segment, beside those above; all are believed where there are none.
     """
 
     silhouette: float
     keypoints: Array
     depth: float
+    segments: Mapping[str, Array] = field(default_factory=dict)
 
     def of_term(self, name: str) -> float:
         """Factor on the weight of an image term."""
         return {'coverage': self.silhouette, 'depth': self.depth}.get(name, 1.0)
+
+    def of_segments(self, name: str) -> Array:
+        """Factors (S,) on the energies of an image term or of keypoints; (0,): all are 1."""
+        return self.segments.get(name, NO_FACTORS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.special import log_softmax, logsumexp
 
 from hmt_ros.body import Camera, load_body
@@ -21,7 +22,7 @@ POSES[:, 2] = 3.0, 4.0, -4.0  # the last one is behind the camera
 LOG_PRIORS = np.log([[0.4, 0.1, 0.3, 0.2]])
 
 
-def inputs():
+def inputs(factors=()):
     rng = np.random.default_rng(0)
     lifted = LiftedPoses(
         NAMES,
@@ -34,7 +35,8 @@ def inputs():
     pixels = rng.uniform(200.0, 400.0, (POINTS, 2))
     noise = np.tile(400.0 * np.eye(2), (POINTS, 1, 1))
     seen = Keypoints(NAMES, pixels, noise, np.ones(POINTS), lifted=lifted)
-    return KeypointTerm(SKELETON, CAMERA, seen, exchanges=LOG_PRIORS).compiled
+    term = KeypointTerm(SKELETON, CAMERA, seen, exchanges=LOG_PRIORS, segments=np.array(factors))
+    return term.compiled
 
 
 def frames():
@@ -62,6 +64,8 @@ def posterior(given, columns, origins):
     errors = np.where(at_back := origins[0, 2] < 0.0, 1e3, errors_of(given, columns, origins))
     assert at_back == (origins[:, 2] < 0.0).all()
     of_points = given.weights[given.points.groups, None] * kernel(errors, given.scale).sum(2)
+    if len(given.factors):  # of the segment as the keypoint is called
+        of_points = given.factors[given.points.segments[:, :1]] * of_points
     lifted = given.lifted
     hips = places(np.array(0), lifted.middle, columns, origins)
     behind = (places(lifted.segments, lifted.offsets, columns, origins) - hips) @ lifted.ray
@@ -71,8 +75,12 @@ def posterior(given, columns, origins):
     return log_softmax(given.log_priors[0] - own - lifted.weight * whole[lifted.readings])
 
 
-def test_exchanges_and_errors_are_those_of_plain_sums():
-    given, found = inputs(), np.empty((len(POSES), EXCHANGES))
+FACTORS = np.random.default_rng(1).uniform(0.0, 2.0, len(SKELETON.parents))
+
+
+@pytest.mark.parametrize('factors', [(), FACTORS], ids=['usual', 'factors'])
+def test_exchanges_and_errors_are_those_of_plain_sums(factors):
+    given, found = inputs(factors), np.empty((len(POSES), EXCHANGES))
     exchange_posteriors(given, np.repeat(LOG_PRIORS, len(POSES), 0), *frames().values(), found)
     wanted = np.array([posterior(given, *x) for x in zip(*frames().values())])
     assert np.allclose(found, wanted, atol=1e-9)
@@ -85,11 +93,32 @@ def test_exchanges_and_errors_are_those_of_plain_sums():
         assert np.allclose(errors[pose], own[np.arange(POINTS), exchanged])
 
 
+def test_listed_residuals_have_the_factors_of_their_segments():
+    usual, own = np.zeros((2, len(POSES), 1 + 2 * POINTS, RECORDED))
+    joints = np.zeros((POINTS, 2), dtype=np.int64)
+    still = np.log([[1.0, 1e-9, 1e-9, 1e-9]])
+    for given, result in ((inputs(), usual), (inputs(FACTORS), own)):
+        record_keypoints(given._replace(log_priors=still), joints, *frames().values(), result)
+    count = int(usual[0, 0, 0])
+    assert count == 2 * POINTS == own[0, 0, 0]
+    factors = np.repeat(FACTORS[inputs().points.segments[:, 0]], 2)
+    assert np.allclose(own[0, 1:, 7:], factors[:, None] * usual[0, 1:, 7:], rtol=1e-12)
+    assert np.array_equal(own[0, 1:, :7], usual[0, 1:, :7])
+
+
+@pytest.mark.parametrize('factors', [FACTORS[1:], -FACTORS, np.nan * FACTORS, np.inf * FACTORS])
+def test_factors_of_segments_must_fit(factors):
+    result = np.empty((len(POSES), EXCHANGES))
+    priors = np.repeat(LOG_PRIORS, len(POSES), 0)
+    with pytest.raises(ValueError, match=r'inputs\.factors: wanted'):
+        exchange_posteriors(inputs(factors), priors, *frames().values(), result)
+
+
 def test_keypoints_need_arguments_that_fit():
     count = len(POSES)
     given = {'inputs': inputs(), **frames()}
-    rows = 'inputs.log_priors inputs.lifted.readings'
-    priors = {'inputs': inputs(), 'log_priors': np.repeat(LOG_PRIORS, count, 0), **frames()}
+    rows = 'inputs.log_priors inputs.lifted.readings inputs.factors'
+    priors = {'inputs': inputs(FACTORS), 'log_priors': np.repeat(LOG_PRIORS, count, 0), **frames()}
     result = {'result': np.zeros((count, EXCHANGES))}
     assert_arguments_are_checked(exchange_posteriors, priors | result, 'result', free=rows)
     errors = {'errors': np.zeros((count, POINTS, 2))}

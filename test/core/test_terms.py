@@ -116,6 +116,23 @@ def test_samples_and_poses_must_fit(model, inputs, frames):
         recorded(model, inputs, frames)
 
 
+@pytest.mark.parametrize('term', range(len(TERMS)))
+def test_factors_of_segments_must_fit(model, inputs, frames, term):
+    ones = np.ones(len(model.tree.parents))
+
+    def weighed(factors):
+        own = inputs[term]._replace(term=inputs[term].term._replace(segments=factors))
+        return recorded(model, (*inputs[:term], own, *inputs[term + 1 :]), frames)
+
+    assert np.array_equal(weighed(ones), recorded(model, inputs, frames))
+    assert not np.array_equal(weighed(2.0 * ones), recorded(model, inputs, frames))
+    for factors in (ones[1:].copy(), -ones, np.nan * ones, np.inf * ones):
+        with pytest.raises(ValueError, match=r'inputs\.term\.segments: wanted'):
+            weighed(factors)
+    with pytest.raises(TypeError, match=r'term\.segments: wanted'):
+        weighed(ones.astype(np.float32))
+
+
 def test_frames_and_lists_must_fit(model, inputs, frames):
     columns, origins = frames
     with pytest.raises(ValueError, match='columns: wanted shape'):

@@ -12,7 +12,7 @@ from hmt_ros.body import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.core import ASIDE, BEHIND, COVER, DEPTH_JUMP, FEWEST, LEAST_COSINE
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
-from hmt_ros.image.observation import observe
+from hmt_ros.image.observation import Beliefs, observe
 from hmt_ros.image.surface import flesh_table_of
 from hmt_ros.image.terms.depth import DEPTH, usable_depths
 from test.oracles.numpy_contour import signed_power
@@ -95,8 +95,11 @@ def measured_at(depth, u, v):
     return np.array([1 - dv, dv]) @ cell @ np.array([1 - du, du])
 
 
-def oracle_energy(body, camera, settings, depth, pose, held=None):
-    """The energy of a pose; held: points of another pose, which stay where they are on the skin."""
+def oracle_energy(body, camera, settings, depth, pose, held=None, factors=None):
+    """The energy of a pose; held: points of another pose, which stay where they are on the skin.
+
+    `factors` (S,) are those of the segments; None: 1.
+    """
     points = oracle_points(body, camera, settings, depth, pose) if held is None else held
     frames = forward(body.skeleton, pose[None])
     costs = []
@@ -104,7 +107,8 @@ def oracle_energy(body, camera, settings, depth, pose, held=None):
         point = frames.points(np.array([segment]), place[None])[0, :, 0]
         z = measured_at(depth, *camera.project(point[None])[0])
         error = (z - point[2]) / sigma if z > 0 else 1.0
-        costs.append(0.5 * error**2 / (1.0 + error**2 / settings.scale**2))
+        factor = 1.0 if factors is None else factors[segment]
+        costs.append(factor * 0.5 * error**2 / (1.0 + error**2 / settings.scale**2))
     return settings.weight * np.sum(costs) / max(len(points), FEWEST)
 
 
@@ -139,18 +143,42 @@ def test_the_kernel_equals_numpy(shot, sensed, distortion):
     assert np.ptp(wanted) > 1.0
 
 
-def test_gradient_at_material_points(shot, sensed, likelihood):
+def with_factors(shot, sensed):
+    """Depths in which each segment is believed by a factor of its own, and these factors."""
+    factors = np.random.default_rng(3).uniform(0.0, 2.0, len(shot.body.skeleton.parents))
+    beliefs = Beliefs(1.0, np.ones(3), 1.0, {'depth': factors})
+    return replace(observe(shot.images[1], depth=sensed), beliefs=beliefs), factors
+
+
+def test_the_kernel_equals_numpy_where_segments_have_factors(shot, sensed, likelihood):
+    poses = shot.near(4, 1)
+    # Without a measurement a point has a cost as well.
+    for given in (sensed, 0.0 * sensed + 2.0 * (np.arange(sensed.shape[1]) < 160)):
+        observation, factors = with_factors(shot, given)
+        depth = usable_depths(given)
+        wanted = [
+            oracle_energy(shot.body, shot.camera, DEPTH.settings, depth, pose, None, factors)
+            for pose in poses
+        ]
+        assert np.allclose(image_energy(likelihood, poses, observation).value, wanted, rtol=1e-9)
+
+
+@pytest.mark.parametrize('weighed', [False, True], ids=['usual', 'factors'])
+def test_gradient_at_material_points(shot, sensed, likelihood, weighed):
     """The gradient is that of points which stay on the skin, with their deviations."""
     poses, step = shot.near(2, 7), 1e-6
     depth = usable_depths(sensed)
-    found = image_energy(likelihood, poses, observe(shot.images[1], depth=sensed)).gradient
+    observation, factors = observe(shot.images[1], depth=sensed), None
+    if weighed:
+        observation, factors = with_factors(shot, sensed)
+    found = image_energy(likelihood, poses, observation).gradient
     for pose, gradient in zip(poses, found):
         held = oracle_points(shot.body, shot.camera, DEPTH.settings, depth, pose)
         wanted = np.empty(len(pose))
         for j in range(len(pose)):
             shift = step * (np.arange(len(pose)) == j)
             up, down = (
-                oracle_energy(shot.body, shot.camera, DEPTH.settings, depth, x, held)
+                oracle_energy(shot.body, shot.camera, DEPTH.settings, depth, x, held, factors)
                 for x in (pose + shift, pose - shift)
             )
             wanted[j] = (up - down) / (2 * step)

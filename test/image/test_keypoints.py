@@ -69,10 +69,13 @@ def term(keypoints, *, exchanges=True):
     return KeypointTerm(BODY.skeleton, CAMERA, keypoints, KEYPOINTS, 150.0, log_prior)
 
 
+@pytest.mark.parametrize('factors', [False, True], ids=['usual', 'factors'])
 @pytest.mark.parametrize('exchanges', [True, False])
-def test_derivatives(pose, exchanges):
+def test_derivatives(pose, exchanges, factors):
     rng = np.random.default_rng(1)
     one = term(seen(pose, noise=8.0, rng=rng), exchanges=exchanges)
+    if factors:
+        one = replace(one, segments=rng.uniform(0.0, 2.0, len(BODY.skeleton.parents)))
     x = pose + 0.05 * rng.standard_normal(BODY.dimension)
 
     def value(poses):

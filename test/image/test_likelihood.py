@@ -10,7 +10,7 @@ from hmt_ros.body.kinematics import directed_derivatives, forward
 from hmt_ros.body.pose_prior import AnglePrior
 from hmt_ros.core import BEHIND, COVER
 from hmt_ros.image.likelihood import OFF, ImageLikelihood, ObservedImage
-from hmt_ros.image.observation import observe
+from hmt_ros.image.observation import Beliefs, observe
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
@@ -43,6 +43,17 @@ def keypoints_of(shot, sigma=2.0, seed=0):
 def observation(shot):
     found = observe(shot.images[1], shot.masks[1], keypoints_of(shot))
     return replace(found, magnification=MAGNIFICATION)
+
+
+def believed(shot, observation):
+    """The observation, of whose cues each segment has a factor of its own; some are 0."""
+    rng = np.random.default_rng(12)
+    count = len(shot.body.skeleton.parents)
+    segments = {
+        name: rng.uniform(0.0, 2.0, count) * (rng.uniform(size=count) > 0.2)
+        for name in (*IMAGE_TERMS, 'keypoints')
+    }
+    return replace(observation, beliefs=Beliefs(0.7, np.array([0.9, 0.4, 0.6]), 1.0, segments))
 
 
 def only(likelihood, *names):
@@ -121,6 +132,31 @@ def test_kernels_equal_numpy_where_the_image_cuts_the_person(shot):
     assert largest_difference(shot.body, camera, poses, observation) <= 1e-9
 
 
+def test_kernels_equal_numpy_where_segments_have_factors(shot, observation):
+    own = believed(shot, observation)
+    poses = np.concatenate([shot.near(12, 1), shot.near(6, 2, spread=0.5)])
+    assert largest_difference(shot.body, shot.camera, poses, own) <= 1e-9
+    likelihood = ImageLikelihood(shot.body, shot.camera)
+    usual = replace(own, beliefs=replace(own.beliefs, segments={}))
+    found, other = (image_energy(likelihood, poses, x).value for x in (own, usual))
+    assert (np.abs(found - other) > 0.05 * other).any()
+
+
+def test_factors_of_one_change_no_byte(shot, observation):
+    likelihood, poses = ImageLikelihood(shot.body, shot.camera), shot.near(8, 1)
+    ones = np.ones(len(shot.body.skeleton.parents))
+    beliefs = Beliefs(0.7, np.array([0.9, 0.4, 0.6]), 0.5)
+    known = replace(beliefs, segments=dict.fromkeys(('coverage', 'edges', 'keypoints'), ones))
+
+    def energy(beliefs):
+        terms = likelihood.seen(replace(observation, beliefs=beliefs))
+        assert len(terms) == 2
+        return PoseEnergy(likelihood, terms).energy(poses)
+
+    for found, wanted in zip(energy(known), energy(beliefs), strict=True):
+        assert np.array_equal(found, wanted)
+
+
 # Derivatives.
 
 
@@ -137,8 +173,9 @@ def relative_errors(found, wanted):
     return np.abs(found - wanted) / np.abs(wanted).max(axis=1, keepdims=True)
 
 
+@pytest.mark.parametrize('factors', [False, True], ids=['usual', 'factors'])
 @pytest.mark.parametrize('name', IMAGE_TERMS)
-def test_gradients_of_contour_terms_at_material_points(shot, observation, name):
+def test_gradients_of_contour_terms_at_material_points(shot, observation, name, factors):
     """The gradient is that of points which stay where they are on the skin."""
     body, camera = shot.body, shot.camera
     likelihood = only(ImageLikelihood(body, camera), name)
@@ -148,14 +185,19 @@ def test_gradients_of_contour_terms_at_material_points(shot, observation, name):
     local = occluding_contour(body.flesh, frames).local
     term = getattr(likelihood.settings, name)
     sigma = np.hypot(term.sigma, MAGNIFICATION * surface.noise)
+    if factors:
+        observation = believed(shot, observation)
+        term = replace(term, weight=term.weight * observation.beliefs.of_term(name))
+    every = np.ones(len(body.skeleton.parents))
+    own = (observation.beliefs.segments[name] if factors else every)[surface.segments]
 
     def value(x):
         moved = forward(body.skeleton, x).points(surface.segments, local)
         pixels, projection = camera.project_with_derivative(moved.transpose(1, 0, 2))
         held = replace(surface, points=moved, pixels=pixels, projection=projection)
         if name == 'coverage':
-            return oracle.coverage(held, observation.outline, term, sigma).value
-        return oracle.edges(held, observation.evidence[name], term, sigma).value
+            return oracle.coverage(held, observation.outline, term, sigma, own).value
+        return oracle.edges(held, observation.evidence[name], term, sigma, own).value
 
     found = image_energy(likelihood, poses, observation).gradient
     errors = relative_errors(found, numerical_gradient(value, poses))
@@ -190,8 +232,11 @@ def summed(frames, segments, points, directions, pull, curvature):
     return by_pose.T @ pull, (by_pose * curvature[:, None]).T @ by_pose
 
 
+@pytest.mark.parametrize('factors', [False, True], ids=['usual', 'factors'])
 @pytest.mark.parametrize('names', [*((name,) for name in IMAGE_TERMS), IMAGE_TERMS])
-def test_listed_residuals_sum_to_gradient_and_hessian(shot, observation, names):
+def test_listed_residuals_sum_to_gradient_and_hessian(shot, observation, names, factors):
+    if factors:
+        observation = believed(shot, observation)
     likelihood = only(ImageLikelihood(shot.body, shot.camera), *names)
     for pose in shot.near(4, 22, spread=0.3):
         frames = forward(shot.body.skeleton, pose[None])

@@ -7,7 +7,7 @@ time, and the tests compare values, gradients and Hessians.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -101,8 +101,12 @@ def _terms(
     seen = {k: v for k, v in observation.evidence.items() if getattr(s, k).weight > 0}
     for name, term in (('coverage', coverage), ('edges', edges)):
         if name in seen:
-            own = getattr(s, name)
-            result[name] = term(surface, seen[name], own, np.hypot(own.sigma, blur))
+            own, factors = getattr(s, name), np.ones(len(frames.skeleton.parents))
+            if observation.beliefs is not None:
+                own = replace(own, weight=own.weight * observation.beliefs.of_term(name))
+                factors = observation.beliefs.segments.get(name, factors)
+            sigma = np.hypot(own.sigma, blur)
+            result[name] = term(surface, seen[name], own, sigma, factors[surface.segments])
     return result
 
 
@@ -244,8 +248,13 @@ def visibility(body: Body, frames: Frames, points: Array, parts: Index) -> tuple
     return through.any(1).T, before.any(1).T
 
 
-def coverage(surface: Surface, outline: Outline, term: TermSettings, sigma: Array) -> Residuals:
-    """Points on the outline pay their distance to the nearest contour of the model."""
+def coverage(
+    surface: Surface, outline: Outline, term: TermSettings, sigma: Array, factors: Array
+) -> Residuals:
+    """Points on the outline pay their distance to the nearest contour of the model.
+
+    `factors` (P,) are those of the points of the contour.
+    """
     match = nearest_contour_points(surface, outline)  # (M, N)
     batch = np.arange(match.shape[1])
     offset = surface.pixels[:, match, batch] - outline.pixels.T[:, :, None]
@@ -256,7 +265,7 @@ def coverage(surface: Surface, outline: Outline, term: TermSettings, sigma: Arra
     beyond = np.sign(along) * np.maximum(np.abs(along) - OUTLINE_SPACING, 0.0) / sigma
     # One kernel on the length of the two residuals together.
     each = term.weight / max(len(match), 1)
-    rho, _, curvature = geman_mcclure(np.hypot(across, beyond), term.scale, each)
+    rho, _, curvature = geman_mcclure(np.hypot(across, beyond), term.scale, each * factors[match])
     # Where nothing of the body is before the camera every sample costs all that it can.
     seen = surface.valid.any(0)
     rho = np.where(seen, rho, 0.5 * each * term.scale**2)
@@ -300,7 +309,9 @@ def nearest_contour_points(surface: Surface, outline: Outline) -> Index:
     return np.ascontiguousarray((samples @ features).argmin(2).T)
 
 
-def edges(surface: Surface, image_map: ImageMap, term: TermSettings, sigma: Array) -> Residuals:
+def edges(
+    surface: Surface, image_map: ImageMap, term: TermSettings, sigma: Array, factors: Array
+) -> Residuals:
     """Visible contour points pay their distance to the nearest edge of their direction."""
     bins = image_map.values.shape[0]
     angle = np.arctan2(surface.normals[1], surface.normals[0])
@@ -309,7 +320,7 @@ def edges(surface: Surface, image_map: ImageMap, term: TermSettings, sigma: Arra
     seen = surface.valid & ~surface.hidden
     each = np.where(seen, term.weight / np.maximum(seen.sum(0), FEWEST), 0.0)
     residual = np.where(seen, value / sigma, 0.0)
-    rho, pull, curvature = geman_mcclure(residual, term.scale, each)
+    rho, pull, curvature = geman_mcclure(residual, term.scale, each * factors[:, None])
     directions = _through(gradient / sigma, surface.projection)
     return Residuals(rho.sum(0), surface.segments, surface.points, directions, pull, curvature)
 

@@ -1,10 +1,11 @@
 // Distance of the silhouette's outline from the model's contour; see
 // hmt_ros/image/terms/silhouette.py.
 //
-//     E(x) = w / M sum_m rho(|u_i(m)(x) - s_m| / sigma)
+//     E(x) = w / M sum_m f_s(m) rho(|u_i(m)(x) - s_m| / sigma)
 //
 // s_m are M samples of the outline of the silhouette, u_i points of the model's contour, and i(m)
 // is the one nearest to sample m, by position and direction, among those that no other part covers.
+// f_s(m) is the factor of its segment.
 #pragma once
 
 #include "../pose_view.h"
@@ -121,14 +122,14 @@ HMT_WIDE inline double add_term(const PoseView& view, const CoverageInputs& inpu
   const Index count = outline.count(), whole = in_whole_lanes(count);
   const double share = term.weight / double(count), per_scale = 1.0 / (term.scale * term.scale);
   const double* explained = inputs.explained[inputs.explained.size() > 1 ? view.number : 0].data;
-  const Matrix rows = view.rows(8, whole);
+  const Matrix rows = view.rows(9, whole);
   rows.fill(0.0);
   double* value = rows[7].data;
   double* costs = inputs.costs.size() > 0 ? inputs.costs[view.number].data : value;
   Scratch<Index, 1> use(contour.count + 1), nearest(count);
   const Index used = matched_points(contour, use.view().data);
   double energy = 0.0;
-  if (used == 0) {
+  if (used == 0) {  // samples belong to no segment
     for (Index m = 0; m < count; ++m) {
       costs[m] = least(explained[m], 0.5 * share * outline.beliefs[m] * term.scale * term.scale);
       energy += costs[m];
@@ -138,6 +139,7 @@ HMT_WIDE inline double add_term(const PoseView& view, const CoverageInputs& inpu
   match_outline(outline, contour, use.view().data, used, nearest.view().data);
   double *du = rows[0].data, *dv = rows[1].data, *nx = rows[2].data, *ny = rows[3].data;
   double *inverse = rows[4].data, *across = rows[5].data, *beyond = rows[6].data;
+  double* share_of = rows[8].data;
   for (Index m = 0; m < count; ++m) {
     const Index i = nearest[m];
     du[m] = contour.u[i] - outline.pixels(m, 0);
@@ -145,6 +147,7 @@ HMT_WIDE inline double add_term(const PoseView& view, const CoverageInputs& inpu
     nx[m] = outline.normals(m, 0);
     ny[m] = outline.normals(m, 1);
     inverse[m] = contour.noise[i];
+    share_of[m] = share * outline.beliefs[m] * view.factor(term, contour.parts[i]);
   }
 #pragma omp simd
   for (Index m = 0; m < whole; ++m) {
@@ -156,7 +159,7 @@ HMT_WIDE inline double add_term(const PoseView& view, const CoverageInputs& inpu
     value[m] = squared / (1.0 + squared * per_scale);
   }
   for (Index m = 0; m < count; ++m) {
-    value[m] = costs[m] = least(0.5 * share * outline.beliefs[m] * value[m], explained[m]);
+    value[m] = costs[m] = least(0.5 * share_of[m] * value[m], explained[m]);
   }
   energy = sum_of(value, whole);
   if (!sums.wanted()) return energy;
@@ -164,7 +167,7 @@ HMT_WIDE inline double add_term(const PoseView& view, const CoverageInputs& inpu
     if (!(costs[m] < explained[m])) continue;
     const double squared = across[m] * across[m] + beyond[m] * beyond[m];
     const double shrink = 1.0 / (1.0 + squared * per_scale);
-    const double k = share * outline.beliefs[m] * shrink * shrink;
+    const double k = share_of[m] * shrink * shrink;
     const double gu = nx[m] * inverse[m], gv = ny[m] * inverse[m];
     view.add(nearest[m], gu, gv, k * across[m], k, sums);
     if (beyond[m] != 0.0) view.add(nearest[m], -gv, gu, k * beyond[m], k, sums);

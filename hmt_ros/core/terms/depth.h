@@ -1,11 +1,11 @@
 // Visible points of the surface lie where a depth image sees one; see hmt_ros/image/terms/depth.py.
 //
-//     E(x) = w / V sum_i rho((D(u_i(x)) - z_i(x)) / sigma_i)
+//     E(x) = w / V sum_i f_s(i) rho((D(u_i(x)) - z_i(x)) / sigma_i)
 //     sigma_i^2 = sigma^2 + (growth D^2)^2 + (noise_i / cos a_i)^2
 //
 // over the V visible points i of the flesh: on every ring the two on either side of the part that
 // faces the camera. D is the depth image, z_i the depth of the point, a_i the angle between its
-// normal and its ray.
+// normal and its ray, f_s the factor of segment s.
 #pragma once
 
 #include "../elementary.h"
@@ -93,13 +93,15 @@ HMT_WIDE inline double add_term(const PoseView& view, const DepthInputs& inputs,
   for (Index i = 0; i < front.count; ++i) {
     if (!front.shows(i)) continue;
     const Sample depth = sample_depth(inputs.depths, front.u[i], front.v[i]);
+    const double factor = view.factor(term, front.parts[i]);
     if (depth.value <= 0.0) {
-      energy += unknown;
+      energy += factor * unknown;
       continue;
     }
     const double noise = front.noise[i], own = term.growth * depth.value * depth.value;
     const double inverse = 1.0 / std::sqrt(term.sigma * term.sigma + own * own + noise * noise);
-    const Robust robust = geman_mcclure((depth.value - front.z[i]) * inverse, term.scale, each);
+    const Robust robust =
+        geman_mcclure((depth.value - front.z[i]) * inverse, term.scale, factor * each);
     energy += robust.value;
     const auto by = [&](int k) {
       return depth.slope_u * front.by[k][i] + depth.slope_v * front.by[3 + k][i];

@@ -1,8 +1,9 @@
 // Visible contour points lie on image edges of their direction; see hmt_ros/image/terms/edges.py.
 //
-//     E(x) = w / V sum_i rho(d_o(i)(u_i(x)) / sigma)
+//     E(x) = w / V sum_i f_s(i) rho(d_o(i)(u_i(x)) / sigma)
 //
-// over the V visible contour points u_i, d_o the distance to the nearest edge of orientation o.
+// over the V visible contour points u_i, d_o the distance to the nearest edge of orientation o, f_s
+// the factor of segment s.
 #pragma once
 
 #include "../pose_view.h"
@@ -61,18 +62,19 @@ HMT_WIDE inline double add_term(const PoseView& view, const EdgeInputs& inputs, 
   const Contour& contour = view.contour;
   const Index count = contour.count;
   const double each = weight_of_each(term.weight, view.model.contour_points * 6 / 10, contour);
-  const Matrix rows = view.rows(9, count);
+  const Matrix rows = view.rows(10, count);
   const Scratch<std::int32_t, 1> cells(count);
   double *a = rows[0].data, *b = rows[1].data, *p = rows[2].data, *q = rows[3].data;
   read_cells(inputs.distances, contour, cells.view().data, {a, b, p, q});
   double *gu = rows[4].data, *gv = rows[5].data, *value = rows[6].data;
-  double *pull = rows[7].data, *curvature = rows[8].data;
+  double *pull = rows[7].data, *curvature = rows[8].data, *own = rows[9].data;
+  for (Index i = 0; i < count; ++i) own[i] = each * view.factor(term, contour.parts[i]);
 #pragma omp simd
   for (Index i = 0; i < count; ++i) {
     const Sample distance =
         distance_between({a[i], b[i], p[i], q[i]}, inputs.distances, contour.u[i], contour.v[i]);
     const double sigma = contour_sigma(term, contour.noise[i]);
-    const Robust robust = geman_mcclure(distance.value / sigma, term.scale, each);
+    const Robust robust = geman_mcclure(distance.value / sigma, term.scale, own[i]);
     const bool shown = contour.valid[i] > contour.hidden[i];
     value[i] = shown ? robust.value : 0.0;
     gu[i] = shown ? distance.slope_u / sigma : 0.0;

@@ -1,9 +1,11 @@
 // Energies of keypoints for all exchanges of sides; see hmt_ros/image/terms/keypoints.py.
 //
 //     E(x) = -log sum_e p_e exp(-sum_g E_g,e(x))          e: exchange, g: group of landmarks
+//     E_g,e(x) = w_g sum_k f_s(k) rho(k, e)
 //
 // Given an exchange of sides, the energies of groups add; over the exchanges, likelihoods add. The
-// energy of the whole pose by a mixture over depths is added to those of the groups.
+// energy of the whole pose by a mixture over depths is added to those of the groups. s(k) is the
+// segment of keypoint k as it is called, however it is exchanged.
 #pragma once
 
 #include "../camera.h"
@@ -68,6 +70,7 @@ struct KeypointInputs {
   Lens lens;
   double scale;                     // of the kernel, in standard deviations
   Numbers weights;                  // (G,) factors on the energies of the groups
+  Numbers factors;                  // (S,) on those of keypoints of each segment; none: 1
   Array<const Index, 2> exchanged;  // (E, G) 1 where an exchange exchanges a group
   Table log_priors;                 // (R, E) of the exchanges, a row a problem or one for all
 
@@ -79,6 +82,7 @@ struct KeypointInputs {
     expect_range("points.groups", points.groups, 0, groups());
     expect_range("lifted.segments", lifted.segments, 0, s);
     expect(s > 0, "tree.parents", "one segment at least");
+    expect_factors("factors", factors, s);
     expect(exchanges() > 0, "exchanged", "one exchange at least");
     expect_shape("exchanged", exchanged, {-1, groups()});
     expect_range("exchanged", exchanged, 0, 2);
@@ -86,6 +90,8 @@ struct KeypointInputs {
     expect(log_priors.size() > 0, "log_priors", "one row at least");
     expect_shape("log_priors", log_priors, {-1, exchanges()});
   }
+  // Factor on the energy of keypoint k.
+  double factor(Index k) const { return factor_of(factors, points.segments(k, 0)); }
   // Frames (N, S, 3, 3), (N, S, 3) of the segments must be there for all poses.
   void check_frames(const Array<const double, 4>& columns, const Tables& origins) const {
     expect_shape("columns", columns, {-1, tree.segments(), 3, 3});
@@ -172,12 +178,13 @@ inline void group_energies(const KeypointInputs& inputs, const Tables& columns,
                            const Table& origins, const Matrix& energies) {
   energies.fill(0.0);
   for (Index k = 0; k < inputs.points.size(); ++k) {
+    const double factor = inputs.factor(k);
     for (int e = 0; e < 2; ++e) {
       const Landmark mark(inputs, k, e, columns, origins);
       double& energy = energies(inputs.points.groups[k], e);
       for (int i = 0; i < 2; ++i) {
         const double error = mark.shown ? mark.errors[i] : error_behind;
-        energy += geman_mcclure(error, inputs.scale, 1.0).value;
+        energy += geman_mcclure(error, inputs.scale, factor).value;
       }
     }
   }
@@ -351,7 +358,7 @@ inline void record_keypoints(const KeypointInputs& inputs, const Array<const Ind
                     [&](Index k, Index exchanged, const Landmark& mark) {
                       if (!mark.shown) return;
                       const double weight = inputs.weights[inputs.points.groups[k]];
-                      mark.add(inputs, k, joints(k, exchanged), weight, list);
+                      mark.add(inputs, k, joints(k, exchanged), inputs.factor(k) * weight, list);
                     });
   }
 }
@@ -378,8 +385,9 @@ HMT_WIDE inline double add_keypoints(const KeypointInputs& inputs, const Numbers
   }
   for (Index k = 0; k < inputs.points.size(); ++k) {
     const Index group = inputs.points.groups[k];
+    const double weight = inputs.factor(k) * inputs.weights[group];
     for (int e = 0; e < 2; ++e) {
-      const double share = inputs.weights[group] * room.shares(group, e);
+      const double share = weight * room.shares(group, e);
       if (share < least_share) continue;
       const Landmark mark(inputs, k, e, columns, origins);
       if (mark.shown) mark.add(inputs, k, inputs.points.segments(k, e), share, sums);

@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.inference.arrays import Image
+from hmt_ros.inference.arrays import Array, Image
 
 # A mask that is not there, and a map.
 NOTHING = np.zeros((0, 0), np.uint8)
 NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
+# Factors on the energies at segments, where all are 1.
+NO_FACTORS = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,8 @@ class ImageWindow:
 class Weighting(NamedTuple):
     """`TermSettings` as compiled code reads them; weight 0: off.
 
-    `magnification`, px for a metre at the person, turns errors of the body into pixels.
+    `magnification`, px for a metre at the person, turns errors of the body into pixels; `segments`
+    are factors (S,) on the energies at each segment, (0,): all are 1.
     """
 
     weight: float
@@ -97,6 +100,7 @@ class Weighting(NamedTuple):
     scale: float
     magnification: float
     growth: float = 0.0
+    segments: Array = NO_FACTORS
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from hmt_ros.image.keypoint_schemes import (
     scheme_of,
 )
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, middle_of_hips
-from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.image_term import NO_FACTORS, TermSettings
 from hmt_ros.image.terms.residuals import RECORDED, Tree, tree_of
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import cholesky, inverse
@@ -246,6 +246,7 @@ class KeypointInputs(NamedTuple):
         tree, lens: skeleton and camera.
         scale: of the kernel, in standard deviations.
         weights: (G,) factors on the energies of the groups.
+        factors: (S,) on those of keypoints of each segment, as they are called; (0,): all are 1.
         exchanged: (E, G) 1 where an exchange exchanges a group.
         log_priors: (R, E) of the exchanges, a row a problem or one for all.
     """
@@ -256,6 +257,7 @@ class KeypointInputs(NamedTuple):
     lens: Lens
     scale: float
     weights: Array
+    factors: Array
     exchanged: Index
     log_priors: Array
 
@@ -276,6 +278,8 @@ class KeypointTerm:
             or one for all; None: nothing is exchanged.
         beliefs: (G,) factors on the energies of the groups of landmarks; None: 1.
         lifted_share: factor on the energy of the mixture over whole poses.
+        segments: (S,) factors on the energies of keypoints of each segment, as they are called;
+            (0,) or None: 1.
 
     Raises:
         KeyError: a keypoint that is not a joint of the body.
@@ -289,6 +293,7 @@ class KeypointTerm:
     exchanges: Array | None = None
     beliefs: Array | None = None
     lifted_share: float = 1.0
+    segments: Array | None = None
 
     @cached_property
     def compiled(self) -> KeypointInputs:
@@ -302,6 +307,7 @@ class KeypointTerm:
             self.camera.lens,
             float(self.settings.scale),
             self.weights,
+            NO_FACTORS if self.segments is None else self.segments,
             EXCHANGED[: exchanges.shape[1]],
             np.ascontiguousarray(exchanges, dtype=np.float64),
         )
