@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import tracking_oracles
 from benchmarks.clips import find_clips, read_clip
 from benchmarks.command import benchmark_parser, run_benchmark, show
 from benchmarks.machine import description
@@ -44,8 +45,6 @@ from benchmarks.tracking_means import (
     means_of,
     paired,
 )
-from benchmarks.tracking_oracles import INPUTS as OF_ORACLES
-from benchmarks.tracking_oracles import measure_oracles, oracles_as_text
 from benchmarks.tracking_scores import detector_scores, scores_of
 from benchmarks.tracking_speed import PRICED, costs, speed
 from benchmarks.tracking_tables import COMPARED, HEAVIEST, as_text
@@ -109,15 +108,15 @@ def main(argv: list[str]) -> int:
     if options.parts == [ORACLES]:
         return run_benchmark(
             'tracking',
-            lambda: measure_oracles(
+            lambda: tracking_oracles.measure(
                 options.clips,
                 options.only,
-                [x for x in options.inputs if x in OF_ORACLES],
+                [x for x in options.inputs if x in tracking_oracles.INPUTS],
                 options.seeds,
                 options.processes,
                 quick=options.quick,
             ),
-            partial(oracles_as_text, markdown=options.markdown),
+            partial(tracking_oracles.as_text, markdown=options.markdown),
             as_json=options.json,
         )
     usual = () if options.against or options.baseline else PARTS

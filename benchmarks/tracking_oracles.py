@@ -430,7 +430,7 @@ def _build(joints: Array, names: list[str]) -> tuple[float, float]:
 # All of them.
 
 
-def measure_oracles(
+def measure(
     clips: Path | None = None,
     only: Sequence[str] = (),
     inputs: Sequence[str] = INPUTS,
@@ -498,7 +498,7 @@ def _kept(one: OracleRun) -> dict[str, dict[str, Any]]:
 KINDS = ('neck', 'shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
 
 
-def oracles_as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """Tables for people, real clips first; mm unless said."""
     parts = [f'seeds {", ".join(map(str, result["seeds"]))}; gravity given where it is known; mm']
     entries, given = result['oracles'], dict.fromkeys(x['inputs'] for x in result['oracles'])
