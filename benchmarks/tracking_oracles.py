@@ -1,14 +1,16 @@
 """Single oracles: what the tracker would gain if one thing were true, one at a time.
 
-true 2D landmarks     landmarks where the true ones are seen, all of them sure; on real clips the
-                      joints, and the face, that the truth has, the others as the detector says;
-weight 1, 2, 4        the same, keypoints weighted more than the usual 0.5: if that helps, depth
-                      that the image tells was discounted, if not, nothing tells it;
-true depths           one pose with the true depths, instead of the mixture of the experts;
-true lengths          those between the true joints;
-true sides            keypoints of arms and legs that are called by the other side put right;
-true heading          the heaviest of the modes that face the right way, at scoring;
-no experts, no depths keypoints count without the experts; without the detector's own 3D as well.
+true 2D landmarks      landmarks where the true ones are seen, all of them sure; on real clips the
+                       joints, and the face, that the truth has, the others as the detector says
+true 2D, weight 1 ...  the same, keypoints weighted more than the usual 0.5: if that helps, depth
+                       that an image tells was discounted, if not, keypoints do not tell it
+true depths            one pose with the true depths, instead of the mixture of the experts
+true depths, weight 1  the same, weighted ten times as much as experts are
+true lengths           those between the true joints
+true sides             keypoints of arms and legs that are called by the other side put right
+true heading           the heaviest of the modes that face the right way, at scoring
+experts, weight 0.3    the experts' depths weighted three times as much
+no experts, no depths  keypoints without the experts; without the detector's own 3D as well
 
 The floor is our body at the poses that come nearest to the truth: with its true lengths, and with
 those that a track begins with. It is what definitions of joints, and lengths, leave.
@@ -217,12 +219,12 @@ PLAIN, HEADING = 'plain', 'true heading'
 ORACLES: dict[str, Callable[[Given], Given]] = {
     PLAIN: lambda given: given,
     'true 2D landmarks': _true_landmarks,
-    **{f'the same, weight {x:g}': partial(_true_landmarks, weight=x) for x in (1.0, 2.0, 4.0)},
+    **{f'true 2D, weight {x:g}': partial(_true_landmarks, weight=x) for x in (1.0, 2.0, 4.0)},
     'true depths': _true_depths,
-    'the same, depths weighted 1': partial(_true_depths, weight=1.0),
+    'true depths, weight 1': partial(_true_depths, weight=1.0),
     'true lengths': _true_lengths,
     'true sides': _true_sides,
-    'experts weighted 0.3': lambda given: replace(given, depth_weight=0.3),
+    'experts, weight 0.3': lambda given: replace(given, depth_weight=0.3),
     'no experts': _without_experts,
     'no depths': _without_depths,
 }

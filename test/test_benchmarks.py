@@ -72,7 +72,7 @@ def test_oracles_gain_what_they_know(clips, tmp_path, monkeypatch, capsys):
     assert {x['clip'] for x in found.values()} == {'desk_1'}
     assert found[tracking_oracles.FLOOR, tracking_oracles.FLOORS[0]]['heaviest'] < 10
     assert found[KEYPOINTS, 'true 2D landmarks']['across'] < plain['across']
-    assert found[KEYPOINTS, 'the same, depths weighted 1']['along'] < 0.8 * plain['along']
+    assert found[KEYPOINTS, 'true depths, weight 1']['along'] < 0.8 * plain['along']
     assert set(found) >= {(KEYPOINTS, x) for x in tracking_oracles.ORACLES}
     text = tracking_oracles.as_text(result)
     assert text.index('Real clips') < text.index('Floors')
