@@ -497,6 +497,7 @@ def _kept(one: OracleRun) -> dict[str, dict[str, Any]]:
 
 # Tables.
 
+MODES = ('heaviest', 'best')
 KINDS = ('neck', 'shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
 
 
@@ -526,16 +527,19 @@ def _oracle_table(
     entries: Sequence[dict[str, Any]],
     clips: Sequence[str],
     markdown: bool,
-    shown: tuple[str, str] = ('heaviest', 'best'),
+    shown: tuple[str, str] = MODES,
 ) -> str:
-    heads = ('heaviest', 'best', 'along', 'across')
-    rows = [['oracle', *heads, 'gain', *clips]]
+    """Two scores of each clip by oracle; beside those of the modes, means over the clips."""
+    heads = ('heaviest', 'best', 'along', 'across') if shown == MODES else ()
+    rows = [['oracle', *heads, *(['gain'] if heads else []), *clips]]
     usual = _column([x for x in entries if x['oracle'] == PLAIN], 'heaviest')
     for oracle in dict.fromkeys(x['oracle'] for x in entries):
         own = [x for x in entries if x['oracle'] == oracle]
-        means = [_column(own, x) for x in heads]
+        means = [_cell(_column(own, x)) for x in heads]
+        if heads:
+            means.append(_cell(usual - _column(own, 'heaviest'), '+.0f'))
         each = [' / '.join(_cell(x[name]) for name in shown) for x in own]
-        rows.append([oracle, *map(_cell, means), _cell(usual - means[0], '+.0f'), *each])
+        rows.append([oracle, *means, *each])
     return table(rows, markdown=markdown)
 
 
