@@ -105,7 +105,9 @@ def main(argv: list[str]) -> int:
         '--processes', type=int, default=0, metavar='N', help='of one thread each (one a core)'
     )
     options = parser.parse_args(argv)
-    if options.parts == [ORACLES]:
+    if ORACLES in (options.parts or ()):
+        if options.parts != [ORACLES] or options.against or options.baseline:
+            parser.error(f'{ORACLES} stands alone')
         return run_benchmark(
             'tracking',
             lambda: tracking_oracles.measure(

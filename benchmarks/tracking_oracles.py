@@ -448,6 +448,8 @@ def measure(
         ValueError: a clip can not be read.
     """
     names = [x for group in GROUPS.values() for x in group if x in (only or x)]
+    if not names:
+        raise ValueError(f'none of the clips {list(only)} has oracles')
     folders = with_file(names[:1] if quick else names, clips, 'truth.npz')
     limit = None
     if quick:

@@ -74,6 +74,8 @@ def test_oracles_gain_what_they_know(clips, tmp_path, monkeypatch, capsys):
     assert found[KEYPOINTS, 'true 2D landmarks']['across'] < plain['across']
     assert found[KEYPOINTS, 'true depths, weight 1']['along'] < 0.8 * plain['along']
     assert set(found) >= {(KEYPOINTS, x) for x in tracking_oracles.ORACLES}
+    assert main([*words[:-1], 'nobody']) == 1
+    assert 'nobody' in capsys.readouterr().err
     text = tracking_oracles.as_text(result)
     assert text.index('Real clips') < text.index('Floors')
 
