@@ -37,9 +37,21 @@ BENCHMARKS = {
     'vertical': 'how well the lines of a scene tell which way is up, and what a look costs',
 }
 
+# Parts with a page of their own: module, command, what they measure.
+PARTS = {
+    'oracles': (
+        'tracking_oracles',
+        'tracking --parts oracles --seeds 0',
+        'what the truth of one thing at a time would gain the tracker',
+    ),
+}
+
 
 def benchmark(name: str) -> ModuleType:
-    """The module of a benchmark: `main` runs it, `measure` measures, `as_text` tells of that."""
+    """The module of a benchmark: `main` runs it, `measure` measures, `as_text` tells of that.
+
+    That of a part has no `main`.
+    """
     # Before numpy is imported: with small matrices a second BLAS thread costs more than it brings.
     for library in ('OMP', 'OPENBLAS', 'MKL'):
         os.environ.setdefault(f'{library}_NUM_THREADS', '1')

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hmt_ros.app.import_video.frames import Selection, open_source
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera, load_body
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions.camera_file import read_camera
 from hmt_ros.sessions.image_inputs import DEPTH
 from msg_tools import BagReader
 from msg_tools.files.array_file import read_archive
@@ -194,19 +196,16 @@ def read_messages(
 
 
 def read_clip(folder: Path, frames: int | None = None) -> Clip:
-    """Reads a clip, or its first frames.
+    """Reads a clip, or its first frames: a bag or, where there is none, a video with its camera.
 
     Raises:
         ValueError: files that can not be read, or that do not fit each other.
     """
-    info, messages = read_messages(folder, frames=frames)
-    stamps = [time_ns(message.header.stamp) for message in messages]
-    images = [decode_image(message) for message in messages]
+    of_video = not (folder / 'metadata.yaml').is_file()
+    camera, stamps, images, truth = (_video if of_video else _bag)(folder, frames)
     background, empty = None, folder / 'background.png'
     if empty.is_file() and (background := cv2.imread(str(empty))) is None:
         raise ValueError(f'{empty} is no image')
-    height, width = images[0].shape[:2]
-    truth = read_truth(folder / 'truth.npz')
     with np.load(folder / 'truth.npz') as content:
         pixels = dict(zip(map(int, content['stamps']), np.array(content['pixels']), strict=True))
         ups = {stamp: ground.up for stamp, ground in truth.ground.items()}
@@ -220,7 +219,7 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
             )
     return Clip(
         folder,
-        camera_from_info(info, (width, height)),
+        camera,
         stamps,
         images,
         truth,
@@ -229,6 +228,43 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
         views=views,
         ups=ups,
     )
+
+
+Content = tuple[Camera, list[int], list[NDArray[np.uint8]], Truth]
+
+
+class PartialTruth(Truth):
+    """Truth that lacks some joints of some images: they are NaN."""
+
+    def __post_init__(self) -> None:
+        """Nothing is checked."""
+
+
+def _bag(folder: Path, frames: int | None) -> Content:
+    info, messages = read_messages(folder, frames=frames)
+    images = [decode_image(message) for message in messages]
+    camera = camera_from_info(info, _size(images[0]))
+    stamps = [time_ns(message.header.stamp) for message in messages]
+    return camera, stamps, images, read_truth(folder / 'truth.npz')
+
+
+def _video(folder: Path, frames: int | None) -> Content:
+    """`NAME.mp4` and `camera.yaml`, each image at the stamp of the truth's row."""
+    with np.load(folder / 'truth.npz') as content:
+        stamps, fps = content['stamps'].tolist()[:frames], float(content['fps'])
+        names, joints = content['joint_names'], content['joints'].astype(np.float64)
+    shown = open_source(folder / f'{folder.name}.mp4', fps).frames(Selection())
+    images = [one.image for one in islice(shown, len(stamps))]
+    if len(images) < len(stamps):
+        raise ValueError(f'{folder} has {len(images)} images, and a truth of {len(stamps)}')
+    by_stamp = dict(zip(stamps, joints, strict=False))
+    truth = PartialTruth(folder.name, tuple(map(str, names)), by_stamp)
+    return read_camera(folder / 'camera.yaml', _size(images[0])), stamps, images, truth
+
+
+def _size(image: NDArray[np.uint8]) -> tuple[int, int]:
+    height, width = image.shape[:2]
+    return width, height
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import tracking_oracles
 from benchmarks.clips import find_clips, read_clip
-from benchmarks.command import benchmark_parser, show
+from benchmarks.command import benchmark_parser, run_benchmark, show
 from benchmarks.machine import description
 from benchmarks.runs import (
     GRAVITIES,
@@ -49,6 +50,7 @@ from benchmarks.tracking_speed import PRICED, costs, speed
 from benchmarks.tracking_tables import COMPARED, HEAVIEST, as_text
 
 PARTS = ('accuracy', 'speed')
+ORACLES = 'oracles'  # a part of its own, of its own clips
 SEEDS = (0, 1, 2)
 RATES = (USUAL_RATE,)
 TIMED = 'walk'  # if it is there
@@ -87,8 +89,9 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         '--parts',
         nargs='+',
-        choices=PARTS,
-        help=f'{", ".join(PARTS)}; none where settings or checkouts are compared',
+        choices=(*PARTS, ORACLES),
+        help=f'{", ".join(PARTS)}; none where settings or checkouts are compared; '
+        f'{ORACLES}, alone: what the truth of one thing at a time would gain, gravity given',
     )
     parser.add_argument(
         '--against', nargs='+', default=(), metavar='SETTING=VALUE',
@@ -102,6 +105,22 @@ def main(argv: list[str]) -> int:
         '--processes', type=int, default=0, metavar='N', help='of one thread each (one a core)'
     )
     options = parser.parse_args(argv)
+    if ORACLES in (options.parts or ()):
+        if options.parts != [ORACLES] or options.against or options.baseline:
+            parser.error(f'{ORACLES} stands alone')
+        return run_benchmark(
+            'tracking',
+            lambda: tracking_oracles.measure(
+                options.clips,
+                options.only,
+                [x for x in options.inputs if x in tracking_oracles.INPUTS],
+                options.seeds,
+                options.processes,
+                quick=options.quick,
+            ),
+            partial(tracking_oracles.as_text, markdown=options.markdown),
+            as_json=options.json,
+        )
     usual = () if options.against or options.baseline else PARTS
     try:
         result = measure(

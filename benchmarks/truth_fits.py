@@ -116,7 +116,7 @@ def with_true_lengths(body: Body, clip: Clip) -> Body:
         return middle
 
     lengths = {
-        name: float(np.mean([np.linalg.norm(at(a) - at(b), axis=1).mean() for a, b in spans]))
+        name: float(np.mean([np.nanmean(np.linalg.norm(at(a) - at(b), axis=1)) for a, b in spans]))
         for name, spans in SPANS.items()
         if all(set(a) | set(b) <= set(names) for a, b in spans)
     }

@@ -3,8 +3,9 @@
     python docs/generate.py NAME [NAME ...]
 
 The name of a node, such as filter_node, writes the table of its parameters in NAME.md, between
-`<!-- begin NAME -->` and `<!-- end -->`, and hmt_ros/config/NAME.yaml. The name of a benchmark
-runs it and writes benchmarks/results/NAME.md (minutes; soak ten, tracking thirty or more).
+`<!-- begin NAME -->` and `<!-- end -->`, and hmt_ros/config/NAME.yaml. The name of a benchmark, or
+of a part that has a page, runs it and writes benchmarks/results/NAME.md (minutes; soak ten,
+tracking and oracles thirty or more).
 """
 
 from __future__ import annotations
@@ -42,10 +43,11 @@ _WIDTH, _INDENT = 100, '    '
 
 def main(argv: list[str]) -> int:
     """Writes what is named."""
-    from benchmarks import BENCHMARKS
+    from benchmarks import BENCHMARKS, PARTS
 
-    if not argv or any(name not in (*NODES, *BENCHMARKS) for name in argv):
-        sys.stderr.write(f'generate.py: wanted some of {", ".join((*NODES, *BENCHMARKS))}\n')
+    known = (*NODES, *BENCHMARKS, *PARTS)
+    if not argv or any(name not in known for name in argv):
+        sys.stderr.write(f'generate.py: wanted some of {", ".join(known)}\n')
         return 1
     for name in argv:
         if name in NODES:
@@ -77,15 +79,15 @@ def with_part(page: str, name: str, content: str) -> str:
 
 def results(name: str) -> str:
     """What a benchmark measures now, as a page."""
-    from benchmarks import BENCHMARKS, benchmark
+    from benchmarks import BENCHMARKS, PARTS, benchmark
 
-    measuring = benchmark(name)
+    module, command, what = PARTS.get(name) or (name, name, BENCHMARKS[name])
+    measuring = benchmark(module)
     from benchmarks.machine import on_machine
 
     result = measuring.measure()
     table, machine = measuring.as_text(result, markdown=True), on_machine(result['machine'])
-    what = BENCHMARKS[name]
-    head = f'# {name}: {what}\n\n```\npython -m benchmarks {name}\n```'
+    head = f'# {name}: {what}\n\n```\npython -m benchmarks {command}\n```'
     return f'{head}\n\n{table}\n\n{machine}\n'
 
 

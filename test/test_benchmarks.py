@@ -2,12 +2,17 @@
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from benchmarks import BENCHMARKS, sampling
+from benchmarks import BENCHMARKS, PARTS, sampling, tracking_oracles
 from benchmarks.__main__ import main
+from benchmarks.clips import development_folder
+from benchmarks.runs import KEYPOINTS
+from hmt_ros.body.skeleton import other_side
 from msg_tools.messages.headers import stamp_in
 
 RESULTS = Path(__file__).resolve().parents[1] / 'benchmarks' / 'results'
@@ -40,10 +45,54 @@ def faults_in(found):
 
 def test_every_benchmark_has_its_page():
     pages = {page.stem: page.read_text('utf-8') for page in RESULTS.glob('*.md')}
-    assert set(pages) == {*BENCHMARKS}
+    assert set(pages) == {*BENCHMARKS, *PARTS}
     for name, text in pages.items():
-        assert text.startswith(f'# {name}: {BENCHMARKS[name]}\n'), name
-        assert f'\npython -m benchmarks {name}' in text, name
+        _, command, what = PARTS.get(name) or (name, name, BENCHMARKS[name])
+        assert text.startswith(f'# {name}: {what}\n'), name
+        assert f'\npython -m benchmarks {command}' in text, name
+
+
+@pytest.fixture
+def clips():
+    """The folder of the development clips."""
+    folder = development_folder()
+    if not (folder / 'desk_1').is_dir():
+        pytest.skip(f'no development data in {folder.parent}')
+    return folder
+
+
+def test_oracles_gain_what_they_know(clips, tmp_path, monkeypatch, capsys):
+    """Of a video whose truth lacks joints, and has no hips."""
+    monkeypatch.setattr(tracking_oracles, 'KEPT', tmp_path)
+    words = ['tracking', '--parts', 'oracles', '--quick', '--only', 'desk_1']
+    assert main([*words, '--inputs', KEYPOINTS, '--json']) == 0
+    result = json.loads(capsys.readouterr().out)
+    found = {(x['inputs'], x['oracle']): x for x in result['oracles']}
+    plain = found[KEYPOINTS, tracking_oracles.PLAIN]
+    assert {x['clip'] for x in found.values()} == {'desk_1'}
+    assert found[tracking_oracles.FLOOR, tracking_oracles.FLOORS[0]]['heaviest'] < 10
+    assert found[KEYPOINTS, 'true 2D landmarks']['across'] < plain['across']
+    assert found[KEYPOINTS, 'true depths, weight 1']['along'] < 0.8 * plain['along']
+    assert set(found) >= {(KEYPOINTS, x) for x in tracking_oracles.ORACLES}
+    assert main([*words[:-1], 'nobody']) == 1
+    assert 'nobody' in capsys.readouterr().err
+    text = tracking_oracles.as_text(result)
+    assert text.index('Real clips') < text.index('Floors')
+
+
+def test_exchanged_keypoints_are_put_right(clips):
+    given = tracking_oracles.given_of(clips / 'signals', 2)
+    right = tracking_oracles.ORACLES['true sides'](given)
+    wrong = {}
+    for stamp, one in right.keypoints.items():
+        names = [other_side(x) if x[0] in 'lr' else x for x in one.landmarks]
+        moved = one[np.array([one.landmarks.index(x) for x in names])]
+        wrong[stamp] = replace(one, pixels=moved.pixels)
+    again = tracking_oracles.ORACLES['true sides'](replace(given, keypoints=wrong))
+    for stamp in given.clip.truth.joints:
+        if stamp in wrong:
+            assert not np.array_equal(wrong[stamp].pixels, right.keypoints[stamp].pixels)
+            assert np.array_equal(again.keypoints[stamp].pixels, right.keypoints[stamp].pixels)
 
 
 def test_command_line(capsys):
