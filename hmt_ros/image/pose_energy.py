@@ -151,7 +151,9 @@ class PoseEnergy:
     _sum: tuple[Compiled, tuple[FrameTerm, ...]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, '_sum', _summed(self.likelihood, self.terms))
+        own = tuple(x for x in self.terms if type(x) in KINDS)
+        others = tuple(cast(FrameTerm, x) for x in self.terms if type(x) not in KINDS)
+        object.__setattr__(self, '_sum', (_summed(self.likelihood, own), others))
 
     @property
     def _strange(self) -> tuple[FrameTerm, ...]:
@@ -341,28 +343,22 @@ class PoseEnergy:
 
 # An image is compared with many sets of poses.
 @lru_cache(maxsize=8)
-def _summed(
-    likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, ...]
-) -> tuple[Compiled, tuple[FrameTerm, ...]]:
-    """Terms with a kernel here, as compiled code reads them, and all others; the same at each call.
+def _summed(likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, ...]) -> Compiled:
+    """Terms with a kernel here, as compiled code reads them.
 
     Raises:
-        ValueError: two terms of one kind that has a kernel.
+        ValueError: two terms of one kind.
     """
     known: dict[str, Any] = {}
-    others: list[FrameTerm] = []
     for term in terms:
-        name = KINDS.get(type(term))
-        if name is None:
-            others.append(cast(FrameTerm, term))
-        elif name in known:
+        name = KINDS[type(term)]
+        if name in known:
             found = f'{type(known[name]).__name__} and {type(term).__name__}'
             raise ValueError(f'a sum has one term of a kind at most, saw {found}')
-        else:
-            known[name] = term
+        known[name] = term
     image = known.pop('image', None) or observed(likelihood, NOTHING_SEEN)
     compiled = {name: term.compiled for name, term in known.items()} | image.compiled
-    return _absent(likelihood.body)._replace(**compiled), tuple(others)
+    return _absent(likelihood.body)._replace(**compiled)
 
 
 def _with_costs(compiled: Compiled, poses: int) -> tuple[Compiled, Array]:

@@ -220,7 +220,8 @@ def energy_over_shape(space, pose, observation, name):
         points = moved.points(surface.segments, centres + place * radii)
         pixels, projection = CAMERA.project_with_derivative(points.transpose(1, 0, 2))
         held = replace(surface, points=points, pixels=pixels, projection=projection)
-        return oracle.coverage(held, observation.evidence[name], term, sigma).value[0]
+        ones = np.ones(len(points))
+        return oracle.coverage(held, observation.evidence[name], term, sigma, ones).value[0]
 
     return value
 
