@@ -208,7 +208,8 @@ class KeypointTracks:
         roots: (F, 3) of the person, m.
         starts, counts: (M,) first frame and number of frames of each track.
         lengths: (M, P) logarithms of the lengths (`lifter.PROPORTIONED`) over the usual ones.
-        weights: (M,) share of the windows that are drawn from a track; they sum to 1.
+        weights: (M,) share of the windows that are drawn from a track; they sum to 1. Of one that
+            is seated 0.
         seated: (M,) whether a track is of legs that sit, with a trunk that is of no use.
         usual: (P,) the usual lengths, m.
     """
@@ -273,7 +274,7 @@ def keypoint_tracks(
                 person = _other_lengths(body, person, rng)
             add(poses, person, share, not variant)
     for _ in range(seated):
-        add(_seated(body, rng), _other_lengths(body, own, rng), 1.0, False)
+        add(_seated(body, rng), _other_lengths(body, own, rng), 0.0, False)
     counts = np.array([len(x[2]) for x in parts], dtype=np.intp)
     landmarks, joints = (
         Figures(*(np.concatenate([getattr(x[i], name) for x in parts]) for name in _FIGURE))
@@ -291,7 +292,7 @@ def keypoint_tracks(
         np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp),
         counts,
         np.array(lengths),
-        np.array(weights),
+        np.array(weights) / np.sum(weights),
         np.arange(len(counts)) >= len(counts) - seated,
         usual,
     )
@@ -426,16 +427,15 @@ def training_windows(
     s = settings or WindowSettings()
     n, f32 = count, np.float32
     which = _drawn_tracks(tracks, n, rng, s)
-    now = (rng.random((n, len(which))) * tracks.counts[which.T]).astype(np.intp).T
+    now = (_drawn_shares(which, rng) * tracks.counts[which]).astype(np.intp)
     times, there, rows, part = _images(now, tracks.counts[which], rng, s)
     base, first = tracks.starts[which][:, :, None] + rows, tracks.starts[which] + now
     joints = assembled(tracks, tracks.joints, JOINTS, first[..., None])[:, 0]
-    # Parts that meet stay those of one motion.
-    met = meet(joints)
-    for one in (base, first, which):
+    # Parts that meet stay those of one motion; hands of people who sit are in their laps.
+    met = meet(joints) & ~tracks.seated[which[0]]
+    for one in (base, first, which, part):
         one[1:, met] = one[:1, met]
-    part[1:, met] = part[:1, met]
-    joints = assembled(tracks, tracks.joints, JOINTS, first[..., None])[:, 0]
+    joints[met] = assembled(tracks, tracks.joints, JOINTS, first[:, met, None])[:, 0]
     joints = joints - tracks.roots[first[0]][:, None]
     joints -= joints[:, [JOINTS.index(name) for name in HIPS]].mean(1, keepdims=True)
     places = assembled(tracks, tracks.landmarks, (*LANDMARKS, *CENTRES), base, part)
@@ -481,14 +481,23 @@ def _drawn_tracks(
     tracks: KeypointTracks, n: int, rng: np.random.Generator, s: WindowSettings
 ) -> Index:
     """Tracks (3, N) of the legs, the trunk and the arms."""
-    seats, weights = tracks.seated, tracks.weights
-    whole = np.where(seats, 0.0, weights) / weights[~seats].sum()
-    legs, trunk, arms = rng.choice(len(weights), (3, n), p=whole)
-    sits = (rng.random(n) < s.seated) & bool(seats.any())
-    legs[sits] = rng.choice(np.flatnonzero(seats), sits.sum()) if sits.any() else legs[sits]
+    legs, trunk, arms = rng.choice(len(tracks.weights), (3, n), p=tracks.weights)
+    seats = np.flatnonzero(tracks.seated)
+    sits = (rng.random(n) < s.seated) & (len(seats) > 0)
+    if sits.any():
+        legs[sits] = rng.choice(seats, sits.sum())
     other, third = rng.random(n) < s.recombined, rng.random(n) < 0.5
     trunk = np.where(sits | other, trunk, legs)
     return np.stack([legs, trunk, np.where((sits | other) & third, arms, trunk)])
+
+
+def _drawn_shares(which: Index, rng: np.random.Generator) -> Array:
+    """How far tracks (3, N) are over; parts of one track are at one time."""
+    result: Array = rng.random(which.shape)
+    for part in (1, 2):
+        same = which[part] == which[part - 1]
+        result[part, same] = result[part - 1, same]
+    return result
 
 
 def assembled(

@@ -372,6 +372,20 @@ def test_a_person_of_three_tracks_holds_together():
     np.testing.assert_allclose(own[:, JOINTS.index('left_knee')], made['left_knee'], atol=1e-6)
 
 
+def test_parts_of_one_track_are_at_one_time():
+    plain = WindowSettings(noise=0.0, near=0.0, recombined=0.0, seated=0.0)
+    one = keypoint_tracks(BODY, [procedural_sequence('walk', BODY, 2.0, 0)], [1.0], variants=1)
+    _, joints = training_windows(one, 60, np.random.default_rng(0), plain, 0)
+    poses = procedural_sequence('walk', BODY, 2.0, 0).poses
+    recorded = BODY.joint_positions(poses)[:, BODY.skeleton.joint_index(JOINTS)]
+
+    def distances(places):
+        return np.linalg.norm(places[:, :, None] - places[:, None], axis=3)
+
+    apart = np.abs(distances(joints)[:, None] - distances(recorded)).max((2, 3))
+    assert apart.min(1).max() < 1e-4
+
+
 def test_arms_within_the_trunk_meet():
     joints = BODY.joint_positions(np.repeat(BODY.prior_mean[None], 2, axis=0))
     joints = joints[:, BODY.skeleton.joint_index(JOINTS)]
