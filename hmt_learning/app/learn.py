@@ -40,7 +40,8 @@ from hmt_learning.app.motions import (
 )
 from hmt_learning.motion.motion_file import read_motion
 from hmt_learning.motion.retarget import body_from_motion
-from hmt_learning.training.keypoint_training import WindowSettings, keypoint_tracks
+from hmt_learning.training.keypoint_tracks import keypoint_tracks
+from hmt_learning.training.keypoint_training import WindowSettings
 from hmt_learning.training.length_learning import (
     held_out,
     learned_spread,

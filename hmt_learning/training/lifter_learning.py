@@ -14,13 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp, ndtr
 
-from hmt_learning.training.keypoint_training import (
-    JOINTS,
-    KeypointTracks,
-    WindowSettings,
-    keypoint_tracks,
-    training_windows,
-)
+from hmt_learning.training.keypoint_tracks import JOINTS, KeypointTracks, keypoint_tracks
+from hmt_learning.training.keypoint_training import WindowSettings, training_windows
 from hmt_learning.training.network_learning import (
     Descent,
     check_tools,

@@ -121,17 +121,28 @@ class WindowInputs:
     known: NDArray[np.bool_]
 
 
-def proportions(usual: Body, lengths: Mapping[str, float]) -> Array:
-    """Proportions (P,) of a person: log lengths over the usual ones, less their mean.
+def log_ratios(usual: Body, lengths: Mapping[str, float]) -> Array:
+    """Logarithms (P,) of a person's lengths over the usual ones.
 
     Args:
         usual: body with the usual lengths.
         lengths: of the person by name, m.
     """
     own = usual.segment_lengths
-    weight = np.array([own[name] for name in PROPORTIONED])
-    ratio = np.array([max(lengths[name] / own[name], SHORTEST) for name in PROPORTIONED])
-    return np.asarray(elementary.log(ratio) - product(weight, elementary.log(ratio)) / weight.sum())
+    return np.asarray(
+        elementary.log([max(lengths[name] / own[name], SHORTEST) for name in PROPORTIONED])
+    )
+
+
+def relative(usual: Body, logs: Array) -> Array:
+    """Log ratios (..., P) less their mean, which is a person's size."""
+    weights = np.array([usual.segment_lengths[name] for name in PROPORTIONED])
+    return np.asarray(logs - product(logs, weights)[..., None] / weights.sum())
+
+
+def proportions(usual: Body, lengths: Mapping[str, float]) -> Array:
+    """Proportions (P,) of a person: log lengths over the usual ones, less their mean."""
+    return relative(usual, log_ratios(usual, lengths))
 
 
 def places_of(keypoints: Keypoints, scheme: str = AUTO) -> list[int]:

@@ -8,16 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hmt_learning.training.keypoint_training import (
-    JOINTS,
-    DetectorErrors,
-    WindowSettings,
-    assembled,
-    keypoint_tracks,
-    meet,
-    training_windows,
-    with_errors,
-)
+from hmt_learning.training.detector_errors import DetectorErrors, with_errors
+from hmt_learning.training.keypoint_tracks import JOINTS, assembled, keypoint_tracks, meet
+from hmt_learning.training.keypoint_training import WindowSettings, training_windows
 from hmt_learning.training.lifter_learning import LearningSettings, learn_lifter, lifter_scores
 from hmt_learning.training.training_set import procedural_sequence
 from hmt_ros.body import Camera, load_body

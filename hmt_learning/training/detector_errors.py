@@ -1,0 +1,159 @@
+"""How the keypoints of a detector err, in windows of images.
+
+Errors of single landmarks are in `image/keypoint_schemes.yaml`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.skeleton import other_side
+from hmt_ros.experts.lifter import LANDMARKS, TIMES
+from hmt_ros.image.lifted_poses import HIPS
+from hmt_ros.inference.arrays import Array
+
+Floats = NDArray[np.float32]
+
+# Rows of the landmarks of the other side, and landmarks of parts of the body.
+SIDES = np.array([LANDMARKS.index(other_side(name)) for name in LANDMARKS])
+ARMS = np.array([name.endswith(('shoulder', 'elbow', 'wrist')) for name in LANDMARKS])
+BELOW_KNEE = np.array([name.endswith(('knee', 'ankle', 'heel', 'toe')) for name in LANDMARKS])
+BELOW_HIP = BELOW_KNEE | np.array([name.endswith('hip') for name in LANDMARKS])
+OF_LEGS = BELOW_KNEE | np.array([name in HIPS for name in LANDMARKS])
+
+
+@dataclass(frozen=True)
+class DetectorErrors:
+    """How the keypoints of a detector err together.
+
+    `sigma`, how much of the variance lasts and how often sides are exchanged are near what
+    `benchmarks keypoint_noise` measures on rendered clips; the rest is chosen.
+
+    Attributes:
+        sigma: Standard deviation of a keypoint that is sure, m at the person.
+        spread: Standard deviation of its logarithm over persons.
+        white, lasting, constant: Shares of the variance of errors that differ from image to image,
+            that last for `time`, and that stay.
+        time: Time for which the second kind lasts, s.
+        hidden, always_hidden: Shares of the landmarks that are unsure for a while, and always.
+        hidden_time: Half of that while, s.
+        hidden_factor: Largest factor on the errors of an unsure landmark.
+        heavy: Share of the landmarks that err as much although they seem sure.
+        unconfident: Share of detectors that have no confidences.
+        missing: Share of landmarks, of single keypoints and of images that are missing.
+        cut: Shares of windows without what is below the knees, and below the hips.
+        beyond: Factor on the errors of a landmark beyond the border, by the tangent of the angle.
+        doubted: Loss of confidence there, by the same; half of the detectors leave it out.
+        exchanged: Shares of windows where nothing, all, arms, legs are called by the other side.
+        exchange_time: Half of the time for which they are, s; half of them stay.
+    """
+
+    sigma: float = 0.016
+    spread: float = 0.35
+    white: float = 0.08
+    lasting: float = 0.64
+    constant: float = 0.25
+    time: float = 0.2
+    hidden: float = 0.12
+    always_hidden: float = 0.04
+    hidden_time: float = 0.5
+    hidden_factor: float = 6.0
+    heavy: float = 0.03
+    unconfident: float = 0.2
+    missing: float = 0.02
+    cut: tuple[float, float] = (0.08, 0.08)
+    beyond: float = 12.0
+    doubted: float = 3.2
+    exchanged: tuple[float, ...] = (0.91, 0.04, 0.025, 0.025)
+    exchange_time: float = 0.3
+
+
+def with_errors(
+    rays: Floats,
+    confidences: Floats,
+    distance: Floats,
+    times: Array,
+    rng: np.random.Generator,
+    amount: float = 1.0,
+    border: Array | None = None,
+) -> tuple[Floats, Floats]:
+    """Rays (N, S, L, 2) and confidences (N, S, L) as a detector would see them.
+
+    Args:
+        rays, confidences: as they are; confidence 0: the scheme lacks a landmark, or there is no
+            image.
+        distance: (N,) of the person, m.
+        times: (N, S) of the images, s; the same order in all windows.
+        amount: factor on the deviations.
+        border: (N,) the lowest y / z in the images; None: they show everything.
+    """
+    e = DetectorErrors()
+    n, s, count = confidences.shape
+    f32 = np.float32
+
+    def normal(*shape: int) -> Floats:
+        return rng.standard_normal(shape, dtype=f32)
+
+    sigma = e.sigma * amount * np.exp(e.spread * rng.normal(size=n)) / distance
+    noise = np.sqrt(f32(e.white)) * normal(n, s, count, 2)
+    noise += np.sqrt(f32(e.constant)) * normal(n, 1, count, 2)
+    lasting, order = normal(n, s, count, 2), np.argsort(TIMES)
+    for before, after in pairwise(order.tolist()):
+        gap = np.abs(times[:, after] - times[:, before])
+        rho = np.exp(-gap / e.time).astype(f32)[:, None, None]
+        lasting[:, after] *= np.sqrt(1 - rho * rho)
+        lasting[:, after] += rho * lasting[:, before]
+    noise += np.sqrt(f32(e.lasting)) * lasting
+    # Landmarks that are hidden, for a while or all the time, and those that err without saying so.
+    reach = float(TIMES.max()) + 0.1
+    middle, half = (
+        rng.uniform(-reach, reach, (n, 1, count)),
+        rng.exponential(e.hidden_time, (n, 1, count)),
+    )
+    hidden = (rng.random((n, 1, count)) < e.hidden) & (np.abs(times[:, :, None] - middle) < half)
+    hidden |= rng.random((n, 1, count)) < e.always_hidden
+    factor = np.where(hidden, rng.uniform(1.5, e.hidden_factor, (n, 1, count)), 1.0)
+    heavy = rng.random((n, 1, count)) < e.heavy
+    factor = factor * np.where(heavy, rng.uniform(2.0, 5.0, (n, 1, count)), 1.0)
+    beyond = np.zeros_like(factor)
+    if border is not None:
+        beyond = np.maximum(rays[..., 1] - border[:, None, None], 0.0)
+        factor = factor * np.minimum(1.0 + e.beyond * beyond, e.hidden_factor)
+    rays = rays + (sigma[:, None, None] * factor)[..., None].astype(f32) * noise
+    doubt = 0.75 - 0.12 * factor + 0.15 * normal(n, 1, count) + 0.05 * normal(n, s, count)
+    sure = np.where(
+        hidden, np.clip(doubt, 0.02, 0.9), np.clip(1 - 0.04 * np.abs(normal(n, s, count)), 0.5, 1)
+    )
+    sure = np.where(rng.random((n, 1, 1)) < e.unconfident, 1.0, sure)
+    sure = np.where(beyond > 0, np.clip(sure - e.doubted * beyond, 0.02, 1.0), sure)
+    sure *= ~((beyond > 0) & (rng.random((n, 1, 1)) < 0.5))
+    confidences = confidences * sure.astype(f32)
+    confidences *= ~(hidden & (rng.random((n, 1, 1)) < 0.3))
+    for shape in ((n, 1, count), (n, s, count), (n, s, 1)):
+        confidences *= rng.random(shape) > e.missing
+    for share, below in zip(e.cut, (BELOW_KNEE, BELOW_HIP), strict=True):
+        confidences[rng.random(n) < share] *= ~below
+    _exchange(rays, confidences, times, rng, e)
+    return rays.astype(f32), confidences
+
+
+def _exchange(
+    rays: Floats, confidences: Floats, times: Array, rng: np.random.Generator, e: DetectorErrors
+) -> None:
+    """Exchanges left and right in some windows: for a run of images, or for all of them."""
+    n = len(rays)
+    kind = rng.choice(4, n, p=e.exchanged)
+    whole, reach = rng.random(n) < 0.5, float(TIMES.max()) + 0.2
+    middle, half = rng.uniform(-reach, reach, n), rng.exponential(e.exchange_time, n)
+    for number, group in ((1, np.ones(len(LANDMARKS), np.bool_)), (2, ARMS), (3, OF_LEGS)):
+        rows = np.flatnonzero(kind == number)
+        order = np.where(group, SIDES, np.arange(len(LANDMARKS)))
+        on = whole[rows, None] | (np.abs(times[rows] - middle[rows, None]) < half[rows, None])
+        rays[rows] = np.where(on[..., None, None], rays[rows][:, :, order], rays[rows])
+        confidences[rows] = np.where(
+            on[..., None], confidences[rows][:, :, order], confidences[rows]
+        )
