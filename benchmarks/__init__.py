@@ -48,9 +48,9 @@ PARTS = {
 
 
 def benchmark(name: str) -> ModuleType:
-    """The module of a benchmark: `main` runs it, `measure` measures, `as_text` tells of that.
+    """The module of a benchmark, or of a part, which has no `main`.
 
-    That of a part has no `main`.
+    `main` runs the benchmark, `measure` returns its result, `as_text` makes tables of a result.
     """
     # Before numpy is imported: with small matrices a second BLAS thread costs more than it brings.
     for library in ('OMP', 'OPENBLAS', 'MKL'):

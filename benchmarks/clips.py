@@ -196,7 +196,7 @@ def read_messages(
 
 
 def read_clip(folder: Path, frames: int | None = None) -> Clip:
-    """Reads a clip, or its first frames: a bag or, where there is none, a video with its camera.
+    """Reads a clip, or its first frames, from a bag, or from a video with its camera.
 
     Raises:
         ValueError: files that can not be read, or that do not fit each other.

@@ -15,8 +15,9 @@ no experts, no depths  keypoints without the experts; without the detector's own
 The floor is our body at the poses that come nearest to the truth: with its true lengths, and with
 those that a track begins with. It is what definitions of joints, and lengths, leave.
 
-Errors are relative to the pelvis, to the middle of the hips where there is none, and to that of the
-shoulders where no hips are known; along the line of sight of each true joint, and across it.
+Errors are relative to the pelvis; where the truth has no pelvis, to the middle of the hips; where
+it has no hips, to the middle of the shoulders. They are split along the line of sight of each true
+joint and across it.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from numpy.typing import NDArray
 
 from benchmarks.clips import Clip, read_clip, read_detections, table, with_file
 from benchmarks.machine import description
+from benchmarks.real_clips import BEAM, DESKS
 from benchmarks.runs import (
     BOTH,
     GIVEN,
@@ -47,6 +49,7 @@ from benchmarks.runs import (
     name_of,
     stepped,
 )  # fmt: skip
+from benchmarks.tracking_means import CHOSEN
 from benchmarks.truth_fits import SHOULDERS, best_poses, with_true_lengths
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.kinematics import forward
@@ -64,8 +67,7 @@ from hmt_ros.tracking.initialisation import start_from_keypoints
 
 Array = NDArray[np.float64]
 
-REAL = ('balance', 'desk_1', 'desk_3')
-CHOSEN = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'follow')
+REAL = (BEAM, *DESKS)
 OTHERS = ('dab', 'drill', 'laugh', 'orbit', 'traffic', 'turns', 'window')
 GROUPS = {'Real clips': REAL, 'Clips C': CHOSEN, 'Clips O': OTHERS}
 INPUTS = (BOTH, KEYPOINTS)
@@ -106,7 +108,7 @@ class Given:
 
 
 class ToldTracker(Tracker):
-    """A tracker that is told depths."""
+    """A tracker that takes given depths instead of the experts'."""
 
     told: Mapping[int, LiftedPoses] | None = None
 
@@ -480,11 +482,6 @@ def _mean_of(scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
     numbers = {x: float(np.mean([one[x] for one in scores])) for x in SCORES}
     return {**numbers, 'images': scores[0]['images'], 'by_joint': joints}
-
-
-def _seeds_of(inputs: str, seeds: Sequence[int]) -> Sequence[int]:
-    """Keypoints alone draw nothing at random."""
-    return seeds[:1] if inputs == KEYPOINTS else seeds
 
 
 def _kept(one: OracleRun) -> dict[str, dict[str, Any]]:

@@ -4,8 +4,8 @@
 
 The name of a node, such as filter_node, writes the table of its parameters in NAME.md, between
 `<!-- begin NAME -->` and `<!-- end -->`, and hmt_ros/config/NAME.yaml. The name of a benchmark, or
-of a part that has a page, runs it and writes benchmarks/results/NAME.md (minutes; soak ten,
-tracking and oracles thirty or more).
+of a part that has a page, runs it and writes benchmarks/results/NAME.md (minutes; live, oracles,
+soak and tracking about ten).
 """
 
 from __future__ import annotations

@@ -137,6 +137,8 @@ class PoseEnergy:
         point: (d,) values of all variables; None: all are free.
         free: (f,) variables that may move, where there is a point.
         counted: called with the number of poses that were evaluated; None: not called.
+        _own: terms with a kernel here, without the motion.
+        _strange: terms without one.
 
     Raises:
         ValueError: two terms of one kind that has a kernel.
@@ -148,17 +150,14 @@ class PoseEnergy:
     point: Array | None = None
     free: Index | None = None
     counted: Callable[[int], None] | None = None
-    _sum: tuple[Compiled, tuple[FrameTerm, ...]] = field(init=False, repr=False)
+    _own: Compiled = field(init=False, repr=False)
+    _strange: tuple[FrameTerm, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         own = tuple(x for x in self.terms if type(x) in KINDS)
         others = tuple(cast(FrameTerm, x) for x in self.terms if type(x) not in KINDS)
-        object.__setattr__(self, '_sum', (_summed(self.likelihood, own), others))
-
-    @property
-    def _strange(self) -> tuple[FrameTerm, ...]:
-        """Terms without a kernel here."""
-        return self._sum[1]
+        object.__setattr__(self, '_own', _summed(self.likelihood, own))
+        object.__setattr__(self, '_strange', others)
 
     def energy(
         self,
@@ -331,7 +330,7 @@ class PoseEnergy:
     @cached_property
     def _compiled(self) -> Compiled:
         """The terms as compiled code reads them; they return their energies alone."""
-        known = self._sum[0]
+        known = self._own
         if self.motion is not None:
             centres, precisions, tails = _expected(self.motion)
             return known._replace(centres=centres, precisions=precisions, tails=tails)

@@ -10,9 +10,10 @@ its own, however far away it is, and is absorbed by the one nearest in time. Whe
 is a span before the first. Spans without an image do not count; where a window is shorter than a
 moment the mean is over the window.
 
-A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each, of those
-within reach of the heaviest: a mean over opposite poses is no pose. b is the share by which the
-image tells changes (`CueErrors.of_changes`). What the modes disagree by is in R.
+A motion's modes in an image are one Gaussian (2), r_k the share of its paths through each. Modes
+far from the heaviest one are left out, because nobody holds the mean of two opposite poses. b is
+the share by which the image tells changes (`CueErrors.of_changes`). What the modes disagree by is
+in R.
 """
 
 from __future__ import annotations

@@ -10,9 +10,9 @@ trembles less than each of them. By reweighted least squares, from the weighted 
     s_kj = w_k / max(|p_j - p_kj|, e),   S_j = sum_k s_kj,   t_j = sum_k s_kj p_kj / S_j         (2)
     x <- x + (sum_j S_j (P_j' P_j + l^2))^-1 sum_j S_j P_j' (t_j - p_j),   P_j = dp_j / dx       (3)
 
-The place of the pelvis is the weighted mean, and so is whatever moves no joint. A mean over poses
-that face opposite ways is no pose. Nothing is remembered of other images: modes are filtered, and
-whoever filters them again lags behind.
+The place of the pelvis is the weighted mean, and so is whatever moves no joint. Modes that face the
+other way are left out, because nobody holds the mean of two opposite poses. Other images have no
+part in it: the modes are filtered, and a second filter would lag.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 STEPS = 2
 # Distance e of joints below which modes agree, m: they tremble by as much. Chosen.
 AGREED = 0.03
-# Lever l of a joint below which it does not tell of a degree of freedom, m. Chosen.
+# Lever l of the joints about an axis, m, below which its angle stays that of the mean. Chosen.
 LEVER = 0.01
 
 
