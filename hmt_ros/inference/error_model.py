@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from types import MappingProxyType
 
 from hmt_ros.core import elementary
@@ -29,8 +28,6 @@ def seconds(nanoseconds: int) -> float:
     return 1e-9 * nanoseconds
 
 
-# Many shares are asked for at the same time.
-@lru_cache(maxsize=64)
 def share_of_time(dt: float, tau: float) -> float:
     """The share a(dt) of an independent measurement that a measurement counts for.
 

@@ -10,7 +10,7 @@ q_10). Time can be divided at will, so that no result counts images.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,7 +57,6 @@ class MarkovChain:
         """Rate at which two states forget which one it was, 1/s."""
         return float(self.rates[0, 1] + self.rates[1, 0])
 
-    @lru_cache(maxsize=64)  # noqa: B019 - chains are few, and images often come at equal times
     def transition(self, dt: float) -> Array:
         """Probabilities (n, n) of state j a time dt, s, after state i."""
         if len(self.rates) == 2:
