@@ -46,6 +46,8 @@ class WindowSettings:
         borders: the lower border of such an image, tangent of the angle below the axis.
         recombined: share of windows with the trunk and the arms of another motion; in half of them
             the arms are of a third one.
+        asynchronous: share of windows whose legs, trunk and arms are at different times, of one
+            motion as well.
         seated: share of windows of people who sit.
         moving, speed: share of cameras that move, and their speed, m/s.
         rates: images a second, drawn evenly on a logarithmic scale.
@@ -67,6 +69,7 @@ class WindowSettings:
     near: float = 0.2
     borders: tuple[float, float] = (0.3, 0.7)
     recombined: float = 0.4
+    asynchronous: float = 1.0
     seated: float = 0.08
     moving: float = 0.2
     speed: float = 0.5
@@ -100,7 +103,7 @@ def training_windows(
     s = settings or WindowSettings()
     n, f32 = count, np.float32
     which = _drawn_tracks(tracks, n, rng, s)
-    now = (_drawn_shares(which, rng) * tracks.counts[which]).astype(np.intp)
+    now = (_drawn_shares(which, rng, s) * tracks.counts[which]).astype(np.intp)
     times, there, rows, part = _images(now, tracks.counts[which], rng, s)
     base, first = tracks.starts[which][:, :, None] + rows, tracks.starts[which] + now
     joints = assembled(tracks, tracks.joints, JOINTS, first[..., None])[:, 0]
@@ -164,11 +167,12 @@ def _drawn_tracks(
     return np.stack([legs, trunk, np.where((sits | other) & third, arms, trunk)])
 
 
-def _drawn_shares(which: Index, rng: np.random.Generator) -> Array:
-    """How far tracks (3, N) are over; parts of one track are at one time."""
+def _drawn_shares(which: Index, rng: np.random.Generator, s: WindowSettings) -> Array:
+    """How far tracks (3, N) are over."""
     result: Array = rng.random(which.shape)
+    together = rng.random(which.shape[1]) >= s.asynchronous
     for part in (1, 2):
-        same = which[part] == which[part - 1]
+        same = together & (which[part] == which[part - 1])
         result[part, same] = result[part - 1, same]
     return result
 

@@ -174,6 +174,7 @@ def scores_on(
         lengths=1.0,
         near=0.0,
         recombined=0.0,
+        asynchronous=0.0,
         seated=0.0,
     )
     kinds = {

@@ -365,8 +365,11 @@ def test_a_person_of_three_tracks_holds_together():
     np.testing.assert_allclose(own[:, JOINTS.index('left_knee')], made['left_knee'], atol=1e-6)
 
 
-def test_parts_of_one_track_are_at_one_time():
-    plain = WindowSettings(noise=0.0, near=0.0, recombined=0.0, seated=0.0)
+@pytest.mark.parametrize('asynchronous', [0.0, 1.0])
+def test_parts_of_one_track_are_at_one_time_or_not(asynchronous):
+    plain = WindowSettings(
+        noise=0.0, near=0.0, recombined=0.0, seated=0.0, asynchronous=asynchronous
+    )
     one = keypoint_tracks(BODY, [procedural_sequence('walk', BODY, 2.0, 0)], [1.0], variants=1)
     _, joints = training_windows(one, 60, np.random.default_rng(0), plain, 0)
     poses = procedural_sequence('walk', BODY, 2.0, 0).poses
@@ -376,7 +379,8 @@ def test_parts_of_one_track_are_at_one_time():
         return np.linalg.norm(places[:, :, None] - places[:, None], axis=3)
 
     apart = np.abs(distances(joints)[:, None] - distances(recorded)).max((2, 3))
-    assert apart.min(1).max() < 1e-4
+    at_one_time = apart.min(1) < 1e-4
+    assert at_one_time.all() if asynchronous == 0 else at_one_time.mean() < 0.2
 
 
 def test_arms_within_the_trunk_meet():
