@@ -26,8 +26,9 @@ from benchmarks.machine import description
 from benchmarks.truth_fits import CLIPS, QUICK, QUICK_IMAGES, best_poses, fitted
 from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
+from hmt_ros.body.skeleton import other_side
 from hmt_ros.experts.lifter import lifted_positions
-from hmt_ros.image.keypoint_schemes import MIRROR, schemes
+from hmt_ros.image.keypoint_schemes import MIRROR, noise_of, schemes
 from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.image.terms.keypoints import EXCHANGED, Keypoints, KeypointTerm
 
@@ -37,6 +38,12 @@ Array = NDArray[np.float64]
 KERNEL, ITERATIONS = 0.06, 30
 # Bins of the confidence, and of the number of images from one deviation to another.
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0001)
+# Bins of the distance from the landmark of the other side, m, and the landmarks of limbs.
+APART = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, np.inf)
+LIMBS = {
+    'arms': ('elbow', 'wrist', 'pinky', 'index', 'thumb'),
+    'legs': ('knee', 'ankle', 'heel', 'foot_index'),
+}
 IMAGES_APART = (1, 2, 5, 10, 20)
 # Deviations count up to this in correlations, m.
 FURTHEST = 0.1
@@ -57,6 +64,7 @@ class Seen:
         errors: (M, 2) pixel less that of the joint, over the magnification, m.
         confidences: (M,).
         images: (M,) numbers, increasing.
+        apart: (M,) from the landmark of the other side, m on the person; NaN: there is none.
     """
 
     name: str
@@ -64,6 +72,7 @@ class Seen:
     errors: Array
     confidences: Array
     images: NDArray[np.intp]
+    apart: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +147,9 @@ def _landmarks(
         by_offset = np.einsum('abn,ncb->nac', projection, columns[:, segment])
         left = name.startswith('left_')
         by_offset = by_offset * (MIRROR if left else 1.0)
+        other = other_side(name)
+        apart = np.linalg.norm(pixels - raw[0][other], axis=1) if other != name else np.nan
+        apart = apart / magnification
         errors = pixels - centre.T
         use = np.flatnonzero(np.isfinite(errors).all(1) & (exchanges == 0))
         scale = magnification[use, None]
@@ -148,6 +160,7 @@ def _landmarks(
                 errors[use] / scale,
                 confidences[use],
                 use,
+                apart[use],
             )
         )
     return result
@@ -217,7 +230,7 @@ def correlation(errors: Sequence[Array], images: Sequence[NDArray[np.intp]], apa
 def summary(found: Sequence[Clips]) -> dict[str, Any]:
     """Offsets, deviations, correlations, depths and exchanges of clips."""
     every = [seen for clip in found for seen in clip.seen]
-    landmarks, left, confidences, images = {}, [], [], []
+    landmarks, left, ordered, names = {}, [], [], []
     for name in dict.fromkeys(seen.name for seen in every):
         own = [seen for seen in every if seen.name == name]
         by_offset, errors = (
@@ -226,26 +239,21 @@ def summary(found: Sequence[Clips]) -> dict[str, Any]:
         offset = robust_offset(by_offset, errors)
         rest = [x.errors - x.by_offset @ offset for x in own]
         left += rest
-        confidences += [x.confidences for x in own]
-        images += [x.images for x in own]
+        ordered += own
+        names += [name] * len(own)
         landmarks[name.removeprefix('right_')] = {
             'offset': offset.tolist(),
             'before': robust_sigma(errors),
             'after': robust_sigma(np.concatenate(rest)),
         }
-    whole, sure = np.concatenate(left), np.concatenate(confidences)
-    bins = []
-    for low, high in pairwise(BINS):
-        inside = whole[(sure >= low) & (sure < high)]
-        if len(inside) >= FEWEST:
-            bins.append(
-                {
-                    'confidence': [low, min(high, 1.0)],
-                    'points': len(inside),
-                    'median': robust_sigma(inside),
-                    'rms': float(np.sqrt((inside**2).mean())),
-                }
-            )
+    whole, sure = np.concatenate(left), np.concatenate([x.confidences for x in ordered])
+    kinds = [name.removeprefix('right_') for name, x in zip(names, left, strict=True) for _ in x]
+    apart = np.concatenate([seen.apart for seen in ordered])
+    pairs = {
+        limb: _by_bin((whole / noise_of(sure)[:, None])[rows], apart[rows], APART)
+        for limb, marks in LIMBS.items()
+        for rows in [np.isin(kinds, marks)]
+    }
     depths: dict[str, list[float]] = {}
     for clip in found:
         for name, error in clip.depths:
@@ -254,10 +262,11 @@ def summary(found: Sequence[Clips]) -> dict[str, Any]:
     for clip in found:
         for kinds in clip.exchanges:
             np.add.at(moves, (kinds[:-1], kinds[1:]), 1.0)
-    correlations = {str(n): correlation(left, images, n) for n in IMAGES_APART}
+    correlations = {str(n): correlation(left, [x.images for x in ordered], n) for n in IMAGES_APART}
     return {
         'landmarks': landmarks,
-        'noise': bins,
+        'noise': _by_bin(whole, sure, BINS),
+        'pairs': pairs,
         'correlations': correlations,
         'lasting': lasting_shares(correlations),
         'depths': {name: float(np.median(np.abs(x)) / MEDIAN) for name, x in depths.items()},
@@ -269,6 +278,19 @@ def summary(found: Sequence[Clips]) -> dict[str, Any]:
             for name, row in zip(KINDS, moves, strict=True)
         },
     }
+
+
+def _by_bin(errors: Array, by: Array, bins: Sequence[float]) -> list[dict[str, Any]]:
+    """Deviations of errors (M, 2) by the bins of another number (M,)."""
+    result = []
+    for low, high in pairwise(bins):
+        inside = errors[(by >= low) & (by < high)]
+        if len(inside) >= FEWEST:
+            result.append({
+                'from': low, 'to': high, 'points': len(inside), 'median': robust_sigma(inside),
+                'rms': float(np.sqrt((inside**2).mean())),
+            })  # fmt: skip
+    return result
 
 
 def lasting_shares(correlations: dict[str, float]) -> dict[str, float]:
@@ -319,16 +341,23 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     def mm(value: float) -> str:
         return f'{1e3 * value:.0f}'
 
+    def bin_cells(x: dict[str, Any], unit: float, form: str) -> list[str]:
+        ends = f' to {min(x["to"], 1):g}' if np.isfinite(x['to']) else ' or more'
+        numbers = (format(unit * x[name], form) for name in ('median', 'rms'))
+        return [f'{x["from"]:g}{ends}', str(x['points']), *numbers]
+
     landmarks = [['landmark', 'offset x, y, z, mm', 'error at the joint, mm', 'at the offset, mm']]
     landmarks += [
         [name, ', '.join(map(mm, row['offset'])), mm(row['before']), mm(row['after'])]
         for name, row in result['landmarks'].items()
     ]
-    noise = [['confidence', 'keypoints', 'deviation by the median, mm', 'rms, mm']]
-    noise += [
-        [f'{low:g} to {high:g}', str(x['points']), mm(x['median']), mm(x['rms'])]
-        for x in result['noise']
-        for low, high in [x['confidence']]
+    heads = ['keypoints', 'deviation by the median', 'rms']
+    noise = [['confidence', heads[0], *(f'{x}, mm' for x in heads[1:])]]
+    noise += [bin_cells(x, 1e3, '.0f') for x in result['noise']]
+    pairs = [
+        [[f'{limb}: m from the other side', heads[0], *(f'{x}, of the usual' for x in heads[1:])]]
+        + [bin_cells(x, 1.0, '.1f') for x in rows]
+        for limb, rows in result['pairs'].items()
     ]
     lasting = [['images apart', *result['correlations']]]
     lasting += [['correlation', *(f'{x:.2f}' for x in result['correlations'].values())]]
@@ -341,7 +370,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         [name, f'{row["share"]:.3f}', *(f'{x:.3f}' for x in row['next'])]
         for name, row in result['exchanges'].items()
     ]
-    parts = (landmarks, noise, lasting, shares, depths, exchanges)
+    parts = (landmarks, noise, *pairs, lasting, shares, depths, exchanges)
     return '\n\n'.join(table(rows, markdown=markdown) for rows in parts)
 
 
