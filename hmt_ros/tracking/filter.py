@@ -224,7 +224,6 @@ class MixtureFilter:
             continuity,
             s.thorough_plan if surprising else s.plan,
             modes,
-            self._by_keypoints.contradicted,
             prediction,
             base,
         )

@@ -44,7 +44,6 @@ class Search:
         continuity: with the modes of the image before.
         plan: allocation of the evaluations of the image.
         modes: of the image before.
-        contradicted: whether these missed more than a quarter of the keypoints there.
         prediction: pose hypotheses from an external predictor, if any.
         base: optima of the image, one for each mode.
     """
@@ -56,7 +55,6 @@ class Search:
     continuity: Continuity
     plan: EvaluationPlan
     modes: Modes
-    contradicted: bool
     prediction: PosePrediction | None
     base: Minimum
 

@@ -40,13 +40,11 @@ class PoseByKeypoints:
 
     Attributes:
         pose: (1, d) of the last image; None: the modes explain every group of keypoints.
-        contradicted: whether the modes missed more than a quarter of the keypoints of that image.
     """
 
     def __init__(self) -> None:
         self.pose: Array | None = None
         self._gain = 0.0
-        self.contradicted = False
 
     def follow(
         self, search: Search, mode: Array, term: KeypointTerm, missed: Misfit
@@ -62,8 +60,7 @@ class PoseByKeypoints:
         Returns:
             Misfit and gain of the pose by keypoints; None: the modes explain enough keypoints.
         """
-        self.contradicted = missed.share > UNDECIDED[KEYPOINTS]
-        if not (missed.shares[missed.counts > 0] > UNDECIDED[KEYPOINTS]).any():
+        if not _misses_a_group(missed):
             self.pose = None
             return None
         pose = _by_keypoints(search, self.pose)
@@ -71,7 +68,7 @@ class PoseByKeypoints:
             both = search.posterior.body.joint_positions(np.stack([pose[0], mode]))
             self._gain = float(np.subtract(*search.continuity.rated(both)))
         self.pose = pose
-        if not self.contradicted:
+        if missed.share <= UNDECIDED[KEYPOINTS]:
             return None
         gain, self._gain = self._gain, 0.0
         return ByKeypoints(of_keypoints(term, pose), gain)
@@ -90,9 +87,14 @@ def predicted_poses(search: Search, sources: Hypotheses, _rng: np.random.Generat
 def keypoint_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
     """The pose to which keypoints alone would move the heaviest mode.
 
-    There is one where the modes missed more than a quarter of the keypoints of the image before.
+    There is one where the mode went to where it misses more than a quarter of the keypoints of a
+    group: a silhouette holds limbs that have moved far since the image before.
     """
-    if not search.contradicted or search.posterior.placing(search.observation) is None:
+    posterior, observation = search.posterior, search.observation
+    if posterior.placing(observation) is None:
+        return sources[:0]
+    term = posterior.likelihood.keypoint_term(observation, None)
+    if not _misses_a_group(of_keypoints(term, search.base.x[:1])):
         return sources[:0]
     pose = _by_keypoints(search, None)
     first = np.zeros(1, dtype=np.intp)
@@ -109,6 +111,10 @@ def reversed_poses(search: Search, sources: Hypotheses, _rng: np.random.Generato
     term = search.posterior.of_image(search.observation)
     moved = search.posterior.minimise(term, turned, REVERSAL_ITERATIONS).x
     return sources.proposed(best, moved, np.ones(moved.shape, dtype=np.bool_))
+
+
+def _misses_a_group(missed: Misfit) -> bool:
+    return bool((missed.shares[missed.counts > 0] > UNDECIDED[KEYPOINTS]).any())
 
 
 def _by_keypoints(search: Search, before: Array | None) -> Array:
