@@ -40,6 +40,7 @@ from hmt_ros.tracking.hypotheses import (
     Modes,
     Optimised,
     PosePrediction,
+    joined,
     new_hypotheses,
 )
 from hmt_ros.tracking.initialisation import Start
@@ -56,7 +57,7 @@ from hmt_ros.tracking.optimisation import Search, is_surprising
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
 from hmt_ros.tracking.proposals import proposals_of, propose
-from hmt_ros.tracking.proposals.whole_poses import PoseByKeypoints
+from hmt_ros.tracking.proposals.whole_poses import PoseByKeypoints, keypoint_poses
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import FIRST_SHAPE_FITS, POSTURE_BITS, SHAPE_MODES, TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
@@ -227,6 +228,10 @@ class MixtureFilter:
             prediction,
             base,
         )
+        placed = keypoint_poses(search, predicted)
+        if len(placed.poses):
+            base = base.joined(search.optimise(placed).minima)
+            search, predicted = replace(search, base=base), joined([predicted, placed])
         candidates = propose(self._proposals, search, predicted, self._rng)
         # Every mode goes on, whatever else is proposed.
         found = search.optimise(candidates).joined(Optimised(predicted, base))

@@ -12,7 +12,7 @@ from hmt_ros.tracking.hypotheses import Hypotheses, joined
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.proposals.kinematic_jumps import jumped_poses
 from hmt_ros.tracking.proposals.sampling import covariance_scaled_poses, spherical_poses
-from hmt_ros.tracking.proposals.whole_poses import keypoint_poses, predicted_poses, reversed_poses
+from hmt_ros.tracking.proposals.whole_poses import predicted_poses, reversed_poses
 
 
 class Proposal(Protocol):
@@ -33,7 +33,7 @@ class Proposal(Protocol):
 
 # Of every tracker, before the one that the setting `proposals` selects by its name. Each decides by
 # itself whether it applies to an image. A new proposal is a file beside this one and a name here.
-USUAL: tuple[Proposal, ...] = (predicted_poses, keypoint_poses, reversed_poses)
+USUAL: tuple[Proposal, ...] = (predicted_poses, reversed_poses)
 SELECTED: Mapping[str, Proposal] = MappingProxyType(
     {'kjs': jumped_poses, 'css': covariance_scaled_poses, 'ss': spherical_poses}
 )

@@ -84,7 +84,7 @@ def predicted_poses(search: Search, sources: Hypotheses, _rng: np.random.Generat
     return sources.proposed(nearest, poses, np.ones(poses.shape, dtype=np.bool_))
 
 
-def keypoint_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
+def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
     """The pose to which keypoints alone would move the heaviest mode.
 
     There is one where the mode went to where it misses more than a quarter of the keypoints of a
@@ -103,7 +103,7 @@ def keypoint_poses(search: Search, sources: Hypotheses, _rng: np.random.Generato
 
 def reversed_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
     """The reversal of the best mode where a way to face is lost."""
-    log_weights = search.base_rated
+    log_weights = search.base_rated[: len(search.modes.back)]
     if not lost_a_facing(search.modes.back, log_weights):
         return sources[:0]
     best = np.argsort(-log_weights, kind='stable')[:1]
