@@ -31,7 +31,7 @@ from hmt_ros.tracking.classes import lost_a_facing
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.misfit import KEYPOINTS, Misfit, of_keypoints
 from hmt_ros.tracking.optimisation import Search
-from hmt_ros.tracking.settings import REVERSAL_ITERATIONS
+from hmt_ros.tracking.settings import BODY_REACH, BODY_SPEED, REVERSAL_ITERATIONS
 from hmt_ros.tracking.validity import UNDECIDED, ByKeypoints
 
 
@@ -88,7 +88,8 @@ def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
     """The pose to which keypoints alone would move the heaviest mode.
 
     There is one where the mode went to where it misses more than a quarter of the keypoints of a
-    group: a silhouette holds limbs that have moved far since the image before.
+    group: a silhouette holds limbs that have moved far since the image before. None is further than
+    a person gets meanwhile: keypoints there are those of another, or the track is lost.
     """
     posterior, observation = search.posterior, search.observation
     if posterior.placing(observation) is None:
@@ -97,6 +98,9 @@ def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
     if not _misses_a_group(of_keypoints(term, search.base.x[:1])):
         return sources[:0]
     pose = _by_keypoints(search, None)
+    moved = np.linalg.norm(pose[:, :3] - search.continuity.predicted[:1, :3], axis=1)
+    if moved[0] > BODY_REACH + BODY_SPEED * search.dt:
+        return sources[:0]
     first = np.zeros(1, dtype=np.intp)
     return sources.proposed(first, pose, np.zeros(pose.shape, dtype=np.bool_), expected=pose)
 
