@@ -26,7 +26,7 @@ from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.body import load_body
-from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
+from hmt_ros.detectors.registry import surest_detector
 from hmt_ros.sessions.focal_length import USUAL_FOV, USUAL_SIGMA
 from msg_tools.files.new_folder import new_file
 
@@ -41,7 +41,8 @@ DIR gets
   tracked/            the bag that replay writes, see replay --help
   report/report.html  the page that report writes, for a browser
 
-Without --keypoints MediaPipe Pose finds them, where install-detector has been run. Without --fov or
+Without --keypoints MediaPipe Pose finds them, with MoveNet if it is there, where install-detector
+has been run. Without --fov or
 --camera the field of view is taken from the metadata of the video, or assumed; the error that this
 may make is in all published depths. Without --level or --gravity lines of the scene show the tilt
 of the camera where they can; an unknown tilt is taken for a lean of the person.
@@ -107,8 +108,7 @@ def _track(arguments: argparse.Namespace) -> int:
             say(text)
 
     if arguments.keypoints is None and arguments.detector is None and not arguments.no_detector:
-        usual = DETECTORS[USUAL_DETECTOR]
-        arguments.detector = USUAL_DETECTOR if usual.is_installed() else None
+        arguments.detector = surest_detector()
     with_keypoints = arguments.keypoints is not None or arguments.detector is not None
     if stature is not None and not with_keypoints:
         raise ValueError(

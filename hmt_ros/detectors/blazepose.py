@@ -15,15 +15,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.core import elementary
 from hmt_ros.detectors import blazepose_models
 from hmt_ros.detectors.detector import DetectorKind
+from hmt_ros.detectors.square import Square, sigmoid
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
@@ -42,8 +42,6 @@ _PERSON_SIZE, _LANDMARK_SIZE, _HEAT_SIZE = 224, 256, 64
 _STRIDES, _PREDICTIONS, _SAME = (8, 16, 32), (2, 2, 6), 0.3
 # Probability from which somebody is there, and from which a pixel belongs to them.
 _SEEN = 0.5
-# The square's side over the circle's diameter.
-_MARGIN = 1.25
 # Half the side of the window of a heat map about its landmark; its least peak.
 _HEAT_REACH, _HEAT_PEAK = 4, 0.5
 # Cutoffs f_0 of the one-euro filters, Hz, and factors b on velocities, which raise them.
@@ -52,7 +50,6 @@ _LANDMARK_CUTOFF, _CIRCLE_CUTOFF, _POSITION_CUTOFF = (0.05, 80.0), (0.01, 10.0),
 # The share of an image in the smoothed visibility.
 _NEW_VISIBILITY = 0.1
 
-_Float = TypeVar('_Float', np.float32, np.float64)
 _Tensor = NDArray[np.float32]
 
 
@@ -99,7 +96,7 @@ class BlazePose:
             self._followed = None
         self._newest, self._size = stamp_ns, image.shape[:2]
         circle = self._circle(image) if self._followed is None else self._followed.circle
-        found = None if circle is None else self._landmarks_in(image, _Square.about(circle))
+        found = None if circle is None else self._landmarks_in(image, Square.about(circle))
         if found is None:
             self._followed = None
             if self._with_mask:
@@ -109,7 +106,7 @@ class BlazePose:
             self._followed = _Followed()
         pixels, confidences, positions = self._followed.smooth(found, interval * 1e-9)
         if self._with_mask:
-            self.mask = found.square.spread(_sigmoid(found.mask), self._size) >= _SEEN
+            self.mask = found.square.spread(sigmoid(found.mask), self._size) >= _SEEN
         # The network counts from the edge of the first pixel.
         return Keypoints(
             self._names, pixels - 0.5, np.full((LANDMARKS, 2, 2), np.nan), confidences, positions
@@ -119,10 +116,10 @@ class BlazePose:
         """Centre and a point (2, 2) of the circle about the most certain person."""
         height, width = image.shape[:2]
         side = max(height, width)
-        square = _Square((width / 2, height / 2), side, 0.0)
+        square = Square((width / 2, height / 2), side, 0.0)
         seen = square.seen(image, _PERSON_SIZE, cv2.BORDER_CONSTANT)
         boxes, logits = self._person(seen * np.float32(2 / 255) - np.float32(1))
-        scores = _sigmoid(logits[:, 0].astype(np.float64))
+        scores = sigmoid(logits[:, 0].astype(np.float64))
         chosen = np.flatnonzero(scores >= _SEEN)
         if not len(chosen):
             return None
@@ -140,7 +137,7 @@ class BlazePose:
         result: Array = square.corner + middle * side
         return result
 
-    def _landmarks_in(self, image: Image, square: _Square) -> _Found | None:
+    def _landmarks_in(self, image: Image, square: Square) -> _Found | None:
         if square.side < 1.0:
             return None
         seen = square.seen(image, _LANDMARK_SIZE, cv2.BORDER_REPLICATE)
@@ -154,7 +151,7 @@ class BlazePose:
         return _Found(
             square,
             square.corner + product(square.side * points, square.axes),
-            _sigmoid(rows[:LANDMARKS, 3]),
+            sigmoid(rows[:LANDMARKS, 3]),
             positions,
             mask[..., 0],
         )
@@ -163,48 +160,6 @@ class BlazePose:
 MEDIAPIPE = DetectorKind(
     'MediaPipe Pose', BlazePose, blazepose_models.is_installed, blazepose_models.install
 )
-
-
-@dataclass(frozen=True, eq=False)
-class _Square:
-    """A square of the image: its centre, px, side, px, and the angle of its turn, radians."""
-
-    centre: tuple[float, float]
-    side: float
-    angle: float
-
-    @classmethod
-    def about(cls, circle: Array) -> _Square:
-        """The square about a circle, with the circle's point above the centre."""
-        centre, (along, down) = circle[0], circle[1] - circle[0]
-        side = 2 * _MARGIN * math.hypot(along, down)
-        return cls((centre[0], centre[1]), side, float(elementary.arctan2(along, -down)))
-
-    @property
-    def axes(self) -> Array:
-        """(2, 2) directions to the right and down in the square."""
-        c, s = float(elementary.cos(self.angle)), float(elementary.sin(self.angle))
-        return np.array([[c, s], [-s, c]])
-
-    @property
-    def corner(self) -> Array:
-        """(2,) of the upper left, px."""
-        result: Array = self.centre - self.axes.sum(axis=0) * (self.side / 2)
-        return result
-
-    def seen(self, image: Image, size: int, border: int) -> Image:
-        """The image in the square, (size, size, 3) RGB."""
-        matrix = np.column_stack([self.axes.T * (self.side / size), self.corner])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        result = cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=border)
-        return np.asarray(result[..., ::-1], np.uint8)
-
-    def spread(self, values: _Tensor, size: tuple[int, int]) -> _Tensor:
-        """An image of `size`, (H, W), with the values (n, n) of the square in its place."""
-        to_square = self.axes * (len(values) / self.side)
-        matrix = np.column_stack([to_square, product(-to_square, self.corner)])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return np.asarray(cv2.warpAffine(values, matrix, size[::-1], flags=flags), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +174,7 @@ class _Found:
         mask: (256, 256) logits of the person in the square.
     """
 
-    square: _Square
+    square: Square
     points: Array
     visibilities: Array
     positions: Array
@@ -315,7 +270,7 @@ def _refined(points: Array, heat: _Tensor) -> Array:
     about = cells[..., None] + np.arange(-_HEAT_REACH, _HEAT_REACH + 1)
     inside = (about >= 0) & (about < _HEAT_SIZE)
     column, row = about.clip(0, _HEAT_SIZE - 1).swapaxes(0, 1)
-    window = _sigmoid(heat[row[:, :, None], column[:, None], np.arange(len(points))[:, None, None]])
+    window = sigmoid(heat[row[:, :, None], column[:, None], np.arange(len(points))[:, None, None]])
     window = window * (inside[:, 1, :, None] & inside[:, 0, None])
     profiles = np.stack([window.sum(axis=1), window.sum(axis=2)], axis=1)
     mass = np.maximum(profiles.sum(axis=2), np.finfo(np.float32).tiny)
@@ -325,9 +280,3 @@ def _refined(points: Array, heat: _Tensor) -> Array:
 
 def _weight(cutoff: Array | float, interval: float) -> Array | float:
     return 1 / (1 + 1 / (2 * math.pi * interval * cutoff))
-
-
-def _sigmoid(x: NDArray[_Float]) -> NDArray[_Float]:
-    # Logits are clipped where exp would overflow.
-    result: NDArray[_Float] = 1 / (1 + elementary.exp(-x.clip(-80, 80)))
-    return result

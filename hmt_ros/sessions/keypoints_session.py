@@ -41,7 +41,8 @@ class KeypointsParameters(ImageNodeParameters):
     """All parameters of the keypoints node.
 
     Attributes:
-        detector: Detector of keypoints; 'mediapipe' is MediaPipe Pose.
+        detector: Detector of keypoints; 'mediapipe' is MediaPipe Pose, 'mediapipe+movenet' asks
+            MoveNet Thunder as well, at three times the cost.
         publish_mask: If true, the node also publishes the mask of the person.
     """
 

@@ -74,9 +74,10 @@ def keypoints_of(message: Any, sigma_px: float = 0.0) -> Keypoints:
     if len(message.covariance):
         covariances = numbers(message.covariance, (n, 2, 2), 'keypoints: covariance').copy()
     found = checked_keypoints(names, pixels, confidences, covariances)
-    if covariances is not None or not sigma_px:
+    if not sigma_px:
         return found
-    return replace(found, covariances=np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)))
+    unknown = np.isnan(found.covariances)
+    return replace(found, covariances=np.where(unknown, sigma_px**2 * np.eye(2), found.covariances))
 
 
 def checked_keypoints(
@@ -88,7 +89,7 @@ def checked_keypoints(
         names: (n,), each once.
         pixels: (n, 2) px; changed in place, like the others.
         confidences: (n,).
-        covariances: (n, 2, 2) px^2; None: unknown.
+        covariances: (n, 2, 2) px^2; NaN: unknown of a keypoint, None: of all.
 
     Raises:
         MessageError: as `keypoints_of`.
@@ -96,7 +97,7 @@ def checked_keypoints(
     seen = (confidences != 0) & ~np.isnan(pixels).all(1) & (pixels != 0).any(1)
     for i in np.flatnonzero(seen):
         _check_point(names[i], pixels[i], confidences[i], FARTHEST_PIXEL, 'px')
-        if covariances is not None:
+        if covariances is not None and not np.isnan(covariances[i]).all():
             check_covariances(covariances[i], f'keypoint {names[i]}')
     pixels[~seen], confidences[~seen] = np.nan, 0.0
     if covariances is None:
@@ -129,10 +130,11 @@ def keypoints_message(
     """hmt_msgs/Keypoints2D of an image with a stamp, in the optical frame of its camera.
 
     Args:
-        keypoints: maybe none: nobody was seen. A message has no covariances if one is unknown, NaN.
+        keypoints: maybe none: nobody was seen. Unknown covariances are NaN; a message has none if
+            all are unknown.
         frame_id: optical frame of the camera.
     """
-    known = bool(np.isfinite(keypoints.covariances).all())
+    known = bool(np.isfinite(keypoints.covariances).any())
     return messages.create(
         KEYPOINTS_2D,
         header=header_message(messages, stamp_ns, frame_id),

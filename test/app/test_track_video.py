@@ -1,6 +1,7 @@
 """track-video: a video in, bags and a report out."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ from hmt_ros.app import main, track_video
 from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import load_body
-from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
+from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.tracking import read_subject
 from test.app.conftest import data_of
 from test.test_docs import ROOT, commands
@@ -20,11 +21,12 @@ from test.test_docs import ROOT, commands
 
 @pytest.fixture(autouse=True)
 def installed(monkeypatch):
-    """Whether the detector is installed; not so, wherever tests run, unless one says so."""
-    answers = [False]
-    usual = replace(DETECTORS[USUAL_DETECTOR], is_installed=lambda: answers[-1])
-    monkeypatch.setitem(DETECTORS, USUAL_DETECTOR, usual)
-    return answers
+    """Names of detectors that are installed; none, wherever tests run, unless one says so."""
+    names: list[str] = []
+    for name, kind in DETECTORS.items():
+        answer = partial(names.__contains__, name)
+        monkeypatch.setitem(DETECTORS, name, replace(kind, is_installed=answer))
+    return names
 
 
 @pytest.fixture
@@ -132,7 +134,7 @@ def test_without_options_the_detector_and_the_usual_lens_are_used(
     walk_video, begun, installed, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    installed.append(True)
+    installed.append('mediapipe')
     assert track_video.main([str(walk_video / 'walk.mp4'), '--quiet']) == 0
     (options,) = begun.imports
     assert options.output == Path('walk_tracked/video')
@@ -144,8 +146,18 @@ def test_without_options_the_detector_and_the_usual_lens_are_used(
     assert capsys.readouterr().err == f'track-video: {note}\n'
 
 
+def test_the_surest_detector_is_used(walk_video, begun, installed, tmp_path):
+    out = ['-o', str(tmp_path / 'out'), '--overwrite']
+    for name in ('mediapipe', 'mediapipe+movenet'):
+        installed.append(name)
+        assert run(walk_video, *out) == 0
+    assert run(walk_video, *out, '--detector', 'mediapipe') == 0
+    used = [options.detector for options in begun.imports]
+    assert used == ['mediapipe', 'mediapipe+movenet', 'mediapipe']
+
+
 def test_what_is_given_is_not_assumed(walk_video, begun, installed, tmp_path, capsys):
-    installed.append(True)
+    installed.append('mediapipe')
     out = ['-o', str(tmp_path / 'out'), '--overwrite']
     assert run(walk_video, *out, *keypoints(walk_video)) == 0
     assert run(walk_video, *out, '--no-detector', '--background', str(ROOT / 'README.md')) == 0

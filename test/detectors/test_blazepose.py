@@ -11,10 +11,10 @@ import pytest
 from hmt_ros.detectors import blazepose
 from hmt_ros.detectors.blazepose import (
     BlazePose,
+    Square,
     _anchors,
     _OneEuroFilter,
     _refined,
-    _Square,
 )
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools import BagReader
@@ -34,7 +34,7 @@ def test_a_square_stands_upright_about_a_circle(degrees):
     angle = math.radians(degrees)
     centre = np.array([100.0, 80.0])
     head = centre + 40 * np.array([math.sin(angle), -math.cos(angle)])
-    square = _Square.about(np.stack([centre, head]))
+    square = Square.about(np.stack([centre, head]))
     assert square.side == pytest.approx(2.5 * 40)
     # The circle's point is above the centre, at 40 of the 50 px to the upper side.
     np.testing.assert_allclose(
@@ -45,7 +45,7 @@ def test_a_square_stands_upright_about_a_circle(degrees):
 def test_a_square_sees_and_spreads():
     rows, columns = np.mgrid[:60, :80]
     image = np.stack([columns, rows, 0 * rows], axis=-1).astype(np.uint8)
-    square = _Square((40.0, 30.0), 32.0, math.pi / 2)
+    square = Square((40.0, 30.0), 32.0, math.pi / 2)
     seen = square.seen(image, 32, cv2.BORDER_CONSTANT)
     # Turned by a quarter: what is right in the square is below in the image; RGB.
     np.testing.assert_array_equal(seen[4, 7], [0, 14 + 7, 56 - 4])
@@ -174,7 +174,7 @@ def test_landmarks_are_keypoints(networks):
     assert np.isnan(found.covariances).all()
     # The mean of both predictions of one person; the network sees 40 px above the image, too.
     offsets = np.array([[0.0, 40.0], [4.0, 0.0]]) / 224
-    square = _Square.about((_anchors()[1000] + offsets) * 320 - [0, 40])
+    square = Square.about((_anchors()[1000] + offsets) * 320 - [0, 40])
     middle = np.array(square.centre)
     expected = square.corner + square.side * np.array([0.25, 0.75]) @ square.axes
     np.testing.assert_allclose(found.pixels[0], expected - 0.5, atol=1e-4)

@@ -54,6 +54,20 @@ def test_what_was_not_seen_has_no_place_and_no_confidence(messages):
     np.testing.assert_array_equal(content.covariances[[0, 1, 2, 5]], np.tile(np.eye(2), (4, 1, 1)))
 
 
+def test_covariances_of_some_may_be_unknown(messages):
+    given = message(messages, covariance=[np.nan] * 8 + [4.0, 1.0, 1.0, 9.0])
+    content = keypoints_of(given)
+    assert np.isnan(content.covariances[0]).all()
+    np.testing.assert_array_equal(content.covariances[2], [[4, 1], [1, 9]])
+    again = keypoints_of(keypoints_message(messages, content, 7, 'camera'))
+    np.testing.assert_array_equal(again.covariances, content.covariances)
+    # Where nothing is known of any, the message has none.
+    nothing = replace(content, covariances=np.full((3, 2, 2), np.nan))
+    assert len(keypoints_message(messages, nothing, 7, 'camera').covariance) == 0
+    assumed = keypoints_of(given, 3.0)
+    np.testing.assert_array_equal(assumed.covariances[[0, 2]], [9 * np.eye(2), [[4, 1], [1, 9]]])
+
+
 @pytest.mark.parametrize(
     ('changes', 'error'),
     [
@@ -79,7 +93,10 @@ def test_what_was_not_seen_has_no_place_and_no_confidence(messages):
         ({'covariance': [0.0] * 12}, r'covariance of keypoint neck is not positive definite'),
         ({'covariance': [1.0, 2.0, 2.0, 1.0] * 3}, r'neck is not positive definite: .* -1$'),
         ({'covariance': [1.0, 0.5, 0.0, 1.0] * 3}, r'covariance of keypoint neck is not symmetric'),
-        ({'covariance': [np.nan] * 12}, r'covariance of keypoint neck has values that are not'),
+        (
+            {'covariance': [np.nan, 0.0, 0.0, 1.0] * 3},
+            r'covariance of keypoint neck has values that are not',
+        ),
     ],
 )
 def test_messages_that_contradict_themselves(messages, changes, error):

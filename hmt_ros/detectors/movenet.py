@@ -1,0 +1,143 @@
+"""MoveNet Thunder beside BlazePose: two detectors of one person in one image.
+
+BlazePose finds the person. MoveNet sees the square about its landmarks, as far as they lie in the
+image, and tells shoulders, elbows, wrists, hips, knees and ankles again. With errors of 10 and 8 px
+that vary over a clip, and correlate by 0.4, the best mean counts MoveNet twice. Where the two
+differ by a vector d, px, the covariance of the mean is s^2 1 + d d' / 4, with the deviation s that
+BlazePose's confidence has. All else is BlazePose's.
+
+MoveNet has four heads of 64 x 64 cells: probabilities of the centre of a person and of the
+landmarks, the way from a centre to the landmarks, and that from the cell of a landmark to it. The
+centre is the cell with the most probability, which counts less at the border. A landmark is in the
+cell with the most probability over its distance from where the centre expects it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.detectors import blazepose_models, movenet_models
+from hmt_ros.detectors.blazepose import BlazePose
+from hmt_ros.detectors.detector import DetectorKind
+from hmt_ros.detectors.movenet_graph import CELLS, HEADS, SIZE, translated
+from hmt_ros.detectors.square import Square, sigmoid
+from hmt_ros.image.keypoint_schemes import noise_of, schemes
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array, Image, Mask
+
+SCHEME = 'coco17'
+# Cells that are added to the distance of a cell from where a landmark is expected.
+_NEAR = 1.8
+# MoveNet's share in the mean; its least score that counts.
+_SHARE, _LEAST_SCORE = 2 / 3, 0.3
+# The first of MoveNet's landmarks that are not of the face.
+_BODY = 5
+
+
+class MoveNet:
+    """The network.
+
+    Raises:
+        DetectorError: it is not installed.
+    """
+
+    def __init__(self) -> None:
+        onnx, self._centres = translated(*movenet_models.require_network())
+        self._network = cv2.dnn.readNetFromONNX(np.frombuffer(onnx, np.uint8))
+
+    def landmarks(self, seen: Image) -> Array:
+        """Landmarks (17, 3) in an image (256, 256, 3) RGB: column, row, in parts of it, score."""
+        scaled = seen.astype(np.float32) * np.float32(2 / 255) - np.float32(1)
+        self._network.setInput(np.ascontiguousarray(scaled.transpose(2, 0, 1)[None]))
+        heat, centre, ways, offsets = (x[0] for x in self._network.forward(HEADS))
+        return chosen(sigmoid(heat), sigmoid(centre[0]) * self._centres, ways, offsets)
+
+
+def chosen(
+    heat: NDArray[np.float32],
+    centre: NDArray[np.float32],
+    ways: NDArray[np.float32],
+    offsets: NDArray[np.float32],
+) -> Array:
+    """Landmarks (n, 3) of the surest person: column, row, in parts of the image, score.
+
+    Args:
+        heat: (n, 64, 64) probabilities of landmarks.
+        centre: (64, 64) weighted probability of a centre.
+        ways: (2 n, 64, 64) rows and columns from a centre to the landmarks, cells.
+        offsets: (2 n, 64, 64) rows and columns from a cell to the landmarks, cells.
+    """
+    at = np.divmod(int(centre.argmax()), CELLS)
+    expected = ways[:, at[0], at[1]].reshape(-1, 2).astype(np.float64) + at
+    cells = np.arange(CELLS)
+    down, along = (cells - expected[..., None]).swapaxes(0, 1)
+    distances = np.sqrt(down[:, :, None] ** 2 + along[:, None] ** 2)
+    likely = (heat / (distances + _NEAR)).reshape(len(heat), -1)
+    rows, columns = np.divmod(likely.argmax(axis=1), CELLS)
+    each = np.arange(len(heat))
+    moved = offsets.reshape(-1, 2, CELLS, CELLS)[each, :, rows, columns]
+    places = (np.stack([columns, rows], axis=1) + moved[:, ::-1]) / CELLS
+    return np.column_stack([places, heat[each, rows, columns]])
+
+
+class BlazePoseAndMoveNet:
+    """BlazePose with MoveNet's opinion; see `BlazePose` for arguments, attributes and errors."""
+
+    def __init__(self, *, with_mask: bool = False) -> None:
+        self.mask: Mask | None = None
+        self._first = BlazePose(with_mask=with_mask)
+        self._second = MoveNet()
+
+    def detect(self, image: Image, stamp_ns: int) -> Keypoints | None:
+        """See `BlazePose.detect`."""
+        found = self._first.detect(image, stamp_ns)
+        self.mask = self._first.mask
+        if found is None:
+            return None
+        last = np.array(image.shape[1::-1]) - 1
+        square = Square.around(found.pixels.clip(0, last))
+        if square.side < 1.0:
+            return found
+        told = self._second.landmarks(square.seen(image, SIZE, cv2.BORDER_REPLICATE))
+        # The network counts from the edge of the first pixel of the square.
+        pixels = square.corner + square.side * (told[:, :2] - 0.5 / SIZE)
+        rows = np.array([found.names.index(name) for name in schemes()[SCHEME].names[_BODY:]])
+        own = found.pixels[rows]
+        inside = (own >= -0.5).all(axis=1) & (own <= last + 0.5).all(axis=1)
+        counted = inside & (told[_BODY:, 2] >= _LEAST_SCORE)
+        return together(found, rows[counted], pixels[_BODY:][counted])
+
+
+def together(found: Keypoints, rows: NDArray[np.intp], pixels: Array) -> Keypoints:
+    """Keypoints with a second detector's opinion of some of them.
+
+    Args:
+        found: of the first detector.
+        rows: (m,) of them that the second found.
+        pixels: (m, 2) where it found them.
+    """
+    apart = pixels - found.pixels[rows]
+    places, covariances = found.pixels.copy(), found.covariances.copy()
+    places[rows] += _SHARE * apart
+    sigma = found.magnification() * noise_of(found.confidences[rows])
+    spread = apart[:, :, None] * apart[:, None] / 4
+    covariances[rows] = sigma[:, None, None] ** 2 * np.eye(2) + spread
+    return replace(found, pixels=places, covariances=covariances)
+
+
+def _is_installed() -> bool:
+    return blazepose_models.is_installed() and movenet_models.FILES.are_there()
+
+
+def _install() -> None:
+    blazepose_models.install()
+    movenet_models.install()
+
+
+WITH_MOVENET = DetectorKind(
+    'MediaPipe Pose with MoveNet Thunder', BlazePoseAndMoveNet, _is_installed, _install
+)

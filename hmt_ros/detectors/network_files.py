@@ -1,0 +1,109 @@
+"""Files of networks, which packages of others carry: taken out of their archives, by their SHA-256.
+
+They lie in a folder of share/hmt_ros of the Python environment or, where that can not be written,
+of the user.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sysconfig
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from msg_tools.files.new_folder import new_file
+
+
+@dataclass(frozen=True)
+class NetworkFiles:
+    """The files of a detector.
+
+    Attributes:
+        folder: name of the folder that they lie in.
+        source: package that carries them, with its release.
+        checksums: SHA-256 by name.
+    """
+
+    folder: str
+    source: str
+    checksums: Mapping[str, str]
+
+    def folders(self) -> tuple[Path, Path]:
+        """Where the files are sought: in the folder of the environment, then in the user's."""
+        user = sysconfig.get_path('data', sysconfig.get_preferred_scheme('user'))
+        environment, own = (
+            Path(data, 'share', 'hmt_ros', self.folder)
+            for data in (sysconfig.get_path('data'), user)
+        )
+        return environment, own
+
+    def content(self, name: str) -> bytes | None:
+        """Content of a file; None where there is none, or another one."""
+        for folder in self.folders():
+            path = folder / name
+            if path.is_file():
+                data = path.read_bytes()
+                if hashlib.sha256(data).hexdigest() == self.checksums[name]:
+                    return data
+        return None
+
+    def are_there(self) -> bool:
+        """Whether all files are there."""
+        return all(self.content(name) is not None for name in self.checksums)
+
+    def absence(self, name: str) -> str:
+        """What is said of a file that is not there."""
+        return f'no {name} as of {self.source} in {" or ".join(map(str, self.folders()))}'
+
+    def taken_from(self, archive: Path, read: Callable[[str], bytes | None]) -> dict[str, bytes]:
+        """The files of an archive, by name.
+
+        Args:
+            archive: that they are read from.
+            read: content of the file of a name; None: the archive has none.
+
+        Raises:
+            ValueError: the archive lacks one, or has another.
+        """
+        found = {}
+        for name, checksum in self.checksums.items():
+            data = read(name)
+            seen = hashlib.sha256(data or b'').hexdigest()
+            if seen != checksum:
+                saw = f'one with SHA-256 {seen}' if data else 'none'
+                raise ValueError(
+                    f'{archive.name}: wanted {name} with SHA-256 {checksum}, saw {saw}'
+                )
+            found[name] = data or b''
+        return found
+
+    def write(self, content: Mapping[str, bytes]) -> None:
+        """Writes files for all users of this Python or, where that is not allowed, for this one."""
+        everybody, own = self.folders()
+        try:
+            everybody.mkdir(parents=True, exist_ok=True)
+            folder = everybody if os.access(everybody, os.W_OK) else own
+        except PermissionError:
+            folder = own
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in content.items():
+            with new_file(folder / name) as file:
+                file.write(data)
+
+
+def run_installer(command: list[str]) -> None:
+    """Runs a command that installs or downloads.
+
+    Raises:
+        ValueError: it fails; one line.
+    """
+    done = subprocess.run(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False
+    )
+    if done.returncode != 0:
+        lines = [line for line in done.stderr.splitlines() if line.strip()]
+        faults = [line for line in lines if line.lower().startswith('error')] or lines[-1:]
+        raise ValueError(f'"{" ".join(command)}" failed: {faults[-1] if faults else "no message"}')
