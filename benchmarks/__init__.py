@@ -12,6 +12,7 @@ BENCHMARKS = {
     'bags': 'what replay adds to the time of the estimate',
     'blind': 'what is said of a person whom nothing explains, and of one whom something does',
     'contour_noise': 'how far contours of people lie from those of the model',
+    'detectors': 'what each detector that is installed sees, and what poses come of it',
     'experts': 'what the predictor that ships says of silhouettes, and its speed',
     'forecast': 'where a person is said to be soon, against holding the last pose',
     'gate': 'whether a step of the tracker costs more than a table that is checked in says',

@@ -318,7 +318,11 @@ def scores_of_run(one: OracleRun) -> dict[str, dict[str, Any]]:
             })
             for name, body, every in zip(FLOORS, bodies, (poses.values(), begun), strict=True)
         }  # fmt: skip
-    given = ORACLES[one.oracle](given)
+    return scores_with(ORACLES[one.oracle](given), one)
+
+
+def scores_with(given: Given, one: OracleRun) -> dict[str, dict[str, Any]]:
+    """Scores of a run with what the tracker is given, by the name of the row."""
     with patch.object(keypoint_term, 'LIFTED_WEIGHT', given.depth_weight):
         modes = _tracked(given, one)
     result = {one.oracle: _scores(given.clip, modes)}
