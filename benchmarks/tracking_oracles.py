@@ -4,6 +4,7 @@ true 2D landmarks      landmarks where the true ones are seen, all of them sure;
                        joints, and the face, that the truth has, the others as the detector says
 true 2D, weight 1 ...  the same, keypoints weighted more than the usual 0.5: if that helps, depth
                        that an image tells was discounted, if not, keypoints do not tell it
+no constant 2D errors  the median error of each landmark over a clip, at the person, is taken out
 true depths            one pose with the true depths, instead of the mixture of the experts
 true depths, weight 1  the same, weighted ten times as much as experts are
 true lengths           those between the true joints
@@ -122,12 +123,50 @@ class ToldTracker(Tracker):
 
 
 def _true_landmarks(given: Given, weight: float | None = None) -> Given:
+    found = dict(given.keypoints)
+    for stamp, (places, offsets) in _landmark_places(given).items():
+        said, known = given.keypoints[stamp], np.isfinite(places).all(1)
+        pixels, sure, noise = said.pixels.copy(), said.confidences.copy(), said.noise
+        assert noise is not None
+        assert said.landmarks is not None
+        pixels[known], sure[known] = given.clip.camera.project(places[known]), 1.0
+        exact = np.hypot(noise_of(np.ones(1)), [landmarks()[x].sigma for x in said.landmarks])
+        found[stamp] = replace(
+            said, pixels=pixels, confidences=sure, offsets=offsets,
+            noise=np.where(known, exact, noise),
+        )  # fmt: skip
+    changes = () if weight is None else (('likelihood.keypoints.weight', weight),)
+    return replace(given, keypoints=found, settings=changed(changes))
+
+
+def _without_constant_errors(given: Given) -> Given:
+    camera, every = given.clip.camera, _landmark_places(given)
+    said = [given.keypoints[stamp] for stamp in every]
+    places = np.array([x for x, _ in every.values()])
+    depths = places[..., 2:]
+    sizes = np.reshape([camera.magnification(z) for z in depths.ravel().tolist()], depths.shape)
+    errors = [x.pixels - camera.project(p) for x, p in zip(said, places, strict=True)]
+    off = np.ma.masked_invalid(np.array(errors) / sizes)
+    constant = np.asarray(np.ma.median(off, axis=0).filled(np.nan))
+    found = dict(given.keypoints)
+    for stamp, one, size in zip(every, said, sizes, strict=True):
+        known = np.isfinite(size * constant).all(1)
+        own = one.offsets
+        assert own is not None
+        found[stamp] = replace(
+            one,
+            pixels=np.where(known[:, None], one.pixels - size * constant, one.pixels),
+            offsets=np.where(known[:, None], every[stamp][1], own),
+        )
+    return replace(given, keypoints=found)
+
+
+def _landmark_places(given: Given) -> dict[int, tuple[Array, Array]]:
+    """By stamp: true places (n, 3) of the landmarks, NaN: unknown, and their offsets (n, 3)."""
     body, poses = given.fitted
-    names, found = given.clip.truth.joint_names, dict(given.keypoints)
-    for stamp, said in given.keypoints.items():
-        if stamp not in poses:
-            continue
-        true = given.clip.truth.joints[stamp]
+    names, result = given.clip.truth.joint_names, {}
+    for stamp in given.keypoints.keys() & poses.keys():
+        said, true = given.keypoints[stamp], given.clip.truth.joints[stamp]
         assert said.landmarks is not None
         assert said.offsets is not None
         offsets, places = said.offsets.copy(), np.full((len(said.names), 3), np.nan)
@@ -139,17 +178,9 @@ def _true_landmarks(given: Given, weight: float | None = None) -> Given:
                 offsets[i] *= mark != joint
             elif not given.real and joint in names:
                 places[i] = true[names.index(joint)] + turns[i] @ offsets[i]
-        known = np.isfinite(places).all(1) & (places[:, 2] > 0)
-        pixels, sure, noise = said.pixels.copy(), said.confidences.copy(), said.noise
-        assert noise is not None
-        pixels[known], sure[known] = given.clip.camera.project(places[known]), 1.0
-        exact = np.hypot(noise_of(np.ones(1)), [landmarks()[x].sigma for x in said.landmarks])
-        found[stamp] = replace(
-            said, pixels=pixels, confidences=sure, offsets=offsets,
-            noise=np.where(known, exact, noise),
-        )  # fmt: skip
-    changes = () if weight is None else (('likelihood.keypoints.weight', weight),)
-    return replace(given, keypoints=found, settings=changed(changes))
+        places[~(places[:, 2] > 0)] = np.nan
+        result[stamp] = places, offsets
+    return result
 
 
 def _true_depths(given: Given, weight: float = LIFTED_WEIGHT) -> Given:
@@ -222,6 +253,7 @@ ORACLES: dict[str, Callable[[Given], Given]] = {
     PLAIN: lambda given: given,
     'true 2D landmarks': _true_landmarks,
     **{f'true 2D, weight {x:g}': partial(_true_landmarks, weight=x) for x in (1.0, 2.0, 4.0)},
+    'no constant 2D errors': _without_constant_errors,
     'true depths': _true_depths,
     'true depths, weight 1': partial(_true_depths, weight=1.0),
     'true lengths': _true_lengths,

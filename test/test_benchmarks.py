@@ -80,6 +80,17 @@ def test_oracles_gain_what_they_know(clips, tmp_path, monkeypatch, capsys):
     assert text.index('Real clips') < text.index('Floors')
 
 
+def test_what_is_left_has_no_constant_errors(clips):
+    given = tracking_oracles.given_of(clips / 'signals', 5)
+    without = tracking_oracles.ORACLES['no constant 2D errors']
+    once = without(given)
+    again = without(once)
+    for stamp in given.fitted[1]:
+        moved = once.keypoints[stamp].pixels - given.keypoints[stamp].pixels
+        assert np.linalg.norm(moved, axis=1).max() > 2.0
+        np.testing.assert_allclose(again.keypoints[stamp].pixels, once.keypoints[stamp].pixels)
+
+
 def test_exchanged_keypoints_are_put_right(clips):
     given = tracking_oracles.given_of(clips / 'signals', 2)
     right = tracking_oracles.ORACLES['true sides'](given)
