@@ -41,11 +41,11 @@ DIR gets
   tracked/            the bag that replay writes, see replay --help
   report/report.html  the page that report writes, for a browser
 
-Without --keypoints MediaPipe Pose finds them, with MoveNet if it is there, where install-detector
-has been run. Without --fov or
---camera the field of view is taken from the metadata of the video, or assumed; the error that this
-may make is in all published depths. Without --level or --gravity lines of the scene show the tilt
-of the camera where they can; an unknown tilt is taken for a lean of the person.
+Without --keypoints the surest detector that install-detector has installed finds them: MediaPipe
+Pose, with MoveNet if it is there. Without --fov or --camera the field of view is taken from the
+metadata of the video, or assumed; the error that this may make is in all published depths. Without
+--level or --gravity lines of the scene show the tilt of the camera where they can; an unknown tilt
+is taken for a lean of the person.
 
 The track starts from the keypoints, or without any from a prediction. --subject names a subject
 file instead, and --stature writes one from the keypoints of an image.
