@@ -245,9 +245,9 @@ SWITCHES = {
 # here what the test finds.
 VERSIONS = {'numpy': '2.4.6', 'cv2': '5.0.0'}
 DIGESTS = {
-    'keypoints/pose_mixture': 'dabec1d7e9bda823',
-    'keypoints/smoothed_pose_mixture': '8d6e2dd666994d91',
-    'anybody/pose_mixture': '8691ebba75e3ed03',
+    'keypoints/pose_mixture': 'e471621286d7d62f',
+    'keypoints/smoothed_pose_mixture': 'f78ae98383f476d6',
+    'anybody/pose_mixture': 'e47ea6ee74428abc',
     'images/pose_mixture': '97da8f3ee1af5da4',
 }
 

@@ -175,19 +175,6 @@ def noise_of(confidences: Array) -> Array:
     return result
 
 
-def noise_of_pairs(limb: str, distances: Array) -> Array:
-    """Factors (n,) on the deviations of both landmarks of pairs, left and right.
-
-    Args:
-        limb: 'arm' or 'leg'.
-        distances: (n,) between the two, m at the person; NaN: one was not seen.
-    """
-    model = _table()['noise']['pairs']
-    known = np.where(np.isnan(distances), np.inf, distances)
-    result: Array = np.interp(known, model['distance'], model[limb])
-    return result
-
-
 @cache
 def position_deviations(scheme: str | None) -> Mapping[str, float]:
     """Standard deviations of depths of a detector, by the kind of the joint, m.

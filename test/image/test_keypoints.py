@@ -135,35 +135,3 @@ def test_residuals_have_the_derivatives_of_the_energy(pose):
     # A translation of the whole person moves all landmarks alike.
     np.testing.assert_allclose(directions.T @ pull, energy(one, pose).gradient[0, :3])
     assert (curvature > 0).all()
-
-
-def precisions(keypoints):
-    """Of each keypoint, 1/px^2, by its landmark or joint."""
-    one = KeypointTerm(BODY.skeleton, CAMERA, keypoints, magnification=150.0)
-    names = [mark or joint for mark, joint in zip(keypoints.landmarks, keypoints.names)]
-    counted = [name for name, known in zip(names, keypoints.seen) if known]
-    return dict(zip(counted, one.measured.points.whiteners[:, 0, 0] ** 2))
-
-
-@pytest.mark.parametrize('named_by', ['landmarks', 'joints'])
-def test_limbs_on_one_another_count_less(pose, named_by):
-    apart = seen(pose, lifted=False)
-    if named_by == 'joints':
-        apart = replace(apart, landmarks=('',) * len(apart.names))
-    names = [mark or joint for mark, joint in zip(apart.landmarks, apart.names)]
-    left, right = names.index('left_wrist'), names.index('right_wrist')
-    # 150 px/m: 60 px are 0.4 m, 9 px are 0.06 m.
-    for distance, factor in ((60.0, 1.0), (9.0, 2.2)):
-        pixels = apart.pixels.copy()
-        pixels[left] = pixels[right] + (distance, 0.0)
-        found = precisions(replace(apart, pixels=pixels))
-        usual = 1 / (1.5**2 + (150.0 * factor * apart.noise[left]) ** 2)
-        assert found['left_wrist'] == pytest.approx(found['right_wrist']) == pytest.approx(usual)
-        shoulder = precisions(apart)['left_shoulder']
-        assert found['left_shoulder'] == pytest.approx(shoulder)
-    # One that was not seen is near nothing.
-    pixels = pixels.copy()
-    pixels[left] = np.nan
-    alone = precisions(replace(apart, pixels=pixels))
-    assert 'left_wrist' not in alone
-    assert alone['right_wrist'] == pytest.approx(1 / (1.5**2 + (150.0 * apart.noise[right]) ** 2))

@@ -27,7 +27,6 @@ from hmt_ros.image.keypoint_schemes import (
     MIRROR,
     landmarks_of,
     noise_of,
-    noise_of_pairs,
     scheme_of,
 )
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, middle_of_hips
@@ -51,9 +50,6 @@ LIFTED_WEIGHT, LIFTED_SCALE = 0.1, 3.0
 # nothing, all, arms, legs.
 CENTRE, ARMS, LEGS = range(3)
 EXCHANGED = np.array([[0, 0, 0], [1, 1, 1], [0, 1, 0], [0, 0, 1]], dtype=np.int64)
-
-# Joints of the limbs that may lie on one another.
-PAIRED = {'arm': ('elbow', 'wrist', 'hand'), 'leg': ('knee', 'ankle', 'toe')}
 
 # (1, E) log probabilities of exchanges of keypoints that are known to be called by their sides.
 NOT_EXCHANGED = np.array([[0.0, -np.inf, -np.inf, -np.inf]])
@@ -410,36 +406,11 @@ def _whitened(keypoints: Keypoints, sigma: float, magnification: float) -> tuple
     covariances = sigma**2 * k.covariances
     confidences = k.confidences[:, None, None]
     if k.noise is not None:
-        scale = magnification or k.magnification()
-        blur = (sigma * scale * k.noise * _together(k, scale)) ** 2
+        blur = (sigma * (magnification or k.magnification()) * k.noise) ** 2
         covariances = covariances + blur[:, None, None] * np.eye(2)
         confidences = np.ones_like(confidences)
     precision = inverse(covariances) * confidences
     return k, np.ascontiguousarray(cholesky(precision).transpose(0, 2, 1))
-
-
-def _together(keypoints: Keypoints, magnification: float) -> Array:
-    """Factors (n,) on the noise: of two limbs on one place a detector often sees one alone."""
-    result = np.ones(len(keypoints.names))
-    marks = keypoints.landmarks or [''] * len(keypoints.names)
-    names = tuple(mark or joint for mark, joint in zip(marks, keypoints.names, strict=True))
-    for limb, pairs in _pairs(keypoints.names, names).items():
-        apart = np.linalg.norm(keypoints.pixels[pairs[0]] - keypoints.pixels[pairs[1]], axis=1)
-        result[pairs] = noise_of_pairs(limb, apart / magnification)
-    return result
-
-
-@lru_cache(maxsize=64)
-def _pairs(joints: tuple[str, ...], landmarks: tuple[str, ...]) -> dict[str, Index]:
-    """Positions (2, n) of landmarks of a left limb and those of the right one, by the limb."""
-    at = {name: i for i, name in enumerate(landmarks)}
-    found: dict[str, list[tuple[int, int]]] = {limb: [] for limb in PAIRED}
-    for i, (joint, name) in enumerate(zip(joints, landmarks, strict=True)):
-        other = at.get(other_side(name), i)
-        for limb, kinds in PAIRED.items():
-            if name.startswith('left_') and other != i and joint.endswith(kinds):
-                found[limb].append((i, other))
-    return {limb: np.array(rows, np.intp).reshape(-1, 2).T for limb, rows in found.items()}
 
 
 NOT_LIFTED = Lifted(
