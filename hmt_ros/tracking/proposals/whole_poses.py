@@ -102,7 +102,7 @@ def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
     if moved[0] > BODY_REACH + BODY_SPEED * search.dt:
         return sources[:0]
     first = np.zeros(1, dtype=np.intp)
-    return sources.proposed(first, pose, np.zeros(pose.shape, dtype=np.bool_), expected=pose)
+    return sources.proposed(first, pose, np.ones(pose.shape, dtype=np.bool_), expected=pose)
 
 
 def reversed_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
