@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from benchmarks.clips import SCHEME, Clip, table, with_file
 from benchmarks.command import add_choice, benchmark_parser, run_benchmark, told
 from benchmarks.machine import description
-from benchmarks.runs import BOTH
+from benchmarks.runs import BOTH, GIVEN
 from benchmarks.tracking_oracles import (
     GROUPS,
     PLAIN,
@@ -31,17 +31,16 @@ from benchmarks.tracking_oracles import (
     given_of,
     scores_with,
 )
+from hmt_ros.body.skeleton import other_side
 from hmt_ros.detectors.registry import DETECTORS
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 from hmt_ros.image.terms.keypoints import Keypoints
 
 Array = NDArray[np.float64]
 
 CLIPS = tuple(name for group in GROUPS.values() for name in group)
-JOINTS = tuple(
-    f'{side}_{name}'
-    for name in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
-    for side in ('left', 'right')
-)
+# Joints of limbs, which are landmarks of all detectors.
+JOINTS = tuple(name for name in EVALUATED_JOINTS if other_side(name) != name)
 
 
 def seen_by(detector: str, given: Given) -> tuple[dict[int, Keypoints], float]:
@@ -80,7 +79,7 @@ def of_clip(folder: Path, detector: str, seed: int, limit: int | None) -> dict[s
     found, spent = seen_by(detector, given)
     mean, varying = image_errors(given.clip, found)
     known = {stamp: x.named_for(given.body, SCHEME)[0] for stamp, x in found.items()}
-    run = OracleRun(folder, BOTH, seed, limit=limit, gravity='given', oracle=PLAIN)
+    run = OracleRun(folder, BOTH, seed, limit=limit, gravity=GIVEN, oracle=PLAIN)
     scores = scores_with(replace(given, keypoints=known), run)[PLAIN]
     return {
         'clip': folder.name, 'detector': detector, 'ms': spent, 'px': mean, 'varying_px': varying,

@@ -64,7 +64,7 @@ class Seen:
         errors: (M, 2) pixel less that of the joint, over the magnification, m.
         confidences: (M,).
         images: (M,) numbers, increasing.
-        apart: (M,) from the landmark of the other side, m on the person; NaN: there is none.
+        apart: (M,) from the landmark of the other side, m on the person; NaN for the nose.
     """
 
     name: str

@@ -18,7 +18,7 @@ COMMANDS = {
     ),
     'install-detector': (
         'hmt_ros.app.install_detector',
-        'install a detector of keypoints: MediaPipe Pose, or MoveNet beside it',
+        'install a detector of keypoints: MediaPipe Pose, alone or with MoveNet',
     ),
     'report': (
         'hmt_ros.app.report.command',

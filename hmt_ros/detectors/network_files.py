@@ -41,7 +41,7 @@ class NetworkFiles:
         return environment, own
 
     def content(self, name: str) -> bytes | None:
-        """Content of a file; None where there is none, or another one."""
+        """Content of a file; None if it is absent, or has another checksum."""
         for folder in self.folders():
             path = folder / name
             if path.is_file():

@@ -18,5 +18,5 @@ _SUREST = ('mediapipe+movenet', USUAL_DETECTOR)
 
 
 def surest_detector() -> str | None:
-    """Name of the surest detector that is installed; None: there is none."""
+    """Name of the surest detector that is installed; None if none is installed."""
     return next((name for name in _SUREST if DETECTORS[name].is_installed()), None)

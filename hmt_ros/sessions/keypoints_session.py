@@ -42,7 +42,7 @@ class KeypointsParameters(ImageNodeParameters):
 
     Attributes:
         detector: Detector of keypoints; 'mediapipe' is MediaPipe Pose, 'mediapipe+movenet' asks
-            MoveNet Thunder as well, at three times the cost.
+            MoveNet Thunder as well, at five times the cost.
         publish_mask: If true, the node also publishes the mask of the person.
     """
 

@@ -45,7 +45,7 @@ class Search:
         plan: allocation of the evaluations of the image.
         modes: of the image before.
         prediction: pose hypotheses from an external predictor, if any.
-        base: optima of the image, one for each mode.
+        base: optima of the image, one for each mode, then that of the pose by keypoints, if any.
     """
 
     posterior: Posterior

@@ -353,7 +353,8 @@ MAX_SIGMA, LIMIT_SIGMA = 2.0, 0.05
 # How often the shape is fitted to the first image, and the number of the heaviest modes that it is
 # estimated from. Chosen.
 FIRST_SHAPE_FITS, SHAPE_MODES = 3, 4
-# How far a person gets from where one was predicted: m, and m/s.
+# How far a person gets from where one was predicted, m and m/s: keypoints of a leap are of another
+# person. No clip comes near it.
 BODY_REACH, BODY_SPEED = 0.1, 4.0
 # Newton steps from the reversal of a mode to its optimum, before candidates are compared. Chosen.
 REVERSAL_ITERATIONS = 8

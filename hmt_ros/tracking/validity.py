@@ -16,7 +16,7 @@ A part of the body may be misplaced in a mode of a track that is right, and cove
 of parts is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way,
 w = `PLACED_PROBABILITY`. Where a track begins the pose was given.
 A silhouette of something else leads the modes x to itself, which then explain it. Where they leave
-more than a quarter of the keypoints, a pose x' by keypoints alone (`proposals.keypoint_poses`)
+more than a quarter of the keypoints, a pose x' by keypoints alone (`proposals.whole_poses`)
 stands for the states without the silhouette:
 
     a sum_g v_g e_g  <-  log t(x_v) + a sum_g v_g min(e_g(x_v), 0)        x_v: x' where v_s = 0  (4)

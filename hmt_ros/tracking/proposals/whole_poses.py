@@ -1,4 +1,4 @@
-"""Proposals of whole poses: predicted ones, by keypoints alone, and reversed ones.
+"""Whole poses to search from: predicted ones, by keypoints alone, and reversed ones.
 
 Pose hypotheses from an external single-image predictor, such as a mixture of experts, are
 proposals, no evidence, which would count the image twice.
@@ -107,7 +107,7 @@ def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
 
 def reversed_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
     """The reversal of the best mode where a way to face is lost."""
-    log_weights = search.base_rated[: len(search.modes.back)]
+    log_weights = search.base_rated[: len(search.modes)]
     if not lost_a_facing(search.modes.back, log_weights):
         return sources[:0]
     best = np.argsort(-log_weights, kind='stable')[:1]
