@@ -247,7 +247,7 @@ VERSIONS = {'numpy': '2.4.6', 'cv2': '5.0.0'}
 DIGESTS = {
     'keypoints/pose_mixture': 'e471621286d7d62f',
     'keypoints/smoothed_pose_mixture': 'f78ae98383f476d6',
-    'anybody/pose_mixture': 'e47ea6ee74428abc',
+    'anybody/pose_mixture': '35bb0c33b760b447',
     'images/pose_mixture': '97da8f3ee1af5da4',
 }
 

@@ -53,7 +53,7 @@ def solve_joint_positions(
     if goal.shape != (len(start), len(names), 3):
         raise ValueError(f'targets have shape {goal.shape}, wanted {(len(start), len(names), 3)}')
     known = np.asarray(np.isfinite(goal).all(2), dtype=np.bool_)
-    weight = np.where(known, np.broadcast_to(np.asarray(sigma) ** -2.0, known.shape), 0.0)
+    weight = np.where(known, 1.0 / np.broadcast_to(np.asarray(sigma), known.shape), 0.0)
     goal = np.where(known[..., None], goal, 0.0)
     precision = (
         prior_weight * np.where(np.isfinite(body.prior_sigma), body.prior_sigma, np.inf) ** -2
@@ -64,20 +64,13 @@ def solve_joint_positions(
         frozen = np.setdiff1d(np.arange(body.dimension), skeleton.dof_index(tuple(free_dofs)))
         limits_low[:, frozen] = limits_high[:, frozen] = start[:, frozen]
     segments, offsets = skeleton.joint_segments[which], skeleton.joint_offsets[which]
-    across = None
+    across = weight[..., None, None] * np.eye(3)
     if along_rays:
         rays = goal / np.maximum(np.linalg.norm(goal, axis=2, keepdims=True), 1e-12)
-        across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+        across -= weight[..., None, None] * rays[..., :, None] * rays[..., None, :]
 
     def distances(x: Array, problem: Index) -> tuple[Array, Array, Array]:
-        return point_energy(
-            forward(skeleton, x),
-            segments,
-            offsets,
-            goal[problem].transpose(1, 2, 0),
-            weight[problem].T,
-            None if across is None else across[problem].transpose(1, 2, 3, 0),
-        )
+        return point_energy(forward(skeleton, x), segments, offsets, goal[problem], across[problem])
 
     energy = Sum((EnergyFunction(distances), Quadratic(body.prior_mean, precision)))
     return minimise(

@@ -150,17 +150,12 @@ def retarget(
     sigma = [SIGMA[n.removeprefix('left_').removeprefix('right_')] for n in place]
     segments = np.append(skeleton.joint_segments[joints], 0)
     local = np.append(skeleton.joint_offsets[joints], [[0.0, FRONT, 0.0]], axis=0)
-    targets = np.stack([*(points.T for points in place.values()), front.T])
-    weights = np.append(sigma, FRONT_SIGMA)[:, None] ** -2.0
+    targets = np.stack([*place.values(), front], axis=1)
+    across = np.eye(3) / np.append(sigma, FRONT_SIGMA)[:, None, None]
 
     def misfit(poses: Array, rows: Index) -> tuple[Array, Array, Array]:
-        return point_energy(
-            forward(skeleton, poses),
-            segments,
-            local,
-            targets[:, :, rows],
-            np.broadcast_to(weights, (len(weights), len(rows))),
-        )
+        every = np.broadcast_to(across, (len(rows), *across.shape))
+        return point_energy(forward(skeleton, poses), segments, local, targets[rows], every)
 
     return _refined(body, misfit, start, motion.fps)
 

@@ -11,19 +11,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.body.skeleton import other_side
-from hmt_ros.experts.lifter import LANDMARKS, TIMES
-from hmt_ros.image.lifted_poses import HIPS
+from hmt_ros.experts.lifter import EXCHANGES, LANDMARKS, TIMES
 from hmt_ros.inference.arrays import Array
 
 Floats = NDArray[np.float32]
 
-# Rows of the landmarks of the other side, and landmarks of parts of the body.
-SIDES = np.array([LANDMARKS.index(other_side(name)) for name in LANDMARKS])
-ARMS = np.array([name.endswith(('shoulder', 'elbow', 'wrist')) for name in LANDMARKS])
+# Landmarks of parts of the body.
 BELOW_KNEE = np.array([name.endswith(('knee', 'ankle', 'heel', 'toe')) for name in LANDMARKS])
 BELOW_HIP = BELOW_KNEE | np.array([name.endswith('hip') for name in LANDMARKS])
-OF_LEGS = BELOW_KNEE | np.array([name in HIPS for name in LANDMARKS])
 
 
 @dataclass(frozen=True)
@@ -149,9 +144,8 @@ def _exchange(
     kind = rng.choice(4, n, p=e.exchanged)
     whole, reach = rng.random(n) < 0.5, float(TIMES.max()) + 0.2
     middle, half = rng.uniform(-reach, reach, n), rng.exponential(e.exchange_time, n)
-    for number, group in ((1, np.ones(len(LANDMARKS), np.bool_)), (2, ARMS), (3, OF_LEGS)):
+    for number, order in enumerate(EXCHANGES[1:], 1):
         rows = np.flatnonzero(kind == number)
-        order = np.where(group, SIDES, np.arange(len(LANDMARKS)))
         on = whole[rows, None] | (np.abs(times[rows] - middle[rows, None]) < half[rows, None])
         rays[rows] = np.where(on[..., None, None], rays[rows][:, :, order], rays[rows])
         confidences[rows] = np.where(

@@ -1,17 +1,6 @@
-"""Forward kinematics, exact Jacobians, and the assembly of energies over points into pose space.
+"""Forward kinematics, exact Jacobians, and energies over points of the body, of N poses at once.
 
-Everything works on a batch of N poses with the batch on the last axis, so that every operation runs
-over contiguous memory, and touches only the degrees of freedom that move a segment.
-
-An energy that depends on the pose through points on segments needs no Jacobian of the points. A
-small motion of a segment is a twist (v, w): the point p moves by v + w x p. A residual whose
-derivative with respect to its point is the 3-vector a therefore has, with respect to the twist, the
-6-vector b = (a, p x a), and a Gauss-Newton term adds `k b b^T` (6 x 6) and `g b` (6) to its
-segment. Summed from the leaves to the root these are all that gradient and Hessian need:
-
-    g_j = s_j . F_j,    H_ij = s_i . K_j s_j    for i on the path from the root to j,
-
-with s_j the twist of degree of freedom j and F_j, K_j the sums over all that j moves.
+How derivatives over points become those over poses is told in `core/residuals.h`.
 """
 
 from __future__ import annotations
@@ -24,7 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.skeleton import Skeleton
-from hmt_ros.core import derive_along, derive_points, lift_origins, place_points, place_poses
+from hmt_ros.core import (
+    derive_along,
+    derive_points,
+    evaluate_points,
+    lift_origins,
+    place_points,
+    place_poses,
+)
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product
 
@@ -105,17 +101,6 @@ class Frames:
     def joints(self) -> Array:
         """Joint positions, (J, 3, N) m."""
         return self.points(self.skeleton.joint_segments, self.skeleton.joint_offsets)
-
-    def twists(self) -> Array:
-        """Twists (d, 6, N) of the degrees of freedom.
-
-        First the velocity of the point at the camera, then the rotation.
-        """
-        rotation = self.skeleton.dof_is_rotation[:, None, None]
-        result = np.empty((self.skeleton.dimension, 6, self.count))
-        result[:, :3] = np.where(rotation, _cross(self.dof_origins, self.axes), self.axes)
-        result[:, 3:] = np.where(rotation, self.axes, 0.0)
-        return result
 
     def by_pose(self) -> tuple[Array, Array]:
         """Columns (N, S, 3, 3) and origins (N, S, 3), pose by pose in memory."""
@@ -244,100 +229,27 @@ def joint_length_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
     return np.asarray(result)
 
 
-def segment_sums(
-    segments: Index, points: Array, directions: Array, pull: Array, curvature: Array, count: int
-) -> tuple[Array, Array]:
-    """Sums of g b and k b b^T per segment, for residuals at points that stay on their segments.
-
-    Args:
-        segments: (M,) the segment of each residual.
-        points: (M, 3, N) where it acts, camera frame, m.
-        directions: (M, 3, N) derivative a of the residual with respect to its point.
-        pull: (M, N) derivative g of the energy with respect to the residual.
-        curvature: (M, N) second derivative k, not negative.
-        count: number of segments, S.
-
-    Returns:
-        wrenches (S, 6, N) and stiffnesses (S, 6, 6, N), for `assemble`.
-    """
-    n = points.shape[-1]
-    b = np.concatenate([directions, _cross(points, directions)], axis=1)
-    wrenches = np.zeros((count, 6, n))
-    stiffnesses = np.zeros((count, 6, 6, n))
-    weighted = curvature[:, None] * b
-    order = np.argsort(segments, kind='stable')
-    present, starts = np.unique(segments[order], return_index=True)
-    for s, rows in zip(present, np.split(order, starts[1:]), strict=True):
-        wrenches[s] = np.einsum('mn,man->an', pull[rows], b[rows])
-        stiffnesses[s] = np.einsum('man,mbn->abn', weighted[rows], b[rows])
-    return wrenches, stiffnesses
-
-
-def assemble(frames: Frames, wrenches: Array, stiffnesses: Array) -> tuple[Array, Array]:
-    """Gradient (N, d) and Gauss-Newton Hessian (N, d, d) from sums over the points of each segment.
-
-    Args:
-        frames: of the poses.
-        wrenches: (S, 6, N) sum of g b.
-        stiffnesses: (S, 6, 6, N) sum of k b b^T, symmetric.
-    """
-    skeleton = frames.skeleton
-    force, stiffness = wrenches.copy(), stiffnesses.copy()
-    for s in range(len(skeleton.parents) - 1, 0, -1):
-        parent = skeleton.parents[s]
-        if parent >= 0:
-            force[parent] += force[s]
-            stiffness[parent] += stiffness[s]
-    twists = frames.twists()
-    segments = skeleton.dof_segments
-    gradient = np.einsum('jan,jan->nj', twists, force[segments])
-    pushed = np.einsum('jabn,jbn->jan', stiffness[segments], twists)
-    rows, cols = _coupled_pairs(skeleton)
-    values = np.einsum('pan,pan->np', twists[rows], pushed[cols])
-    hessian = np.zeros((frames.count, skeleton.dimension, skeleton.dimension))
-    hessian[:, rows, cols] = values
-    hessian[:, cols, rows] = values
-    return gradient, hessian
-
-
 def point_energy(
-    frames: Frames,
-    segments: Index,
-    local: Array,
-    targets: Array,
-    weights: Array,
-    across: Array | None = None,
+    frames: Frames, segments: Index, local: Array, targets: Array, across: Array
 ) -> tuple[Array, Array, Array]:
-    """Energy 1/2 sum w |A (p - t)|^2 of points p that should be at targets t.
+    """Energy 1/2 sum |A (p - t)|^2 of points p that should be at targets t.
 
     Args:
         frames: of N poses.
         segments: (P,) that carry the points.
         local: (P, 3) places in the frames of the segments, m.
-        targets: (P, 3, N) camera frame, m.
-        weights: (P, N) w, 1/m^2.
-        across: (P, 3, 3, N) A, such as the projection across a ray; the identity when None.
+        targets: (N, P, 3) camera frame, m.
+        across: (N, P, R, 3) A, such as the projection across a ray over a deviation, 1/m.
 
     Returns:
         Value (N,), gradient (N, d), Gauss-Newton Hessian (N, d, d).
     """
-    points = frames.points(segments, local)
-    error = points - targets
-    if across is None:
-        across = np.broadcast_to(np.eye(3)[..., None], (len(points), 3, 3, frames.count))
-    else:
-        error = np.einsum('jikn,jkn->jin', across, error)
-    value = 0.5 * np.einsum('jn,jin,jin->n', weights, error, error)
-    rows = np.repeat(weights, 3, axis=0)
-    sums = segment_sums(
-        np.repeat(segments, 3),
-        np.repeat(points, 3, axis=0),
-        across.reshape(-1, 3, frames.count),
-        rows * error.reshape(-1, frames.count),
-        rows,
-        len(frames.skeleton.parents),
-    )
-    gradient, hessian = assemble(frames, *sums)
+    n, d = frames.count, frames.skeleton.dimension
+    value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
+    evaluate_points(
+        tree_of(frames.skeleton), *frames.by_pose(), *frames.dofs_by_pose(), segments,
+        *map(np.ascontiguousarray, (local, targets, across)), value, gradient, hessian,
+    )  # fmt: skip
     return value, gradient, hessian
 
 
@@ -373,27 +285,36 @@ def placing_of(skeleton: Skeleton) -> Placing:
     )
 
 
+class Tree(NamedTuple):
+    """The skeleton as the compiled code reads it.
+
+    Attributes:
+        parents: (S,) segment above; -1: none.
+        dof_segments: (d,) segment of each degree of freedom.
+        dof_parents: (d,) the degree of freedom before it on the path from the root; -1: none.
+        dof_is_rotation: (d,).
+    """
+
+    parents: NDArray[np.int64]
+    dof_segments: NDArray[np.int64]
+    dof_parents: NDArray[np.int64]
+    dof_is_rotation: NDArray[np.bool_]
+
+
 @lru_cache(maxsize=16)
-def _coupled_pairs(skeleton: Skeleton) -> tuple[Index, Index]:
-    """Pairs (i, j) of degrees of freedom with i on the path from the root to j, or i = j."""
-    moves = skeleton.moves[skeleton.dof_segments]  # (d, d): column moves the segment of the row
-    rows: list[np.intp] = []
-    cols: list[int] = []
-    for j in range(skeleton.dimension):
-        before = np.flatnonzero(moves[j])
-        before = before[before <= j]
-        rows.extend(before)
-        cols.extend([j] * len(before))
-    return np.array(rows, dtype=np.intp), np.array(cols, dtype=np.intp)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product over the axis before the last."""
-    return np.stack(
-        [
-            a[..., 1, :] * b[..., 2, :] - a[..., 2, :] * b[..., 1, :],
-            a[..., 2, :] * b[..., 0, :] - a[..., 0, :] * b[..., 2, :],
-            a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :],
-        ],
-        axis=-2,
+def tree_of(skeleton: Skeleton) -> Tree:
+    """The compiled code's view of a skeleton."""
+    last_of: list[int] = []  # the last degree of freedom on the path to each segment
+    before = np.full(skeleton.dimension, -1)
+    for segment, parent in enumerate(skeleton.parents):
+        last = last_of[parent] if parent >= 0 else -1
+        for dof in skeleton.segment_dofs[segment]:
+            before[dof] = last
+            last = dof
+        last_of.append(last)
+    return Tree(
+        np.array(skeleton.parents, dtype=np.int64),
+        np.array(skeleton.dof_segments, dtype=np.int64),
+        before.astype(np.int64),
+        np.array(skeleton.dof_is_rotation),
     )

@@ -35,13 +35,14 @@ TRUNK_START = 'start of the trunk'
 FLEXIBLE = 0.05  # weight of neck and shoulders for the root of a body whose trunk can bend
 
 
-def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> Array:
+def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float | None) -> Array:
     """Poses (T, d) that follow joints by their standard names, (T, 3) each, camera frame, m.
 
     Args:
         skeleton: with the limbs of KJS fig. 3, such as those of the bodies that ship.
         place: positions of the joints; toes and hands may be missing.
-        fps: frames per second.
+        fps: frames per second, of which headings go on beyond half a turn; None: poses that have
+            nothing to do with one another.
 
     Raises:
         ValueError: the skeleton has other limbs.
@@ -54,6 +55,9 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> A
     for s, parent in enumerate(skeleton.parents):
         if parent < 0:
             turns[s] = _set_root(skeleton, place, poses)
+            if fps is not None:
+                heading = root_rotation_dofs(skeleton)[0]
+                poses[:, heading] = np.unwrap(poses[:, heading])
             continue
         turn = product(turns[parent], skeleton.mounts[s])
         own, axes = rotations_of(skeleton, s)
@@ -146,7 +150,7 @@ def _set_root(skeleton: Skeleton, place: Mapping[str, Array], poses: Array) -> A
     poses[:, shifts] = place['pelvis']
     rotation: Array = product(turn, skeleton.mounts[0])
     own = product(skeleton.mounts[0].T, rotation)
-    poses[:, rotations[0]] = np.unwrap(elementary.arctan2(own[:, 1, 0], own[:, 0, 0]))
+    poses[:, rotations[0]] = elementary.arctan2(own[:, 1, 0], own[:, 0, 0])
     poses[:, rotations[1]] = elementary.arcsin(np.clip(-own[:, 2, 0], -1.0, 1.0))
     poses[:, rotations[2]] = elementary.arctan2(own[:, 2, 1], own[:, 2, 2])
     return rotation
@@ -173,7 +177,12 @@ def _smoothed(values: Array, sigma: float) -> Array:
 
 
 def _twist(
-    skeleton: Skeleton, s: int, turn: Array, place: Mapping[str, Array], next_end: str, fps: float
+    skeleton: Skeleton,
+    s: int,
+    turn: Array,
+    place: Mapping[str, Array],
+    next_end: str,
+    fps: float | None,
 ) -> Array:
     """The third angle of a spherical joint, from the next segments.
 
@@ -182,7 +191,7 @@ def _twist(
     """
     if not next_end:
         line = _local(turn, place['right_shoulder'] - place['left_shoulder'])
-        return np.unwrap(elementary.arctan2(line[:, 1], line[:, 0]))
+        return np.asarray(elementary.arctan2(line[:, 1], line[:, 0]))
     side, _, joint = next_end.partition('_')
     middle_joint = f'{side}_{"knee" if joint == "ankle" else "elbow"}'
     hinge = next(i for i, t in enumerate(skeleton.dof_segments) if skeleton.parents[t] == s)
@@ -193,7 +202,7 @@ def _twist(
     if joint == 'ankle' and toe in place:
         forward_of_foot = _local(turn, place[toe] - place[next_end])
         said += FOOT * np.stack([forward_of_foot[:, 1], -forward_of_foot[:, 0]], axis=1)
-    around = _smoothed(said, AROUND_TIME * fps)
+    around = said if fps is None else _smoothed(said, AROUND_TIME * fps)
     said = said + AROUND * around + [REST, 0.0]
     twist: Array = elementary.arctan2(said[:, 1], said[:, 0])
     return twist

@@ -29,6 +29,7 @@
 #include "terms.h"
 #include "terms/ground.h"
 #include "terms/keypoints.h"
+#include "terms/points.h"
 #include "terms/self_intersection.h"
 #include "tracking/continuity.h"
 #include "tracking/facing.h"
@@ -56,6 +57,9 @@ PYBIND11_MODULE(_compiled, m) {
        "moves is_rotation axes dof_origins segments points directions result");
   bind(m, "derive_points", derive_points,
        "moves is_rotation axes dof_origins segments points result");
+  bind(m, "evaluate_points", evaluate_points,
+       "tree columns origins axes dof_origins segments local targets across value gradient "
+       "hessian");
   bind(m, "lift_origins", lift_origins, "parents basis columns result");
   bind(m, "fill_rings", fill_rings, "parts ring_parts heights centre radius slope lean");
   bind(m, "fill_surface", fill_surface, "parts heights cosines sines points normals");

@@ -114,6 +114,16 @@ inline void place_pose(const Placing& tree, const Numbers& pose, const Tensor& c
   }
 }
 
+// Place (3,) in the camera frame of a point of a segment.
+inline void place_point(const Tables& columns, const Table& origins, Index segment,
+                        const double* offset, double* place) {
+  const double *column = columns[segment].data, *origin = origins[segment].data;
+  for (int i = 0; i < 3; ++i) {
+    place[i] = origin[i];
+    for (int j = 0; j < 3; ++j) place[i] += column[3 * j + i] * offset[j];
+  }
+}
+
 inline void expect_poses(const Table& poses, Index d) {
   expect_shape("poses", poses, {-1, d});
   for (double x : poses) expect(std::isfinite(x), "poses", "numbers, which must be finite");

@@ -40,6 +40,7 @@ from hmt_ros.body.learned_file import (
     require,
     write_model,
 )
+from hmt_ros.body.skeleton import other_side
 from hmt_ros.core import elementary, fill_window_inputs, window_middles
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.network_experts import Floats, Layers
@@ -47,7 +48,7 @@ from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.image.keypoint_schemes import AUTO, landmarks, landmarks_of, position_deviations
 from hmt_ros.image.lifted_poses import WHOLE, LiftedPoses, bone_lengths, from_positions
 from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.inference.random_numbers import standard_normals
@@ -100,10 +101,25 @@ PROPORTIONED = (
 )
 # A length counts as at least this share of the usual one.
 SHORTEST = 0.3
+# Number of components that remain of a mixture over exchanges of sides.
+MOST = 12
 # A keypoint of less confidence is not looked at; fewer landmarks are no person.
 LEAST_CONFIDENCE, FEWEST = 0.02, 5
 # Length of the inputs of a window.
 INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
+# Landmarks (rows) that stand in the place of each one where a detector calls nothing, all, arms or
+# legs by the other side, as `terms.keypoints.EXCHANGED`.
+SIDES = np.array([LANDMARKS.index(other_side(name)) for name in LANDMARKS])
+ARMS, LEGS = (
+    np.array([name.endswith(joints) for name in LANDMARKS])
+    for joints in (
+        ('shoulder', 'elbow', 'wrist'),
+        ('left_hip', 'right_hip', 'knee', 'ankle', 'heel', 'toe'),
+    )
+)
+EXCHANGES = np.where(
+    np.stack([np.zeros_like(ARMS), np.ones_like(ARMS), ARMS, LEGS]), SIDES, np.arange(len(SIDES))
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +245,16 @@ def window_inputs(
     return WindowInputs(values, axes, seen >= FEWEST)
 
 
+def _exchanged_inputs(order: Index) -> Index:
+    """Inputs (p,) that stand in the place of each where landmarks (L,) stand for one another."""
+    s, count = len(TIMES), len(LANDMARKS)
+    places = np.arange(2 * s * count).reshape(s, count, 2)[:, order].ravel()
+    confidences = np.arange(2 * s * count, 3 * s * count).reshape(s, count)[:, order].ravel()
+    return np.concatenate([places, confidences, np.arange(3 * s * count, INPUTS)])
+
+
+EXCHANGED_INPUTS = np.stack([_exchanged_inputs(order) for order in EXCHANGES])
+
 FOLDER = Path(__file__).resolve().parent / 'models'
 SHIPPED = 'keypoints'
 KIND = 'lifter'
@@ -305,8 +331,12 @@ class Lifter:
         person: Array | None = None,
         *,
         causal: bool,
+        exchanges: Array | None = None,
     ) -> list[LiftedPoses | None]:
         """The mixtures at N times; None where nobody is seen.
+
+        With `exchanges`, sum_e P(e) p(y | r with the sides exchanged by e): a person whose sides a
+        detector exchanges looks like one who faces the other way, so that the window can not tell.
 
         Args:
             stamps: (T,) times of the images, increasing, s.
@@ -315,6 +345,8 @@ class Lifter:
             ups: (N, 3) unit vectors against gravity, camera frame; None: unknown.
             person: proportions of the person; None: unknown.
             causal: whether images after those times do not count.
+            exchanges: (E,) probabilities of `EXCHANGES`, of which the `MOST` heaviest components
+                remain; None: the keypoints are called by their sides.
         """
         rows, there, times = filled(stamps, at, causal=causal)
         n = len(at)
@@ -328,12 +360,23 @@ class Lifter:
         result: list[LiftedPoses | None] = [None] * n
         seen = np.flatnonzero(inputs.known)
         if len(seen):
-            gates, means, deviations = self.network(inputs.values[seen])
-            for i, row in enumerate(seen):
+            found = self._components(inputs.values[seen], exchanges)
+            for row, gates, means, deviations in zip(seen, *found, strict=True):
                 result[row] = LiftedPoses(
-                    self.joints, gates[i], means[i], deviations[i], inputs.axes[row], self.lengths
+                    self.joints, gates, means, deviations, inputs.axes[row], self.lengths
                 )
         return result
+
+    def _components(self, inputs: Floats, exchanges: Array | None) -> tuple[Array, Array, Array]:
+        """Log weights (N, C), means and deviations (N, C, J, 3) for inputs (N, p)."""
+        if exchanges is None:
+            return self.network(inputs)
+        n = len(inputs)
+        found = self.network(inputs[:, EXCHANGED_INPUTS].reshape(-1, INPUTS))
+        gates, means, deviations = (x.reshape(n, -1, *x.shape[2:]) for x in found)
+        gates = gates + np.repeat(elementary.log(exchanges), gates.shape[1] // len(exchanges))
+        kept = np.arange(n)[:, None], np.argsort(-gates, axis=1, kind='stable')[:, :MOST]
+        return log_softmax(gates[kept]), means[kept], deviations[kept]
 
     def to_arrays(self) -> Arrays:
         """The arrays of a file, with half precision."""
@@ -431,17 +474,25 @@ class KeypointHistory:
             self._seen[i] = stamp, turned, confidences
 
     def lift(
-        self, lifter: Lifter, up: Array | None = None, person: Array | None = None
+        self,
+        lifter: Lifter,
+        up: Array | None = None,
+        person: Array | None = None,
+        exchanges: Array | None = None,
     ) -> LiftedPoses | None:
         """The mixture at the last image; None: nobody is seen.
 
         Args:
             up: (3,) unit vector against gravity, camera frame; None: unknown.
             person: proportions of the person; None: unknown.
+            exchanges: see `Lifter.lift`.
         """
         stamps, rays, confidences = (np.array(x) for x in zip(*self._seen, strict=True))
         ups = None if up is None else np.asarray(up)[None]
-        return lifter.lift(stamps, rays, confidences, stamps[-1:], ups, person, causal=True)[0]
+        (found,) = lifter.lift(
+            stamps, rays, confidences, stamps[-1:], ups, person, causal=True, exchanges=exchanges
+        )
+        return found
 
 
 def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> tuple[Array, Array]:

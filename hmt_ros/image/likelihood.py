@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.kinematics import Frames
+from hmt_ros.body.kinematics import Frames, tree_of
 from hmt_ros.body.pose_prior import (
     LEARNED,
     AnglePrior,
@@ -27,14 +27,13 @@ from hmt_ros.body.pose_prior import (
     pose_prior,
 )
 from hmt_ros.body.self_intersection import SelfIntersection
-from hmt_ros.core import record_residuals
+from hmt_ros.core import RECORDED, record_residuals
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of
 from hmt_ros.image.terms.image_term import NO_FACTORS, TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
 from hmt_ros.image.terms.registry import TERMS, Model
-from hmt_ros.image.terms.residuals import RECORDED, tree_of
 from hmt_ros.inference.arrays import Array
 
 OFF = TermSettings(0.0, 1.0, 1.0)

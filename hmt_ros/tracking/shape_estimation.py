@@ -23,10 +23,9 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import ShapeSpace
-from hmt_ros.core import consider_shape, inform_shape
+from hmt_ros.core import RECORDED, consider_shape, inform_shape
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.terms.residuals import RECORDED
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_algebra import product, solve

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from hmt_learning.motion.motion_file import read_skeleton
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.kinematics import (
-    assemble,
     directed_derivatives,
     forward,
     joint_length_jacobians,
+    point_energy,
     point_jacobians,
-    segment_sums,
 )
+from test.oracles.numpy_kinematics import assemble, segment_sums
 
 BODIES = {name: load_body(name) for name in ('human37', 'human34', 'human32')}
 STEP = 1e-6
@@ -159,6 +159,25 @@ def test_assembled_gradient_and_hessian_equal_the_dense_ones(body, random_poses)
     np.testing.assert_allclose(gradient, expected, atol=1e-10)
     np.testing.assert_allclose(hessian, dense, atol=1e-10)
     assert np.linalg.eigvalsh(hessian).min() > -1e-9
+
+
+def test_energy_of_points_equals_the_dense_one(body, random_poses):
+    poses = random_poses(body, 4, 6)
+    rng = np.random.default_rng(7)
+    segments = rng.integers(len(body.skeleton.parents), size=9)
+    local = rng.normal(0, 0.2, (9, 3))
+    targets, across = rng.normal(size=(4, 9, 3)), rng.normal(size=(4, 9, 2, 3))
+    frames = forward(body.skeleton, poses)
+    value, gradient, hessian = point_energy(frames, segments, local, targets, across)
+    places = frames.places(segments, local)
+    residuals = np.einsum('npri,npi->npr', across, places - targets)
+    slopes = across @ point_jacobians(frames, segments, places)
+    np.testing.assert_allclose(value, 0.5 * np.square(residuals).sum((1, 2)), rtol=1e-12)
+    np.testing.assert_allclose(gradient, np.einsum('npr,nprd->nd', residuals, slopes), atol=1e-10)
+    dense = np.einsum('nprd,npre->nde', slopes, slopes)
+    np.testing.assert_allclose(hessian, dense, atol=1e-10)
+    with pytest.raises(ValueError, match='across'):
+        point_energy(frames, segments, local, targets, across[:, :5])
 
 
 def test_point_jacobians_equal_central_differences(body, random_poses):

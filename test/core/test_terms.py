@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.kinematics import forward
+from hmt_ros.body.kinematics import forward, tree_of
 from hmt_ros.core import RECORDED, record_residuals
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface import flesh_table_of
@@ -14,7 +14,6 @@ from hmt_ros.image.terms.depth import DepthInputs
 from hmt_ros.image.terms.edges import ORIENTATIONS, EdgeInputs
 from hmt_ros.image.terms.image_term import Weighting
 from hmt_ros.image.terms.registry import TERMS, Model
-from hmt_ros.image.terms.residuals import tree_of
 from hmt_ros.image.terms.silhouette import CoverageInputs, Outline
 
 CAMERA = Camera(100.0, 100.0, 31.5, 23.5, 64, 48)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.special import logsumexp
 
 from hmt_learning.training.detector_errors import DetectorErrors, with_errors
 from hmt_learning.training.keypoint_tracks import JOINTS, assembled, keypoint_tracks, meet
@@ -16,9 +17,13 @@ from hmt_learning.training.training_set import procedural_sequence
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_angles, root_rotations
+from hmt_ros.body.skeleton import other_side
 from hmt_ros.experts.lifted_fit import lift_poses, poses_of
 from hmt_ros.experts.lifter import (
+    EXCHANGED_INPUTS,
+    EXCHANGES,
     LANDMARKS,
+    MOST,
     PROPORTIONED,
     TIMES,
     KeypointHistory,
@@ -219,6 +224,42 @@ def test_history_sees_what_a_causal_sequence_sees(lifter):
     np.testing.assert_allclose(later[-1].means, whole[-1].means, atol=1e-5)
 
 
+def exchanged(one: Keypoints) -> Keypoints:
+    order = [one.names.index(other_side(name)) for name in one.names]
+    return replace(one, pixels=one.pixels[order], confidences=one.confidences[order])
+
+
+@pytest.mark.parametrize('order', range(len(EXCHANGES)))
+def test_inputs_are_exchanged_as_landmarks_are(order):
+    rng = np.random.default_rng(order)
+    shape = (3, len(TIMES), len(LANDMARKS))
+    rays, sure = rng.normal(0, 0.1, (*shape, 2)), rng.random(shape)
+    known = np.tile(TIMES, (3, 1)), np.zeros((3, 3)), np.zeros((3, len(PROPORTIONED)))
+    found = window_inputs(rays, sure, *known).values[:, EXCHANGED_INPUTS[order]]
+    rows = EXCHANGES[order]
+    wanted = window_inputs(rays[:, :, rows], sure[:, :, rows], *known).values
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+def test_exchanged_sides_are_among_the_answers():
+    """Poses near a person whose sides are exchanged get some of the weight."""
+    poses, stamps = turned(walking(20), [0, 1, 0], 20), np.arange(20) / 30.0
+    seen = [exchanged(one) for one in detected(poses)]
+    rays, sure = (np.array([landmark_rays(CAMERA, x)[i] for x in seen]) for i in range(2))
+    lifter = load_lifter()
+    true = truly_lifted(poses[-1:])[0].means[0]
+
+    def weight_near(exchanges):
+        (one,) = lifter.lift(stamps, rays, sure, stamps[-1:], causal=True, exchanges=exchanges)
+        distances = np.linalg.norm(one.means - true, axis=2).mean(1)
+        assert logsumexp(one.log_weights) == pytest.approx(0.0, abs=1e-9)
+        assert len(distances) == (5 if exchanges is None else MOST)
+        return np.exp(one.log_weights)[distances < 0.1].sum()
+
+    assert weight_near(None) < 0.08
+    assert 0.1 < weight_near(np.array([0.8, 0.1, 0.05, 0.05])) < 0.2
+
+
 def test_history_follows_a_camera_that_turns(lifter):
     poses = walking(5)
     turn = ray_rotations(np.array([[0.1, 0.05, 1.0]]))[0]
@@ -270,6 +311,18 @@ def test_poses_have_the_lifted_joints_where_the_keypoints_are():
         # How far away the person is depends on the size.
         depth = mixture.covariances[0, 2, 2] ** 0.5
         assert depth == pytest.approx(0.06 * mixture.means[0, 2], rel=0.3)
+
+
+def test_poses_of_a_long_clip_are_those_of_each_image():
+    poses = walking(6)
+    turning = np.tile(poses, (8, 1))
+    turning[:, BODY.dof_names.index('root_z')] += np.linspace(0.0, 60.0, len(turning))
+    rays = np.zeros((len(turning), len(LANDMARKS), 2))
+    sure = np.zeros((len(turning), len(LANDMARKS)))
+    lifted = truly_lifted(turning)
+    together = poses_of(BODY, lifted, rays, sure, 0.06)
+    alone = poses_of(BODY, lifted[-1:], rays[-1:], sure[-1:], 0.06)
+    np.testing.assert_allclose(together[-1].means, alone[0].means, atol=1e-6)
 
 
 def test_a_larger_person_is_further_away():

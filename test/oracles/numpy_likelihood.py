@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera
-from hmt_ros.body.kinematics import Frames, assemble, forward, segment_sums
+from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.core import (
     BEHIND,
     COVER,
@@ -34,6 +34,7 @@ from hmt_ros.image.surface_points import SurfacePoints, coarse_mesh
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.silhouette import Outline
 from test.oracles.numpy_contour import occluding_contour
+from test.oracles.numpy_kinematics import assemble, segment_sums
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

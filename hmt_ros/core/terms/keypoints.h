@@ -9,6 +9,7 @@
 #pragma once
 
 #include "../camera.h"
+#include "../kinematics.h"
 #include "../log_sum_exp.h"
 #include "../residuals.h"
 
@@ -130,16 +131,6 @@ struct KeypointRoom {
     return sums;
   }
 };
-
-// Place (3,) in the camera frame of a point of a segment.
-inline void place_point(const Tables& columns, const Table& origins, Index segment,
-                        const double* offset, double* place) {
-  const double *column = columns[segment].data, *origin = origins[segment].data;
-  for (int i = 0; i < 3; ++i) {
-    place[i] = origin[i];
-    for (int j = 0; j < 3; ++j) place[i] += column[3 * j + i] * offset[j];
-  }
-}
 
 // The landmark of a keypoint at a pose.
 struct Landmark {

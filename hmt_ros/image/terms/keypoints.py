@@ -20,9 +20,15 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera, Lens
-from hmt_ros.body.kinematics import Frames
+from hmt_ros.body.kinematics import Frames, Tree, tree_of
 from hmt_ros.body.skeleton import Skeleton, other_side
-from hmt_ros.core import elementary, exchange_posteriors, keypoint_errors, record_keypoints
+from hmt_ros.core import (
+    RECORDED,
+    elementary,
+    exchange_posteriors,
+    keypoint_errors,
+    record_keypoints,
+)
 from hmt_ros.image.keypoint_schemes import (
     MIRROR,
     landmarks_of,
@@ -31,7 +37,6 @@ from hmt_ros.image.keypoint_schemes import (
 )
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, middle_of_hips
 from hmt_ros.image.terms.image_term import NO_FACTORS, TermSettings
-from hmt_ros.image.terms.residuals import RECORDED, Tree, tree_of
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import cholesky, inverse
 

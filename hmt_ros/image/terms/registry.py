@@ -11,11 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from hmt_ros.body.camera import Lens
+from hmt_ros.body.kinematics import Tree
 from hmt_ros.image.surface import FleshTable
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.edges import EDGES
 from hmt_ros.image.terms.image_term import ImageTerm
-from hmt_ros.image.terms.residuals import Tree
 from hmt_ros.image.terms.silhouette import COVERAGE
 from hmt_ros.inference.arrays import Mask
 
