@@ -3,7 +3,7 @@
 # make setup  the workspace, with MediaPipe Pose       make soak   nodes under load and faults
 # make clean  restores the state of a clone            make detector  MediaPipe Pose alone
 # make core   compiles the core of the sources         make sanitize  its tests, with sanitizers
-# make learn  learns everything again from DATA=...
+# make learn  learns everything again from DATA=...   make figures  those of the papers, in docs/
 #
 # Each works as the first command after a clone: it installs its requirements into .venv and builds
 # the packages once. See CONTRIBUTING.md.
@@ -11,7 +11,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -e -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup core detector demo test lint sanitize bench soak learn clean lock
+.PHONY: help setup core detector demo test lint sanitize bench soak learn figures clean lock
 
 # Small matrices: a second BLAS thread costs more than it saves.
 export OMP_NUM_THREADS := 1
@@ -74,6 +74,11 @@ bench:
 soak:
 	@$(WORKSPACE) ros test core build
 	@$(SOURCED) python -m benchmarks soak --minutes $(SOAK_MINUTES) $(ARGS)
+
+figures:
+	@$(WORKSPACE) ros test core build
+	@$(WITH_DETECTOR)
+	@$(SOURCED) for papers in sampling smoothing experts; do python docs/figures_$$papers.py; done
 
 learn:
 	@$(WORKSPACE) ros test core build

@@ -1,11 +1,13 @@
 """experts: what the predictor that ships says of the images of clips with truth, and its speed.
 
-Masks are the true ones, and those of background subtraction with the empty scene. Nobody of the
-clips was learned from.
+Masks are the true ones, those of background subtraction with the empty scene, and of real people
+those of a detector, where it is installed. Where the truth has no hips, joints are compared from
+the middle of the shoulders. Nobody of the clips was learned from.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,29 +15,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clips import Clip, find_clips, read_clip, table
+from benchmarks.clips import Clip, find_clips, read_clip, table, with_file
 from benchmarks.command import benchmark_parser, run_benchmark
 from benchmarks.machine import best_time, description
+from benchmarks.real_clips import BEAM, DESKS
 from benchmarks.runs import in_processes
 from benchmarks.tracking_means import GROUPS, group_of
+from benchmarks.truth_fits import SHOULDERS
+from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.evaluation.pose_scores import joint_mixtures, origin_joints, score
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError, person_blob
-from hmt_ros.experts.pose_predictor import ALONE, BY_DYNAMICS, PosePredictor, load_predictor
+from hmt_ros.experts.pose_predictor import PosePredictor, load_predictor
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Image
 from msg_tools.files.array_file import read_archive
 
 Mask = NDArray[np.uint8]
 
 BEST_OF = 5
 QUICK = 8  # images
-STEP = 2  # interval of the images that are predicted without propagation
-TRUE, SUBTRACTED = 'true', 'subtracted'
-COLUMNS = (
-    'best_mm', 'heaviest_mm', 'depth_error', 'coverage_90', 'joint_coverage_90',
-    'propagated_best_mm', 'propagated_heaviest_mm',
-)  # fmt: skip
+STEP = 2  # interval of the images
+TRUE, SUBTRACTED, DETECTED = 'true', 'subtracted', 'detected'
+# Clips of real people.
+REAL = (BEAM, DESKS[0])
+COLUMNS = 'best_mm', 'heaviest_mm', 'depth_error', 'coverage_90', 'joint_coverage_90'
 
 
 def main(argv: list[str]) -> int:
@@ -58,6 +63,8 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
         ValueError: there are no clips, or one can not be read.
     """
     folders, _ = find_clips(clips, moving=True, quick=quick)
+    if not clips and not quick and folders[0].parent.joinpath(DESKS[0]).is_dir():
+        folders = [*folders, *with_file(DESKS[:1], None, 'truth.npz')]
     work = [(folder, QUICK if quick else None) for folder in folders]
     found = in_processes(of_clip, work, 1 if quick else 0, 'experts')
     by_clip = {folder.name: one for (folder, _), one in zip(work, found, strict=True) if one}
@@ -101,6 +108,8 @@ def of_clip(work: tuple[Path, int | None]) -> dict[str, dict[str, float]]:
     true = true_masks(clip)
     if true is not None:
         masks[TRUE] = true
+    if clip.folder.name in REAL and DETECTORS[USUAL_DETECTOR].is_installed():
+        masks[DETECTED] = detected_masks(clip.images, clip.stamps)
     return {kind: of_masks(predictor, clip, which) for kind, which in masks.items()}
 
 
@@ -114,13 +123,21 @@ def true_masks(clip: Clip) -> list[Mask] | None:
     return [np.unpackbits(packed[stamp], axis=1)[:, :width] for stamp in clip.stamps]
 
 
+def detected_masks(images: Sequence[Image], stamps: Sequence[int]) -> list[Mask]:
+    """The masks that the usual detector finds in images; empty where it finds none."""
+    detector = DETECTORS[USUAL_DETECTOR].make(with_mask=True)
+    result = []
+    for image, stamp in zip(images, stamps, strict=True):
+        detector.detect(image, stamp)
+        mask = np.zeros(image.shape[:2]) if detector.mask is None else detector.mask
+        result.append(np.asarray(mask, dtype=np.uint8))
+    return result
+
+
 def of_masks(predictor: PosePredictor, clip: Clip, masks: Sequence[Mask]) -> dict[str, float]:
-    """Errors of single predictions and of propagated ones, mm, and coverage."""
-    rows = np.arange(0, len(masks), STEP)
-    alone = predictions(predictor, clip, masks, rows)
-    after = predictions(predictor, clip, masks, np.arange(len(masks)), BY_DYNAMICS)
+    """Errors of predictions, mm, and coverage."""
+    alone = predictions(predictor, clip, masks, np.arange(0, len(masks), STEP))
     found = _scores(predictor, clip, alone, 200)
-    followed = _scores(predictor, clip, after, 2)
     depth = true_depths(clip.truth, [clip.stamps[i] for i in alone])
     off = [abs(x.means[0, 2] - z) / z for x, z in zip(alone.values(), depth, strict=True)]
     return {
@@ -129,8 +146,6 @@ def of_masks(predictor: PosePredictor, clip: Clip, masks: Sequence[Mask]) -> dic
         'depth_error': float(np.mean(off)),
         'coverage_90': found['coverage_90'],
         'joint_coverage_90': found['joint_coverage_90'],
-        'propagated_best_mm': followed['best_mm'],
-        'propagated_heaviest_mm': followed['heaviest_mm'],
     }
 
 
@@ -138,40 +153,40 @@ def _scores(
     predictor: PosePredictor, clip: Clip, found: dict[int, GaussianMixture], samples: int
 ) -> dict[str, float]:
     names = clip.truth.joint_names
-    scored, origin = clip.truth.evaluated_joints(), origin_joints(names)
+    origin = _origin(clip.truth)
     every = np.array([clip.truth.joints[clip.stamps[i]] for i in found])
+    known = np.isfinite(every).all((0, 2))
+    scored = tuple(x for x in clip.truth.evaluated_joints() if known[names.index(x)])
     true = every[:, [names.index(x) for x in scored]]
     true = true - every[:, [names.index(x) for x in origin]].mean(1, keepdims=True)
     mixtures = joint_mixtures(predictor.body, [*found.values()], scored, origin=origin)
     return score(mixtures, true, scored, samples=samples).summary()
 
 
+def _origin(truth: Truth) -> tuple[str, ...]:
+    seen = np.isfinite(np.array([*truth.joints.values()])).all((0, 2))
+    try:
+        return origin_joints([x for x, known in zip(truth.joint_names, seen) if known])
+    except ValueError:
+        return SHOULDERS
+
+
 def predictions(
-    predictor: PosePredictor, clip: Clip, masks: Sequence[Mask], rows: NDArray[np.intp],
-    propagation: str = ALONE,
-) -> dict[int, GaussianMixture]:  # fmt: skip
+    predictor: PosePredictor, clip: Clip, masks: Sequence[Mask], rows: NDArray[np.intp]
+) -> dict[int, GaussianMixture]:
     """Mixtures over poses by the row of the image, of those that show somebody and have truth."""
     result: dict[int, GaussianMixture] = {}
-    before: GaussianMixture | None = None
-    last = 0
     for i in rows.tolist():
-        interval = 1e-9 * (clip.stamps[i] - last)
-        try:
-            seen = predictor.observe(
-                masks[i], clip.camera, before, interval, propagation=propagation,
-                max_components=BEST_OF,
-            )  # fmt: skip
-        except NoSilhouetteError:
-            continue
-        before, last = seen.mixture, clip.stamps[i]
         if clip.stamps[i] in clip.truth.joints:
-            result[i] = seen.mixture
+            with contextlib.suppress(NoSilhouetteError):
+                seen = predictor.observe(masks[i], clip.camera, max_components=BEST_OF)
+                result[i] = seen.mixture
     return result
 
 
 def true_depths(truth: Truth, stamps: Sequence[int]) -> NDArray[np.float64]:
     """Depth of the hips or the pelvis (T,), m."""
-    rows = [truth.joint_names.index(x) for x in origin_joints(truth.joint_names)]
+    rows = [truth.joint_names.index(x) for x in _origin(truth)]
     return np.array([truth.joints[stamp][rows, 2].mean() for stamp in stamps])
 
 
@@ -185,8 +200,6 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         'depth',
         '90 %',
         'joint 90 %',
-        'by rule (9): best',
-        'heaviest',
     ]
     rows = [head]
     for name, entry in [*result['clips'].items(), *result['means'].items()]:

@@ -145,3 +145,8 @@ def test_what_computes_is_sampled(tmp_path):
     found = [one for one in sampling.read_samples(file) if one.thread == 'MainThread']
     assert sum(one.seconds for one in found) > 0.1
     assert ('msg_tools/messages/headers.py', 'stamp_in') in {x for one in found for x in one.stack}
+
+
+def test_models_that_compete_need_time(capsys):
+    assert main(['contenders', '--quick', '--budget', '0']) == 1
+    assert '--budget 0: wanted some seconds' in capsys.readouterr().err

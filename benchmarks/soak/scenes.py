@@ -202,7 +202,7 @@ def _bme() -> Scene:
         (
             {},
             {'image_transport': 'raw', 'reset_on_time_jump': True},
-            {'propagation': 'dynamics', 'reset_on_time_jump': True},
+            {'max_hypotheses': 3, 'reset_on_time_jump': True},
             {'background_file': ''},
         ),
     )

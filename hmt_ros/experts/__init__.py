@@ -2,7 +2,7 @@
 
 from hmt_ros.experts.calibrated_experts import CalibratedExperts
 from hmt_ros.experts.conditional_density import ConditionalDensity
-from hmt_ros.experts.density_propagation import propagate, propagate_by_dynamics
+from hmt_ros.experts.density_propagation import propagate
 from hmt_ros.experts.expert_mixture import (
     ConditionalExperts,
     JointExperts,
@@ -28,5 +28,4 @@ __all__ = [
     'load_lifter',
     'load_predictor',
     'propagate',
-    'propagate_by_dynamics',
 ]

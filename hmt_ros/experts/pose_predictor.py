@@ -4,8 +4,7 @@
     mask -> bounding box -> root of each component -> mixture over poses
 
 One object and one file hold everything that is learned. The mixture of the image before can be
-propagated (BME 2.1): by rule (9), with the motion prior of the body over any interval, or by
-rule (1), with a model of p(x_t | x_t-1, r_t) that has learned for one step.
+propagated by rule (1) (BME 2.1), with a model of p(x_t | x_t-1, r_t) that has learned for one step.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from hmt_ros.body.learned_file import (
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.core import elementary
 from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
-from hmt_ros.experts.density_propagation import joined, propagate, propagate_by_dynamics
+from hmt_ros.experts.density_propagation import joined, propagate
 from hmt_ros.experts.descriptor.contour import PersonBlob, centred_view, person_blob
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
     ANGULAR,
@@ -47,7 +46,7 @@ from hmt_ros.experts.descriptor.silhouette_descriptor import (
     SilhouetteParts,
     silhouette_parts,
 )
-from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
+from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.root_placement import (
     SIZE_SPREAD,
     place_roots,
@@ -55,7 +54,6 @@ from hmt_ros.experts.root_placement import (
 )
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.inference.linear_algebra import inverse, product, singular_values
 from hmt_ros.inference.reduction import reduced
 
@@ -70,15 +68,11 @@ LIGHTEST = 1e-3  # weight below which a component is dropped
 RATE = 30.0
 STEP = 1.0 / RATE
 JITTER = 1e-9  # variance that is added to poses, m^2 and rad^2
-# How a mixture is propagated: by rule (9), by rule (1), or not at all.
-BY_DYNAMICS, BY_EXPERTS, ALONE = 'dynamics', 'experts', 'none'
-PROPAGATIONS = (BY_DYNAMICS, BY_EXPERTS, ALONE)
-# Rate at which a past turns out to be wrong, per second: a track that is lost recovers. Time for
-# which errors of silhouettes last, s. Both are chosen.
-FORGETTING, LASTING = 5.0, 0.02
-# Axes of unit length have no spread along themselves, and those that are predicted have no unit
-# length: variance that is added to both.
-OF_AXES = 0.5**2
+# How a mixture is propagated: by rule (1), or not at all.
+BY_EXPERTS, ALONE = 'experts', 'none'
+PROPAGATIONS = (BY_EXPERTS, ALONE)
+# Rate at which a past turns out to be wrong, per second: a track that is lost recovers. Chosen.
+FORGETTING = 5.0
 # Largest condition of a basis of targets; how much an offset may differ from the usual one, m.
 WORST_CONDITION, OFFSET = 1e12, 0.06
 
@@ -176,7 +170,7 @@ class PosePredictor:
         previous: GaussianMixture | None = None,
         interval: float = STEP,
         *,
-        propagation: str = BY_DYNAMICS,
+        propagation: str = ALONE,
         max_components: int = MAX_COMPONENTS,
         size_spread: float = SIZE_SPREAD,
     ) -> Prediction:
@@ -234,7 +228,7 @@ class PosePredictor:
         previous: GaussianMixture | None = None,
         interval: float = STEP,
         *,
-        propagation: str = BY_DYNAMICS,
+        propagation: str = ALONE,
         max_components: int = MAX_COMPONENTS,
     ) -> GaussianMixture:
         """Mixture over targets (D,) for one descriptor, heaviest component first.
@@ -250,14 +244,6 @@ class PosePredictor:
         if previous is None or propagation == ALONE:
             return _transformed(found, self._from_basis)
         forgotten = -float(elementary.expm1(-FORGETTING * interval))
-        if propagation == BY_DYNAMICS:
-            return self._by_dynamics(
-                _transformed(found, self._from_basis),
-                previous,
-                interval,
-                forgotten,
-                max_components,
-            )
         if propagation != BY_EXPERTS:
             raise ValueError(f'no propagation {propagation!r}, wanted one of {PROPAGATIONS}')
         if self.dynamics is None:
@@ -278,32 +264,6 @@ class PosePredictor:
         whole = joined([(1.0 - forgotten, after), (forgotten, found)])
         whole = _heaviest(reduced(whole, max_components), max_components)
         return _transformed(whole, self._from_basis)
-
-    def _by_dynamics(
-        self,
-        found: GaussianMixture,
-        previous: GaussianMixture,
-        interval: float,
-        forgotten: float,
-        count: int,
-    ) -> GaussianMixture:
-        """Rule (9), over targets."""
-        prior = self._to_targets(self._expected(previous, interval))
-        wider = np.zeros(self.encoding.size)
-        wider[:AXES] = OF_AXES
-        prior, found = (
-            GaussianMixture(x.weights, x.means, x.covariances + np.diag(wider))
-            for x in (prior, found)
-        )
-        result = propagate_by_dynamics(
-            prior,
-            found,
-            self.equilibrium,
-            share=share_of_time(interval, LASTING),
-            forgotten=forgotten,
-            n_components=count,
-        )
-        return _heaviest(result, count)
 
     def _expected(self, poses: GaussianMixture, interval: float) -> GaussianMixture:
         """The mixture over poses after an interval, s, by the motion prior of the body."""

@@ -28,6 +28,10 @@ from hmt_ros.inference.arrays import Array, Index
 INDEPENDENT = 1e-8
 # Two functions that differ by less than this share of their squares count as one.
 ALIGNED = 1e-8
+# Largest standard deviation of a weight, in standard deviations of the outputs. Kernels of which the
+# samples of an expert see the tails alone would get weights without bounds, and what they say near
+# their centres.
+LARGEST_WEIGHT = 10.0
 ROUNDS = 100  # of greedy steps, each followed by a new estimate of the noise
 
 
@@ -214,6 +218,9 @@ class _GreedyState:
         half = columns @ self.covariance
         self.S = np.diagonal(self.gram) - (half * columns).sum(1)
         self.Q = whitened - half @ whitened[self.active]
+        spread = np.linalg.solve(factor, np.linalg.solve(factor, sums.outer).T)
+        variance = max(float(np.trace(spread)) / (self.outputs * sums.total), 1e-300)
+        self.least_precision = 1.0 / (LARGEST_WEIGHT**2 * variance)
         self.least = INDEPENDENT * np.maximum(np.diagonal(self.gram), 1e-300)
         self.is_active = np.zeros(len(self.gram), dtype=bool)
         self.is_active[self.active] = True
@@ -236,19 +243,22 @@ class _GreedyState:
         return True
 
     def _best(self) -> tuple[int, float, float]:
-        """The function with the largest gain of evidence, the gain, and its new precision."""
+        """The function with the largest gain of evidence, the gain, and its new precision.
+
+        At precision a a function adds 1/2 (d log(a / (a + s)) + q / (a + s)).
+        """
         d = self.outputs
         s, q = self.S.copy(), np.einsum('kd,kd->k', self.Q, self.Q)
         # Active functions are treated as if they were not in the model.
         a, own = self.precisions, self.active
         variances = np.diagonal(self.covariance)
         s[own], q[own] = 1.0 / variances - a, q[own] / (a * variances) ** 2
-        ratio = q / (d * s)
         worth = q > d * s
         worth[own] &= s[own] > INDEPENDENT * a
         s[own] = np.maximum(s[own], 0.0)
-        best = np.where(worth, d * s**2 / np.where(worth, q - d * s, 1.0), np.inf)
-        gain = np.where(worth, 0.5 * d * (ratio - 1.0 - np.log(ratio)), 0.0)
+        best = d * s**2 / np.where(worth, q - d * s, 1.0)
+        best = np.where(worth, np.maximum(best, self.least_precision), np.inf)
+        gain = 0.5 * (d * np.log1p(-s / (best + s)) + q / (best + s))
         gain[self.excluded | (~self.is_active & (self.least >= self.S))] = -np.inf
         gain[own] -= 0.5 * (d * np.log(a / (a + s[own])) + q[own] / (a + s[own]))
         gain[np.isnan(gain)] = -np.inf

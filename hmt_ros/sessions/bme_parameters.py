@@ -38,9 +38,8 @@ class BmeParameters(CameraNodeParameters):
             where these show nobody.
         lifter: Experts that predict from keypoints, 'keypoints', which ships, or a file that
             'learn lifter' wrote.
-        propagation: How a prediction depends on the one before: 'none', 'dynamics' or 'experts'.
-            Dynamics are rule (9) of the paper with the motion prior; experts are rule (1), trained
-            with --dynamics.
+        propagation: How a prediction depends on the one before: 'none', or 'experts', rule (1) of
+            the paper, which needs a model trained with --dynamics.
         max_hypotheses: Maximum number of components of a prediction.
         tracked_interval: Interval between two predictions while pose_mixture says that the filter
             tracks the person, by the stamps of the images, s; 0 predicts from every image.

@@ -23,7 +23,7 @@ from hmt_ros.experts import (
 from hmt_ros.experts.calibrated_experts import Calibration
 from hmt_ros.experts.lifter import Lifter, Network
 from hmt_ros.experts.network_experts import Layers
-from hmt_ros.experts.pose_predictor import BY_DYNAMICS, BY_EXPERTS
+from hmt_ros.experts.pose_predictor import BY_EXPERTS
 from hmt_ros.experts.training_pairs import Standardisation
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -158,10 +158,9 @@ def predictions(model: object) -> list[GaussianMixture]:
     """
     if isinstance(model, PosePredictor):
         first = model.observe(MASK, CAMERA).mixture
-        ways = [BY_DYNAMICS, BY_EXPERTS] if model.dynamics is not None else [BY_DYNAMICS]
-        return [first] + [
-            model.observe(MASK, CAMERA, first, 0.1, propagation=way).mixture for way in ways
-        ]
+        if model.dynamics is None:
+            return [first]
+        return [first, model.observe(MASK, CAMERA, first, 0.1, propagation=BY_EXPERTS).mixture]
     if isinstance(model, Lifter):
         rng = np.random.default_rng(6)
         inputs = [s * rng.normal(size=len(model.network.mean)) for s in (0.0, 1.0, 5.0)]

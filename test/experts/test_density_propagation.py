@@ -5,10 +5,8 @@ import pytest
 
 from hmt_ros.experts import JointExperts
 from hmt_ros.experts.density_propagation import (
-    divided_product,
     linearised_products,
     propagate,
-    propagate_by_dynamics,
 )
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.reduction import reduced
@@ -106,6 +104,26 @@ def test_kernel_experts_agree_with_samples(kernel_model, rng):
     assert 0.05 * np.abs(counted - np.exp(found.log_density(middle))).sum() < 0.15
 
 
+def test_rule_one_on_a_grid(linear_model):
+    """The integral of rule (1) over a grid of states before, in two dimensions."""
+    before = GaussianMixture(
+        [0.6, 0.4], [[0.0, 0.4], [-0.8, 0.1]], np.array([0.03, 0.05])[:, None, None] * np.eye(2)
+    )
+    observation = np.array([0.2])
+    found = linearised_products(linear_model, before, observation)
+    axis = np.linspace(-2.0, 2.0, 81)
+    states = np.stack(np.meshgrid(axis, axis, indexing='ij'), axis=-1).reshape(-1, 2)
+    shares = np.exp(before.log_density(states))
+    shares /= shares.sum()
+    inputs = np.hstack([states, np.broadcast_to(observation, (len(states), 1))])
+    weights, means, covariances = linear_model.predict_arrays(inputs)
+    at = found.sample(60, np.random.default_rng(3))
+    whole = GaussianMixture(
+        (shares[:, None] * weights).ravel(), means.reshape(-1, 2), covariances.reshape(-1, 2, 2)
+    )
+    np.testing.assert_allclose(found.log_density(at), whole.log_density(at), atol=0.05)
+
+
 def test_rule_one_reduces_and_sorts(linear_model, previous):
     found = propagate(linear_model, previous, np.array([0.4]))
     assert len(found) == 2
@@ -133,77 +151,3 @@ def test_dimensions_that_do_not_fit_are_named(linear_model, previous):
         propagate(linear_model, previous, np.zeros(1), without_past=alone)
     with pytest.raises(ValueError, match='0 components'):
         reduced(previous, 0)
-
-
-GRID = np.linspace(-12.0, 14.0, 8001)[:, None]
-STEP = float(GRID[1, 0] - GRID[0, 0])
-
-
-def on_grid(*mixtures):
-    return [np.exp(one.log_density(GRID)) for one in mixtures]
-
-
-@pytest.fixture(scope='module')
-def factors():
-    a = GaussianMixture([0.3, 0.7], [[0.0], [1.0]], [[[0.2]], [[0.1]]])
-    b = GaussianMixture([0.5, 0.5], [[0.5], [2.0]], [[[0.3]], [[0.2]]])
-    return a, b
-
-
-def test_product_over_a_gaussian_is_exact(factors):
-    wide = GaussianMixture([1.0], [[0.5]], [[[2.0]]])
-    a, b, c = on_grid(*factors, wide)
-    expected = a * b / c / (a * b / c).sum() / STEP
-    found = divided_product(*factors, wide)
-    np.testing.assert_allclose(on_grid(found)[0], expected, atol=1e-12)
-
-
-def test_product_over_a_mixture_is_weighted_at_its_means(factors):
-    wide = GaussianMixture([0.6, 0.4], [[-1.0], [4.0]], [[[6.0]], [[6.0]]])
-    a, b, c = on_grid(*factors, wide)
-    expected = a * b / c / (a * b / c).sum() / STEP
-    assert STEP * np.abs(on_grid(divided_product(*factors, wide))[0] - expected).sum() < 0.05
-
-
-def test_a_narrow_equilibrium_keeps_the_product_a_density(factors):
-    narrow = GaussianMixture([1.0], [[0.5]], [[[0.01]]])
-    found = divided_product(*factors, narrow)
-    assert np.isfinite(found.weights).all()
-    assert (found.covariances > 0).all()
-
-
-def test_rule_nine_on_a_grid(kernel_model):
-    previous = GaussianMixture([1.0], [[0.2]], [[[1e-4]]])
-    predicted = GaussianMixture([0.5, 0.5], [[1.3], [-0.7]], [[[0.3]], [[0.3]]])
-    equilibrium = GaussianMixture([1.0], [[0.0]], [[[1.6]]])
-    prior = linearised_products(kernel_model, previous, np.zeros(0))
-    found = propagate_by_dynamics(prior, predicted, equilibrium, n_components=4)
-    a, b, c = on_grid(prior, predicted, equilibrium)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        expected = np.where(a * b > 1e-250, a * b / c, 0.0)
-    expected /= expected.sum() * STEP
-    assert STEP * np.abs(on_grid(found)[0] - expected).sum() < 1e-3
-
-
-def test_rule_nine_leaves_a_wrong_past():
-    """Far from the past an observation is believed with the odds that the past is wrong."""
-    prior = GaussianMixture([1.0], [[-4.0]], [[[0.04]]])
-    predicted = GaussianMixture([1.0], [[4.0]], [[[0.1]]])
-    equilibrium = GaussianMixture([1.0], [[0.0]], [[[9.0]]])
-    stays = propagate_by_dynamics(prior, predicted, equilibrium, n_components=2)
-    assert abs(stays.means[0, 0] - 4.0) > 1.0
-    leaves = propagate_by_dynamics(prior, predicted, equilibrium, forgotten=1e-3, n_components=2)
-    assert leaves.means[0, 0] == pytest.approx(4.0, abs=0.05)
-    assert leaves.weights[0] > 0.99
-
-
-def test_a_repeated_observation_tells_its_share():
-    prior = GaussianMixture([1.0], [[0.0]], [[[1.0]]])
-    predicted = GaussianMixture([1.0], [[1.0]], [[[0.5]]])
-    equilibrium = GaussianMixture([1.0], [[0.0]], [[[4.0]]])
-    nothing = propagate_by_dynamics(prior, predicted, equilibrium, share=0.0)
-    np.testing.assert_allclose(nothing.means, prior.means)
-    np.testing.assert_allclose(nothing.covariances, prior.covariances)
-    half = propagate_by_dynamics(prior, predicted, equilibrium, share=0.5)
-    assert half.covariances[0, 0, 0] == pytest.approx(1.0 / (1.0 + 0.5 * (2.0 - 0.25)))
-    assert half.means[0, 0] == pytest.approx(half.covariances[0, 0, 0] * 0.5 * 2.0)

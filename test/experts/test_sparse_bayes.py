@@ -163,6 +163,20 @@ def test_equal_candidates_are_taken_once(problem, prior):
     assert np.isfinite(found.evidence)
 
 
+def test_tails_of_kernels_get_no_weight_without_bounds(prior):
+    """Seen by their tails alone kernels would say anything near their centres."""
+    rng = np.random.default_rng(1)
+    r = rng.uniform(0.0, 1.0, (200, 1))
+    centres = np.array([[4.0, 5.0, 6.0, 8.0]])
+    targets = np.exp(2.0 * r) @ np.ones((1, D)) + 0.01 * rng.normal(size=(200, D))
+    targets -= targets.mean(0)
+    sums = WeightedSums.of(np.exp(-0.5 * (r - centres) ** 2), targets, np.ones(200))
+    found = maximise_evidence(sums, prior)
+    at = np.linspace(-2.0, 10.0, 50)[:, None]
+    said = found.mean(np.exp(-0.5 * (at - centres) ** 2))
+    assert np.abs(said).max() < 100.0 * targets.std()
+
+
 def test_targets_that_are_pure_noise_need_no_function(prior):
     rng = np.random.default_rng(3)
     features = np.exp(-0.5 * (rng.normal(size=(200, 1)) - rng.normal(size=40)) ** 2)

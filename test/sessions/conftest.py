@@ -304,7 +304,7 @@ class StubPredictor:
         return self
 
     def observe(
-        self, mask, camera, previous=None, interval=1 / 30, *, propagation='dynamics',
+        self, mask, camera, previous=None, interval=1 / 30, *, propagation='none',
         max_components=8, size_spread=0.06,
     ):  # fmt: skip
         if self.fault is not None:

@@ -127,8 +127,9 @@ def test_masks_are_the_silhouettes(session, outputs, somebody, stub_predictor):
     assert [len(message.components) for message in predictions(outputs)] == [2, *[0] * 7, 2]
 
 
-def test_predictions_take_those_before_into_account(session, somebody, stub_predictor):
-    one = session(propagation='dynamics')
+def test_predictions_take_those_before_into_account(session, somebody, stub_predictor, monkeypatch):
+    monkeypatch.setattr(stub_predictor, 'dynamics', 'a model')
+    one = session(propagation='experts')
     one.take(CAMERA_INFO, somebody.info())
     for index in (0, 1, 7):
         one.take(IMAGE, somebody.image(index))

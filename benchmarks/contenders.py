@@ -1,0 +1,457 @@
+"""contenders: models of p(pose | image) with the same pairs and the same processor time (BME 3).
+
+Every model gets the same inputs, targets and pairs, and so much processor time: it learns from
+twice as many pairs, or a network in twice as many steps, until the next time would be too long; the
+last one counts. All are calibrated on motions left out, within that time.
+
+keypoints      windows of keypoints of a detector that errs, `experts.lifter`
+silhouettes    descriptors of silhouettes as uneven as those of background subtraction
+targets        joints along the axes of a camera that looks at the person
+
+Both are reduced to principal components. Nobody of the tested motions is learned from. Distances
+are those of the joints from the truth, seen from the pelvis: of the heaviest component, and of the
+best of the five heaviest. The log density is that of the components of targets, nats a number;
+regions are those of single coordinates of joints. What ships learned from more, for hours. Numbers
+of experts were chosen with these people in view.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from benchmarks.clips import development_folder, table
+from benchmarks.command import benchmark_parser, run_benchmark
+from benchmarks.machine import best_time, description
+from benchmarks.runs import in_processes
+from hmt_learning.training.calibration_learning import LearningCalibration
+from hmt_learning.training.keypoint_tracks import JOINTS, keypoint_tracks
+from hmt_learning.training.keypoint_training import WindowSettings, training_windows
+from hmt_learning.training.lifter_learning import PELVIS, SCORED
+from hmt_learning.training.network_learning import LearningNetwork, tools_are_there
+from hmt_learning.training.predictor_learning import described
+from hmt_learning.training.training_set import (
+    PoseSequence,
+    TrainingSettings,
+    motion_files,
+    procedural_sequence,
+    recorded_sequence,
+    training_set,
+)
+from hmt_ros.body import load_body
+from hmt_ros.experts import ConditionalExperts, JointExperts, LocalExperts, NearestNeighbours
+from hmt_ros.experts.conditional_density import ConditionalDensity
+from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
+from hmt_ros.experts.lifter import load_lifter
+from hmt_ros.experts.pose_encoding import ray_rotations
+from hmt_ros.experts.pose_predictor import load_predictor
+from hmt_ros.image.lifted_poses import HIPS
+
+Array = NDArray[np.float64]
+
+BUDGET = 60.0  # s of processor time for each model
+KEYPOINTS, SILHOUETTES = 'keypoints', 'silhouettes'
+CUES = (KEYPOINTS, SILHOUETTES)
+PAIRS = {KEYPOINTS: 24_000, SILHOUETTES: 12_000}
+TESTED = 250  # pairs of an activity
+INPUTS, TARGETS = 40, 24  # principal components
+FIRST, FIRST_STEPS = 400, 250  # pairs, and steps, of the first time
+QUICK = 60  # pairs, with --quick
+GROWTH = 2.6  # of the time for twice as many pairs, at most
+BEST_OF = 5
+SHARES = (0.5, 0.9)
+
+# Tested motions by activity, and those of people who sit: two of UI-PRMD are left out.
+ACTIVITIES = {
+    'walking': ('cmu_06_01_walk', 'cmu_15_wander'),
+    'running': ('cmu_run_c',),
+    'turning': ('cmu_06_10_turns',),
+    'conversation': ('cmu_14_19_laugh', 'cmu_14_traffic', 'cmu_signals_b'),
+    'dance': ('cmu_93_charleston1', 'fair_dab'),
+    'other': ('cmu_03_01_uneven', 'cmu_06_15_shoot', 'cmu_14_washwindow'),
+    'sitting': ('prmd_s07_m05_sittostand', 'prmd_s08_m05_sittostand'),
+}
+LEFT_OUT = ('prmd_s07', 'prmd_s08')
+# With --quick.
+PROCEDURAL = {'walking': 'walk', 'dance': 'dance'}
+
+
+# Models.
+
+Maker = Callable[[int], ConditionalDensity]
+
+
+def _conditional(experts: int, basis: str, most: int = 200) -> Maker:
+    return lambda count: ConditionalExperts(
+        max(min(experts, count // 40), 1), basis, scaling='common', width=3.0, n_starts=1,
+        max_iterations=5, max_kernels=most,
+    )  # fmt: skip
+
+
+def _joint(experts: int, basis: str) -> Maker:
+    return lambda count: JointExperts(
+        max(min(experts, count // 40), 1), basis, scaling='common', n_starts=1, max_iterations=12
+    )
+
+
+MODELS: dict[str, Maker] = {
+    'nearest neighbours': lambda _: NearestNeighbours(BEST_OF, scaling='common'),
+    'one RVM': lambda _: ConditionalExperts(1, scaling='common', n_starts=1),
+    'conditional, linear': _conditional(8, 'linear'),
+    'conditional, RBF': _conditional(8, 'rbf'),
+    'joint, linear': _joint(30, 'linear'),
+    'joint, RBF': _joint(8, 'rbf'),
+    'local experts': lambda count: LocalExperts(BEST_OF, max(min(40, count // 3), 8)),
+}
+NETWORK, SHIPPED = 'network', 'what ships'
+
+
+# Pairs.
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs to learn from, and to test with.
+
+    Attributes:
+        inputs, targets: (N, `INPUTS`), (N, `TARGETS`).
+        groups: (N,) the motion of each.
+        tested: inputs, targets and true joints (n, J, 3) by activity.
+        middle, basis: (3 J,), (`TARGETS`, 3 J) of the joints that targets are.
+        residual: (3 J,) variances that targets leave out.
+    """
+
+    inputs: Array
+    targets: Array
+    groups: NDArray[np.intp]
+    tested: Mapping[str, tuple[Array, Array, Array]]
+    middle: Array
+    basis: Array
+    residual: Array
+
+
+def _motions(quick: bool) -> tuple[list[PoseSequence], dict[str, list[PoseSequence]]]:
+    """Motions to learn from, and tested ones by activity."""
+    body = load_body('human37')
+    if quick:
+        learned = [procedural_sequence(x, body, 4.0, 1) for x in PROCEDURAL.values()]
+        return learned, {k: [procedural_sequence(x, body, 2.0, 9)] for k, x in PROCEDURAL.items()}
+    mocap = development_folder().parent / 'mocap'
+    if not (mocap / 'dev').is_dir():
+        raise FileNotFoundError(f'{mocap} lacks dev and train (set HMT_SHARED)')
+    folders = [mocap / x for x in ('dev', 'train', 'train_more', 'train_wide')]
+    paths = {path.stem: path for folder in folders for path in motion_files(folder)}
+    of_tested = {name for names in ACTIVITIES.values() for name in names}
+    sits = {x for x in paths if x.startswith('prmd') and 'sittostand' in x}
+    mirrored = {'cmu_13_traffic', 'cmu_12_0x_walk', 'cmu_signals_a1', 'cmu_signals_a2', 'cmu_run_a'}
+    left = {x for x, path in paths.items() if path.parent.name == 'dev' or x.startswith(LEFT_OUT)}
+    chosen = {x for x in paths if x.startswith('cmu') or x in sits} - left - mirrored
+    motions = {x: recorded_sequence(paths[x], body) for x in sorted(chosen | of_tested)}
+    tested = {k: [motions[x] for x in names] for k, names in ACTIVITIES.items()}
+    return [motions[x] for x in sorted(chosen)], tested
+
+
+def pairs_of(cue: str, *, quick: bool = False) -> tuple[Pairs, dict[str, Any]]:
+    """Pairs of a cue, and what the model that ships says of the tested ones, by activity."""
+    learned, tested = _motions(quick)
+    count, few = (QUICK, 12) if quick else (PAIRS[cue], TESTED)
+    if cue == KEYPOINTS:
+        seen, joints, groups = _windows(learned, count, 0)
+        of_tests = {k: _windows(x, few, 1)[:2] for k, x in tested.items()}
+        shipped = {k: _lifted(x) for k, (x, _) in of_tests.items()}
+    else:
+        seen, joints, groups, of_tests, shipped = _silhouettes(learned, tested, count, few)
+    centre, scale = seen.mean(0), seen.std(0) + 1e-6
+    _, _, rows = np.linalg.svd((seen - centre)[:4000] / scale, full_matrices=False)
+    axes = rows[: min(INPUTS, len(rows))].T
+    flat = joints.reshape(len(joints), -1).astype(np.float64)
+    middle = flat.mean(0)
+    _, _, rows = np.linalg.svd((flat - middle)[:4000], full_matrices=False)
+    basis = rows[:TARGETS]
+    targets = (flat - middle) @ basis.T
+    residual = np.square(flat - middle - targets @ basis).mean(0)
+
+    def reduced(x: Array) -> Array:
+        return np.asarray((x - centre) / scale @ axes, dtype=np.float64)
+
+    tests = {
+        k: (reduced(x), (y.reshape(len(y), -1) - middle) @ basis.T, y)
+        for k, (x, y) in of_tests.items()
+    }
+    pairs = Pairs(reduced(seen), targets, groups, tests, middle, basis, residual)
+    scored = {
+        k: _scores(found, tests[k], pairs)
+        for k, found in shipped.items()
+        # The lifter has learned from these people.
+        if not (cue == KEYPOINTS and k == 'sitting' and not quick)
+    }
+    return pairs, scored
+
+
+def _windows(
+    motions: Sequence[PoseSequence], count: int, seed: int
+) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Inputs of windows, joints (N, J, 3) and motions; the same number of each motion."""
+    settings = replace(
+        WindowSettings(), causal=1.0, cut=0.0, near=0.0, recombined=0.0, asynchronous=0.0,
+        seated=0.0, lengths=1.0,
+    )  # fmt: skip
+    each = -(-count // len(motions))
+    drawn, body = [], load_body('human37')
+    for i, one in enumerate(motions):
+        tracks = keypoint_tracks(body, [one], [1.0], variants=1, seated=0, seed=seed)
+        rng = np.random.default_rng([seed, i])
+        drawn.append(training_windows(tracks, each, rng, settings, 0))
+    inputs, joints = (np.concatenate(x).astype(np.float64) for x in zip(*drawn, strict=True))
+    return inputs, joints, np.repeat(np.arange(len(motions)), each)
+
+
+def _lifted(inputs: Array) -> tuple[Array, Array, Array]:
+    """Log weights (n, K), means (n, K, J, 3) and variances (n, K, 3 J) of the lifter that ships."""
+    gates, means, deviations = load_lifter().network(inputs.astype(np.float32))
+    return gates, means, np.square(deviations).reshape(*gates.shape, -1)
+
+
+def _silhouettes(
+    learned: list[PoseSequence], tested: dict[str, list[PoseSequence]], count: int, few: int
+) -> Any:
+    body = load_body('human37')
+    sets = training_set(body, learned, TrainingSettings(samples=count, seed=0))
+    training = described(body, sets)
+    of_tests, shipped = {}, {}
+    predictor = load_predictor()
+    for activity, motions in tested.items():
+        some = training_set(body, motions, TrainingSettings(samples=few, seed=1))
+        masks = [silhouette_parts(x, training.descriptor.points) for x in some.masks()]
+        of_tests[activity] = training.descriptor.describe(masks), _joints(some.poses)
+        found = []
+        for row, pose in zip(predictor.descriptor.describe(masks), some.poses, strict=True):
+            targets = predictor.targets_after(row, max_components=BEST_OF)
+            roots = np.repeat(pose[None, :3], len(targets), axis=0)
+            joints = _joints(predictor.encoding.decode(targets.means, roots), pose)
+            more = BEST_OF - len(targets)
+            weights = np.log(np.append(targets.weights, np.full(more, 1e-12)))
+            found.append((weights, np.concatenate([joints, np.repeat(joints[:1], more, axis=0)])))
+        weights, means = (np.array(x) for x in zip(*found, strict=True))
+        shipped[activity] = weights, means, None
+    return training.descriptors, _joints(sets.poses), training.motions, of_tests, shipped
+
+
+def _joints(poses: Array, before: Array | None = None) -> Array:
+    """Joints (N, J, 3) from the hips along the axes of a camera that looks at poses, or one."""
+    body = load_body('human37')
+
+    def places(x: Array) -> tuple[Array, Array]:
+        every = body.joint_positions(x)
+        return every, every[:, body.skeleton.joint_index(HIPS)].mean(1)
+
+    joints, hips = places(poses)
+    _, seen = (joints, hips) if before is None else places(before[None])
+    turns = np.broadcast_to(ray_rotations(seen), (len(poses), 3, 3))
+    which = body.skeleton.joint_index(JOINTS)
+    return np.asarray((joints[:, which] - hips[:, None]) @ turns)
+
+
+# Learning and scores.
+
+
+def learned_in_time(
+    name: str, pairs: Pairs, budget: float
+) -> tuple[ConditionalDensity, int, float] | None:
+    """A model that has learned, from so many pairs and in so many s; None: the time was too short.
+
+    A network tells its steps in the place of pairs.
+    """
+    order = np.random.default_rng(0).permutation(len(pairs.inputs))
+    size = FIRST_STEPS if name == NETWORK else min(FIRST, len(order))
+    spent, found = 0.0, None
+    while True:
+        rows = np.sort(order if name == NETWORK else order[:size])
+        model = LearningNetwork(BEST_OF, steps=size) if name == NETWORK else MODELS[name](size)
+        calibrated = LearningCalibration(model, 2)
+        begun = time.process_time()
+        calibrated.fit(pairs.inputs[rows], pairs.targets[rows], groups=pairs.groups[rows])
+        used = time.process_time() - begun
+        spent += used
+        if spent > budget:
+            return found
+        found = calibrated, size, spent
+        if spent + GROWTH * used > budget or (name != NETWORK and size >= len(order)):
+            return found
+        size = 2 * size if name == NETWORK else min(2 * size, len(order))
+
+
+def _scores(found: Any, test: tuple[Array, Array, Array], pairs: Pairs) -> dict[str, float]:
+    """Scores of log weights (n, K), means (n, K, J, 3) and variances (n, K, 3 J); None: unknown."""
+    logs, means, variances = found
+    true = test[2]
+    order = np.argsort(-logs, axis=1, kind='stable')[:, :BEST_OF]
+    rows = np.arange(len(true))[:, None]
+    off = means[rows, order] - true[:, None]
+    off = off[:, :, SCORED] - off[:, :, [PELVIS]]
+    away = np.linalg.norm(off, axis=3).mean(2)
+    result = {'heaviest_mm': 1e3 * away[:, 0].mean(), 'best_mm': 1e3 * away.min(1).mean()}
+    if variances is not None:
+        flat = means.reshape(*logs.shape, -1)
+        z = (true.reshape(len(true), 1, -1) - flat) / np.sqrt(variances)
+        below = np.einsum('nk,nkj->nj', np.exp(logs), ndtr(z))
+        wanted = [i for j in SCORED for i in range(3 * j, 3 * j + 3)]
+        for share in SHARES:
+            inside = np.abs(below[:, wanted] - 0.5) <= 0.5 * share
+            result[f'within_{100 * share:.0f}'] = inside.mean()
+        result['log_density'] = _projected_density(logs, means, variances, test[1], pairs)
+    return {name: float(value) for name, value in result.items()}
+
+
+def _projected_density(
+    logs: Array, means: Array, variances: Array, targets: Array, pairs: Pairs
+) -> float:
+    """Mean log density of targets (n, D), nats a number, of a mixture over joints."""
+    basis = pairs.basis
+    centres = (means.reshape(*logs.shape, -1) - pairs.middle) @ basis.T
+    spread = np.einsum('di,nki,ei->nkde', basis, variances, basis, optimize=True)
+    off = targets[:, None] - centres
+    squares = np.einsum('nkd,nkd->nk', off, np.linalg.solve(spread, off[..., None])[..., 0])
+    each = logs - 0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * spread)[1])
+    return float(np.logaddexp.reduce(each, axis=1).mean() / targets.shape[1])
+
+
+def _scored(model: ConditionalDensity, pairs: Pairs) -> dict[str, dict[str, float]]:
+    result = {}
+    for activity, test in pairs.tested.items():
+        found = model.components(test[0])
+        flat = found.means @ pairs.basis + pairs.middle
+        spread = np.einsum('di,mde,ei->mi', pairs.basis, found.noise, pairs.basis, optimize=True)
+        variances = found.inflation[..., None] * spread + pairs.residual
+        means = flat.reshape(*found.log_weights.shape, len(JOINTS), 3)
+        scores = _scores((found.log_weights, means, variances), test, pairs)
+        density = found.log_density(test[1]).mean() / test[1].shape[1]
+        result[activity] = {**scores, 'log_density': float(density)}
+    return result
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path) -> Pairs:
+    with np.load(path, allow_pickle=True) as content:
+        values = {name: content[name] for name in content.files}
+    return Pairs(**{**values, 'tested': values['tested'].item()})
+
+
+def of_model(work: tuple[Path, str, float]) -> dict[str, Any]:
+    """What a model learned within the time, and its scores by activity."""
+    path, name, budget = work
+    pairs = _read(path)
+    found = learned_in_time(name, pairs, budget)
+    if found is None:
+        return {'pairs': 0, 'seconds': budget, 'activities': {}}
+    model, size, seconds = found
+    one = next(iter(pairs.tested.values()))[0][:1]
+    arrays = model.to_arrays().values()
+    return {
+        'pairs': size,
+        'seconds': seconds,
+        'megabytes': 1e-6 * sum(np.asarray(x).nbytes for x in arrays),
+        'ms': 1e3 * best_time(lambda: model.components(one), seconds=0.2),
+        'activities': _scored(model, pairs),
+    }
+
+
+def measure(
+    cues: Sequence[str] = CUES,
+    models: Sequence[str] = (),
+    budget: float = BUDGET,
+    processes: int = 0,
+    *,
+    quick: bool = False,
+) -> dict[str, Any]:
+    """Scores by cue and model.
+
+    Raises:
+        ValueError: the budget is not above 0.
+        FileNotFoundError: the motion capture is not there.
+    """
+    if not budget > 0.0:
+        raise ValueError(f'--budget {budget:g}: wanted some seconds of processor time, above 0')
+    known = [*MODELS, *([NETWORK] if tools_are_there() else [])]
+    names = [x for x in known if not models or x in models]
+    budget, processes = (1.0, 1) if quick else (budget, processes)
+    if quick:
+        names = [x for x in names if x != NETWORK]
+    rows = []
+    with tempfile.TemporaryDirectory() as made:
+        work = []
+        for cue in cues:
+            pairs, shipped = pairs_of(cue, quick=quick)
+            path = Path(made) / f'{cue}.npz'
+            np.savez(path, **vars(pairs))
+            rows.append({'cue': cue, 'model': SHIPPED, 'activities': shipped})
+            work += [(cue, (path, name, budget)) for name in names]
+        found = in_processes(of_model, [x for _, x in work], processes, 'contenders')
+    for (cue, (_, name, _)), one in zip(work, found, strict=True):
+        rows.append({'cue': cue, 'model': name, **one})
+    return {'machine': description(), 'budget': budget, 'rows': rows}
+
+
+# Tables.
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """Tables for people, by cue: means over activities, then each activity."""
+    parts = [f'{result["budget"]:g} s of processor time each; mm unless said']
+    for cue in dict.fromkeys(x['cue'] for x in result['rows']):
+        own = [x for x in result['rows'] if x['cue'] == cue]
+        head = [
+            cue, 'pairs or steps', 'heaviest', f'best of {BEST_OF}', 'log density, nats', '50 %',
+            '90 %', 'MB', 'ms',
+        ]  # fmt: skip
+        parts.append(table([head, *map(_summary, own)], markdown=markdown))
+        activities = list(dict.fromkeys(k for x in own for k in x['activities']))
+        rows = [[f'{cue}: heaviest / best of {BEST_OF}', *activities]]
+        for one in own:
+            each = [one['activities'].get(k) for k in activities]
+            cells = [f'{x["heaviest_mm"]:.0f} / {x["best_mm"]:.0f}' if x else '-' for x in each]
+            rows.append([one['model'], *cells])
+        parts.append(table(rows, markdown=markdown))
+    return '\n\n'.join(parts)
+
+
+def _summary(one: dict[str, Any]) -> list[str]:
+    def mean(name: str, form: str, factor: float = 1.0) -> str:
+        values = [x[name] for x in one['activities'].values() if name in x]
+        return format(factor * float(np.mean(values)), form) if values else '-'
+
+    def plain(name: str, form: str) -> str:
+        return format(one[name], form) if name in one else '-'
+
+    return [
+        one['model'], plain('pairs', 'd'), mean('heaviest_mm', '.0f'), mean('best_mm', '.0f'),
+        mean('log_density', '.2f'), mean('within_50', '.0f', 100), mean('within_90', '.0f', 100),
+        plain('megabytes', '.1f'), plain('ms', '.2f'),
+    ]  # fmt: skip
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark."""
+    parser = benchmark_parser('contenders', __doc__, quick='procedural motions, a second each')
+    parser.add_argument(
+        '--budget', type=float, default=BUDGET,
+        help=f'processor time of each model, s (default: {BUDGET:g})',
+    )  # fmt: skip
+    parser.add_argument('--cues', nargs='+', choices=CUES, default=CUES, help='some of them')
+    parser.add_argument('--models', nargs='+', default=[], metavar='MODEL', help='some of them')
+    options = parser.parse_args(argv)
+    return run_benchmark(
+        'contenders',
+        lambda: measure(tuple(options.cues), options.models, options.budget, quick=options.quick),
+        as_text,
+        as_json=options.json,
+    )
