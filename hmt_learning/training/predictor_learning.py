@@ -43,7 +43,7 @@ Progress = Callable[[Iterable[Bytes], int], Iterable[Bytes]]
 
 SAMPLES_PER_EXPERT = 40  # minimum for a linear expert of the joint model
 NEIGHBOURS = 40  # of the local model
-WIDTH = 3.0  # of the kernels of the conditional model, in standard deviations of an input
+WIDTH = 3.0  # of the kernels of the conditional model's gates, in standard deviations of an input
 
 FOR_DESCRIPTOR = 3000  # maximum number of silhouettes that the descriptor learns from
 FOR_BASIS = 600  # maximum number of poses that the metric of targets is averaged over
@@ -84,6 +84,7 @@ def _local(experts: int, seed: int, samples: int | None) -> ConditionalDensity:
 def _conditional(experts: int, seed: int, _: int | None) -> ConditionalDensity:
     return ConditionalExperts(
         experts,
+        'linear',
         scaling='common',
         seed=seed,
         width=WIDTH,
@@ -94,7 +95,6 @@ def _conditional(experts: int, seed: int, _: int | None) -> ConditionalDensity:
 
 
 def _joint(experts: int, seed: int, _: int | None) -> ConditionalDensity:
-    # Many linear experts follow folds for which a few experts with kernels are too stiff.
     return JointExperts(
         experts, 'linear', scaling='common', seed=seed, n_starts=1, max_iterations=12
     )
@@ -107,8 +107,8 @@ def _network(experts: int, seed: int, _: int | None) -> ConditionalDensity:
 KINDS = {
     'network': ModelKind(_network, 5, folds=2),
     'local': ModelKind(_local, 5),
-    'conditional': ModelKind(_conditional, 16, 20, 6, few=True, folds=2),
-    'joint': ModelKind(_joint, 120, 20, 40, few=True, folds=2),
+    'conditional': ModelKind(_conditional, 8, 40, 6, few=True, folds=2),
+    'joint': ModelKind(_joint, 30, 40, few=True, folds=2),
     'relevance-vector': ModelKind(
         lambda _, seed, __: ConditionalExperts(1, scaling='common', seed=seed, n_starts=1), 1
     ),

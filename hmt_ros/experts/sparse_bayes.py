@@ -28,9 +28,8 @@ from hmt_ros.inference.arrays import Array, Index
 INDEPENDENT = 1e-8
 # Two functions that differ by less than this share of their squares count as one.
 ALIGNED = 1e-8
-# Largest standard deviation of a weight, in standard deviations of the outputs. Kernels of which the
-# samples of an expert see the tails alone would get weights without bounds, and what they say near
-# their centres.
+# Largest standard deviation of a weight, in standard deviations of the outputs. Kernels of which an
+# expert's samples see the tails alone would get weights without bounds.
 LARGEST_WEIGHT = 10.0
 ROUNDS = 100  # of greedy steps, each followed by a new estimate of the noise
 
