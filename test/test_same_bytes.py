@@ -245,9 +245,9 @@ SWITCHES = {
 # here what the test finds.
 VERSIONS = {'numpy': '2.4.6', 'cv2': '5.0.0'}
 DIGESTS = {
-    'keypoints/pose_mixture': 'e471621286d7d62f',
-    'keypoints/smoothed_pose_mixture': 'f78ae98383f476d6',
-    'anybody/pose_mixture': '35bb0c33b760b447',
+    'keypoints/pose_mixture': 'aa5a63c257cf1617',
+    'keypoints/smoothed_pose_mixture': '8d23bcb61a40f406',
+    'anybody/pose_mixture': '108b6b92c04e8472',
     'images/pose_mixture': '97da8f3ee1af5da4',
 }
 

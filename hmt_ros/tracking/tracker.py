@@ -53,6 +53,7 @@ from hmt_ros.tracking.ground import (
 )
 from hmt_ros.tracking.hypotheses import PosePrediction
 from hmt_ros.tracking.initialisation import Start, check_box
+from hmt_ros.tracking.landmark_offsets import LandmarkOffsets
 from hmt_ros.tracking.laplace_approximation import likelihood_modes
 from hmt_ros.tracking.misfit import KEYPOINTS, SILHOUETTE, of_depth_at_best
 from hmt_ros.tracking.observer import Observer, View
@@ -115,6 +116,7 @@ class Tracker:
         chosen = self.settings.lifter
         self._lifter = load_lifter(chosen) if chosen else None
         self._seen = KeypointHistory(camera)
+        self._landmarks = LandmarkOffsets()
         self._likelihood = no_likelihood(body.dimension)
         self._state = TrackState()
         self._track = self._new_track(body)
@@ -148,6 +150,7 @@ class Tracker:
         self._drop_track(TrackState())
         self._camera_path = CameraPath()
         self._seen = KeypointHistory(self.camera)
+        self._landmarks = LandmarkOffsets()
         self._ground.forget_scene()
         self.estimate = self._estimate()
 
@@ -203,7 +206,7 @@ class Tracker:
         elif not self._state.existence.last.blank:
             observation = self._propagate(view)
         if observation is not None:
-            self._learn(view)
+            self._learn(view, image_counts=bool(observation.evidence))
         return self._publish(stamp, observation)
 
     def set_gravity(
@@ -275,7 +278,8 @@ class Tracker:
                 self._given = relevelled(before, self._given, body)
         known = silhouettes.scene.known and not silhouettes.doubted
         ground.still = self._camera_path.known or (known and not ground.turning)
-        given = given._replace(keypoints=self._lifted(given.keypoints, given.stamp))
+        keypoints = self._landmarks.applied(given.keypoints)
+        given = given._replace(keypoints=self._lifted(keypoints, given.stamp))
         found = self._state.begun and not self._state.validity.lost
         near = self._track.modes.poses if found else None
         doubted = silhouettes.doubted
@@ -308,6 +312,7 @@ class Tracker:
         """Updates the beliefs that somebody is there, and that it is who was seen last."""
         if self._state.is_somebody_else(view.stamp):
             # Of whoever comes now nothing is known.
+            self._landmarks = LandmarkOffsets()
             self._drop_track(replace(self._state, ended=True, met=None), self.model)
         state = self._state
         if not (state.begun or state.ended or view.mask is not None):
@@ -449,7 +454,7 @@ class Tracker:
             view, view.stamp, self._track.person, self.camera, self._track.modes.poses[0]
         )
 
-    def _learn(self, view: View) -> None:
+    def _learn(self, view: View, *, image_counts: bool) -> None:
         """Takes in what the modes of an image tell of scene, ground and person."""
         state, track, modes = self._state, self._track, self._track.modes
         shown = {KEYPOINTS: view.keypoints is not None, DEPTH: view.depth is not None}
@@ -461,9 +466,14 @@ class Tracker:
         if self.settings.ground.on:
             resting = min(self._ground.by_foot(modes).values(), default=RESTING_SHARE)
             self._ground.update(track.person, modes, resting, state.age(view.stamp))
+        age = state.age(view.stamp)
         self._observer.last_image, state.followed = view.image, view.stamp
         if state.existence.last.seen:
             self._meet(view)
+        if view.keypoints is not None and image_counts and not state.validity.lost:
+            self._landmarks = self._landmarks.after(
+                view.keypoints, track.person, self.camera, modes.poses[0], age
+            )
 
     def _publish(
         self, stamp: int, observation: Observation | None

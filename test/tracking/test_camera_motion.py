@@ -237,10 +237,10 @@ class Places:
 
     def energy(self, frames, rows, *, derivatives=Derivatives.POSITIVE):
         skeleton, n = self.body.skeleton, frames.count
-        targets = np.repeat(self.targets[:, :, None], n, axis=2)
-        weights = np.full((len(self.targets), n), self.sigma**-2)
+        targets = np.repeat(self.targets[None], n, axis=0)
+        across = np.broadcast_to(np.eye(3) / self.sigma, (*targets.shape, 3))
         found = point_energy(
-            frames, skeleton.joint_segments, skeleton.joint_offsets, targets, weights
+            frames, skeleton.joint_segments, skeleton.joint_offsets, targets, across
         )
         return Energy(*found) if derivatives else Energy(found[0])
 

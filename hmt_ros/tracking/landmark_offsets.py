@@ -1,0 +1,91 @@
+"""Where the landmarks of one person lie, learned while the image says where the person is.
+
+    pixel_l = project(J_l + R_l (o_l + d_l)) + e,     d_l ~ N(0, PRIOR^2)
+
+o_l is the usual offset of landmark l in the frame of its segment R_l, d_l what this person, these
+clothes and this detector add. A keypoint errs by much the same for seconds, so that images count at
+most `RATE` a second. Keypoints alone can not tell an offset from a pose: edges or silhouettes must
+be evidence, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hmt_ros.body import Body, Camera
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_algebra import product, solve
+
+# Standard deviation of an offset of a person, and of a keypoint at the person, m.
+PRIOR, SIGMA = 0.02, 0.03
+# Scale of the kernel of robust errors, m; least confidence; images that count, per second.
+KERNEL, LEAST_CONFIDENCE, RATE = 0.06, 0.5, 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkOffsets:
+    """What has been learned of the landmarks of a person.
+
+    Attributes:
+        landmarks: names of n landmarks; empty: nothing is known.
+        precision: (n, 3, 3) information on the offsets, 1/m^2.
+        pull: (n, 3) the same times the offsets, 1/m.
+    """
+
+    landmarks: tuple[str, ...] = ()
+    precision: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    pull: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def offsets(self) -> Array:
+        """The most probable offsets (n, 3), m."""
+        known = self.precision + np.eye(3) / PRIOR**2
+        return np.asarray(solve(known, self.pull[..., None])[..., 0])
+
+    def applied(self, keypoints: Keypoints | None) -> Keypoints | None:
+        """Keypoints of the landmarks where this person has them."""
+        if keypoints is None or not self.landmarks or keypoints.landmarks != self.landmarks:
+            return keypoints
+        own = np.zeros(self.pull.shape) if keypoints.offsets is None else keypoints.offsets
+        return replace(keypoints, offsets=own + self.offsets)
+
+    def after(
+        self, keypoints: Keypoints, body: Body, camera: Camera, pose: Array, dt: float
+    ) -> LandmarkOffsets:
+        """What is known after an image.
+
+        Args:
+            keypoints: of the image, as `applied` gave them.
+            body, pose: the person, (d,), as all cues show it.
+            dt: since the image before, s.
+        """
+        if keypoints.landmarks is None or keypoints.offsets is None:
+            return self
+        known, n = self, len(keypoints.names)
+        if keypoints.landmarks != self.landmarks:
+            known = LandmarkOffsets(keypoints.landmarks, np.zeros((n, 3, 3)), np.zeros((n, 3)))
+        which = body.skeleton.joint_index(keypoints.names)
+        segments = body.skeleton.joint_segments[which]
+        frames = forward(body.skeleton, pose[None])
+        places = frames.places(segments, body.skeleton.joint_offsets[which] + keypoints.offsets)[0]
+        seen = keypoints.seen & (keypoints.confidences > LEAST_CONFIDENCE) & (places[:, 2] > 0)
+        if not seen.any():
+            return known
+        pixels, slopes = camera.project_with_derivative(places[seen].T)
+        size = np.array([camera.magnification(z) for z in places[seen, 2].tolist()])
+        slopes = product(slopes.transpose(2, 0, 1), frames.rotations()[0, segments[seen]])
+        slopes = slopes / size[:, None, None]
+        errors = (keypoints.pixels[seen] - pixels.T) / size[:, None]
+        weights = min(RATE * dt, 1.0) / SIGMA**2
+        weights = weights / (1.0 + np.square(errors).sum(1) / KERNEL**2) ** 2
+        by_weight = weights[:, None, None] * slopes
+        precision, pull = known.precision.copy(), known.pull.copy()
+        information = product(by_weight.transpose(0, 2, 1), slopes)
+        precision[seen] += information
+        pull[seen] += np.einsum('nab,na->nb', by_weight, errors)
+        pull[seen] += product(information, known.offsets[seen][..., None])[..., 0]
+        return LandmarkOffsets(known.landmarks, precision, pull)
