@@ -40,6 +40,8 @@ BATCH = 256  # inputs whose neighbours are searched together
 RIDGE = 1e-6  # share of the targets' variance that is added to the covariance
 # Distances below this share of the spacing count as equal; else one neighbour has all the weight.
 CLOSEST = 1e-3
+# Least spacing of samples, which may all be the same, in scaled inputs.
+LEAST_SPACING = 1e-9
 SWEEPS = 8  # of the clustering
 LEFT_OUT = 600  # training samples whose residuals give the covariance of local experts
 FAINT = 1e-12  # weight of an expert without neighbours
@@ -166,7 +168,7 @@ class NearestNeighbours(_NeighbourModel):
         own[~own.any(1), -1] = True
         shape = (len(pairs), self.n_neighbours)
         distances, index = distances[~own].reshape(shape), index[~own].reshape(shape)
-        self.spacing_ = max(float(np.sqrt((distances**2).mean())), np.finfo(float).tiny)
+        self.spacing_ = max(float(np.sqrt((distances**2).mean())), LEAST_SPACING)
         residuals = pairs.targets[:, None] - pairs.targets[index]
         share = self._shares(distances, index) * (pairs.weights / pairs.weights.sum())[:, None]
         self.noise_ = ridge + np.einsum(
@@ -249,7 +251,7 @@ class LocalExperts(_NeighbourModel):
         rng = np.random.default_rng(self.seed)
         left_out = np.sort(rng.permutation(len(pairs))[:LEFT_OUT])
         distances, index = self._nearest(self._scaled[left_out], self.n_neighbours + 1)
-        self.spacing_ = max(float(np.sqrt((distances[:, 1] ** 2).mean())), np.finfo(float).tiny)
+        self.spacing_ = max(float(np.sqrt((distances[:, 1] ** 2).mean())), LEAST_SPACING)
         weights, means = self._modes(distances[:, 1:], index[:, 1:])[:2]
         residuals = pairs.targets[left_out][:, None] - means
         squared = np.where(weights > FAINT, (residuals**2).sum(2), np.inf)

@@ -139,6 +139,13 @@ def test_nobody_is_seen(predictor: PosePredictor) -> None:
         predictor.predict(np.zeros((300, 400)), CAMERA)
 
 
+def test_an_image_full_of_somebody_is_like_nobody_learned(predictor: PosePredictor) -> None:
+    found = predictor.observe(np.ones((300, 400), np.uint8), CAMERA)
+    assert found.support < 0.1
+    assert found.place.remarks
+    assert np.isfinite(found.mixture.means).all()
+
+
 def test_several_blobs_are_said(
     predictor: PosePredictor, clip: tuple[np.ndarray, np.ndarray]
 ) -> None:

@@ -47,3 +47,36 @@ def test_the_metric_of_targets_is_that_of_joints():
         guess = (((encoding.encode(other) - encoding.encode(poses)) @ basis) ** 2).sum(1)
         ratios.append(guess.mean() / actual.mean())
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.15)
+
+
+def degenerate_pairs():
+    """Inputs, targets and motions that hold less than their number suggests."""
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(200, 8))
+    targets = np.tanh(inputs @ rng.normal(size=(8, 5)))
+    quarter = np.repeat(np.arange(4), 50)
+    return {
+        'one motion': (inputs, targets, None),
+        'copies of one motion': (
+            np.tile(inputs[:20], (10, 1)), np.tile(targets[:20], (10, 1)), np.repeat(range(10), 20)
+        ),
+        'two poses': (
+            np.repeat(inputs[:2], 100, axis=0), np.repeat(targets[:2], 100, axis=0), quarter
+        ),
+        'one input': (np.ones((200, 8)), targets, quarter),
+        'equal columns': (np.repeat(inputs[:, :1], 8, axis=1), targets, quarter),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize('case', degenerate_pairs())
+@pytest.mark.parametrize('name', [x for x in KINDS if x != 'network'])
+def test_degenerate_pairs_are_learned(name, case):
+    """Mixtures are finite and wide enough to be any, and far away nothing supports them."""
+    inputs, targets, motions = degenerate_pairs()[case]
+    model = new_model(name, samples=len(inputs)).fit(inputs, targets, groups=motions)
+    far = inputs[:1] + 100.0
+    weights, means, covariances = model.predict_arrays(np.concatenate([inputs[:3], far]))
+    np.testing.assert_allclose(weights.sum(1), 1.0)
+    assert np.isfinite(means).all()
+    assert np.linalg.eigvalsh(covariances).min() > 0.0
+    assert model.support(far)[0] < 1e-3
