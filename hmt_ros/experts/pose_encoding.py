@@ -29,6 +29,8 @@ TURNS = ('root_z', 'root_y', 'root_x')
 # A mean over opposite headings is a short vector, whose direction means little: its derivative is
 # computed as if it had at least this length.
 SHORTEST = 0.1
+# Coordinates after each one, and before it.
+NEXT, LAST = [1, 2, 0], [2, 0, 1]
 STEEPEST = np.radians(86.0)  # limit of the middle root angle, near which the other two coincide
 
 
@@ -193,7 +195,7 @@ def _orthogonal(axes: Array) -> Array:
     up = axes[:, 3:] - (axes[:, 3:] * front).sum(1, keepdims=True) * front
     up = _unit(up)
     result = np.empty((len(axes), 3, 3))
-    result[:, :, 0], result[:, :, 1], result[:, :, 2] = np.cross(front, up), front, up
+    result[:, :, 0], result[:, :, 1], result[:, :, 2] = cross(front, up), front, up
     return result
 
 
@@ -223,6 +225,11 @@ def _rotation_by_axes(axes: Array) -> Array:
             - z[:, :, None] * product(x[:, None], dys[k])
         )
     return result
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Cross products (..., 3), as numpy's, in a fourth of the time for a few of them."""
+    return np.asarray(a[..., NEXT] * b[..., LAST] - a[..., LAST] * b[..., NEXT])
 
 
 def _unit(vectors: Array) -> Array:

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.camera import tangent
 from hmt_ros.body.flesh import Mesh
-from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.body.kinematics import Frames, forward, point_positions
 from hmt_ros.core import elementary
 from hmt_ros.experts.descriptor.contour import PersonBlob
-from hmt_ros.experts.pose_encoding import PoseEncoding
+from hmt_ros.experts.pose_encoding import PoseEncoding, cross
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import inverse, product, solve
 
@@ -197,19 +197,21 @@ def _box_error(
     """
     poses = encoding.decode(targets, roots)
     by_target, by_root = slopes
-    frames = forward(encoding.body.skeleton, poses)
-    points = frames.points(mesh.segments, mesh.vertices)  # (V, 3, M)
-    points[:, 2] = np.maximum(points[:, 2], 0.05)  # a hand may be behind the camera
-    u, v = camera.project_with_derivative(points.transpose(1, 0, 2), derivative=False)[0]
-    outermost = np.stack([u.argmin(0), v.argmin(0), u.argmax(0), v.argmax(0)], axis=1)  # (M, 4)
+    skeleton = encoding.body.skeleton
+    points = point_positions(skeleton, poses, mesh.segments, mesh.vertices)  # (M, V, 3)
+    points[..., 2] = np.maximum(points[..., 2], 0.05)  # a hand may be behind the camera
+    seen = camera.project(points)
+    outermost = np.concatenate([seen.argmin(1), seen.argmax(1)], axis=1)  # (M, 4)
     rows = np.arange(len(poses))[:, None]
-    chosen = points[outermost, :, rows]  # (M, 4, 3)
+    chosen = points[rows, outermost]  # (M, 4, 3)
     pixels, by_point = camera.project_with_derivative(chosen.transpose(2, 0, 1))
     coordinate = np.array([0, 1, 0, 1])
     # pixels (2, M, 4) and by_point (2, 3, M, 4), of the coordinate that the side bounds
     value = np.stack([pixels[c, :, k] for k, c in enumerate(coordinate)], axis=1)
     slope = np.stack([by_point[c, :, :, k].T for k, c in enumerate(coordinate)], axis=1)
-    by_pose = np.einsum('mkc,mkdc->mkd', slope, _by_pose(frames, mesh, outermost, chosen))
+    by_pose = np.einsum(
+        'mkc,mkdc->mkd', slope, _by_pose(forward(skeleton, poses), mesh, outermost, chosen)
+    )
     residual = value - sides
     # The person reaches the border of the image; how far beyond is unknown.
     outwards = np.array([-1.0, -1.0, 1.0, 1.0])
@@ -224,6 +226,6 @@ def _by_pose(frames: Frames, mesh: Mesh, vertices: Index, points: Array) -> Arra
     skeleton = frames.skeleton
     axes, origins = frames.dofs_by_pose()  # (M, d, 3)
     arm = points[:, :, None] - origins[:, None]
-    turning = np.cross(axes[:, None], arm)
+    turning = cross(axes[:, None], arm)
     moved = np.where(skeleton.dof_is_rotation[:, None], turning, axes[:, None])
     return moved * skeleton.moves[mesh.segments[vertices]][..., None]
