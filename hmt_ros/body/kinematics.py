@@ -1,6 +1,6 @@
 """Forward kinematics, exact Jacobians, and energies over points of the body, of N poses at once.
 
-How derivatives over points become those over poses is told in `core/residuals.h`.
+`core/residuals.h` describes how derivatives over points become those over poses.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ KNOWN_SIZE, UNKNOWN_SIZE = 0.02, 0.06
 # Probabilities that a detector calls nothing, all, arms or legs by the other side throughout a
 # window. It does in 5, 3 and 3 % of the images of clips, but in up to half of those of one person;
 # chosen so that regions of 90 % of such people hold 80 %.
-EXCHANGES = np.array([0.8, 0.1, 0.05, 0.05])
+EXCHANGE_SHARES = np.array([0.8, 0.1, 0.05, 0.05])
 # A person is at least this far away, m.
 NEAREST = 0.4
 
@@ -90,7 +90,7 @@ def lift_poses(
     rays, confidences = (np.array([one[i] for one in seen]) for i in range(2))
     person = lifter.proportions(body) if lengths_known else None
     lifted = lifter.lift(
-        stamps, rays, confidences, stamps, ups, person, causal=causal, exchanges=EXCHANGES
+        stamps, rays, confidences, stamps, ups, person, causal=causal, exchanges=EXCHANGE_SHARES
     )
     rows = [i for i, one in enumerate(lifted) if one is not None]
     level = body.level if ups is None else roll(ups.mean(0))
@@ -265,7 +265,9 @@ class KeypointPredictor:
             up: (3,) unit vector against gravity, camera frame; None: unknown.
         """
         lifted = (
-            None if self._shown is None else self._history.lift(self._lifter, up, None, EXCHANGES)
+            None
+            if self._shown is None
+            else self._history.lift(self._lifter, up, None, EXCHANGE_SHARES)
         )
         if lifted is None or self._shown is None:
             return None
