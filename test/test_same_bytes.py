@@ -245,9 +245,9 @@ SWITCHES = {
 # here what the test finds.
 VERSIONS = {'numpy': '2.4.6', 'cv2': '5.0.0'}
 DIGESTS = {
-    'keypoints/pose_mixture': 'aa5a63c257cf1617',
-    'keypoints/smoothed_pose_mixture': '8d23bcb61a40f406',
-    'anybody/pose_mixture': '108b6b92c04e8472',
+    'keypoints/pose_mixture': '84eac3ea0fb11e52',
+    'keypoints/smoothed_pose_mixture': '69e9154b9c541db5',
+    'anybody/pose_mixture': 'c4c3ee067c064e04',
     'images/pose_mixture': '97da8f3ee1af5da4',
 }
 

@@ -23,7 +23,7 @@ from hmt_ros.inference.linear_algebra import product, solve
 # Standard deviation of an offset of a person, and of a keypoint at the person, m.
 PRIOR, SIGMA = 0.02, 0.03
 # Scale of the kernel of robust errors, m; least confidence; images that count, per second.
-KERNEL, LEAST_CONFIDENCE, RATE = 0.06, 0.5, 10.0
+KERNEL, LEAST_CONFIDENCE, RATE = 0.06, 0.5, 4.0
 
 
 @dataclass(frozen=True, eq=False)
