@@ -11,8 +11,8 @@ targets        joints along the axes of a camera that looks at the person
 Both are reduced to principal components. Nobody of the tested motions is learned from. Distances
 are those of the joints from the truth, seen from the pelvis: of the heaviest component, and of the
 best of the five heaviest. The log density is that of the components of targets, nats a number;
-regions are those of single coordinates of joints. What ships learned from more, for hours. Numbers
-of experts were chosen with these people in view.
+regions are those of single coordinates of joints. What ships learned from more, for hours, and
+from those who sit. Numbers of experts were chosen with these people in view.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from hmt_learning.training.keypoint_tracks import JOINTS, keypoint_tracks
 from hmt_learning.training.keypoint_training import WindowSettings, training_windows
 from hmt_learning.training.lifter_learning import PELVIS, SCORED
 from hmt_learning.training.network_learning import LearningNetwork, tools_are_there
-from hmt_learning.training.predictor_learning import described
+from hmt_learning.training.predictor_learning import KINDS, SAMPLES_PER_EXPERT, described
 from hmt_learning.training.training_set import (
     PoseSequence,
     TrainingSettings,
@@ -48,7 +48,6 @@ from hmt_learning.training.training_set import (
     training_set,
 )
 from hmt_ros.body import load_body
-from hmt_ros.experts import ConditionalExperts, JointExperts, LocalExperts, NearestNeighbours
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.lifter import load_lifter
@@ -90,27 +89,25 @@ PROCEDURAL = {'walking': 'walk', 'dance': 'dance'}
 Maker = Callable[[int], ConditionalDensity]
 
 
-def _conditional(experts: int, basis: str, most: int = 200) -> Maker:
-    return lambda count: ConditionalExperts(
-        max(min(experts, count // 40), 1), basis, scaling='common', width=3.0, n_starts=1,
-        max_iterations=5, max_kernels=most,
-    )  # fmt: skip
+def _of_kind(name: str, experts: int = BEST_OF, **changes: Any) -> Maker:
+    """A model of `KINDS` without its calibration, maybe with other parameters."""
 
+    def make(count: int) -> ConditionalDensity:
+        kind = KINDS[name]
+        few = max(min(experts, count // SAMPLES_PER_EXPERT), 1) if kind.few else experts
+        return kind.make(few, 0, count).set_params(**changes)
 
-def _joint(experts: int, basis: str) -> Maker:
-    return lambda count: JointExperts(
-        max(min(experts, count // 40), 1), basis, scaling='common', n_starts=1, max_iterations=12
-    )
+    return make
 
 
 MODELS: dict[str, Maker] = {
-    'nearest neighbours': lambda _: NearestNeighbours(BEST_OF, scaling='common'),
-    'one RVM': lambda _: ConditionalExperts(1, scaling='common', n_starts=1),
-    'conditional, linear': _conditional(8, 'linear'),
-    'conditional, RBF': _conditional(8, 'rbf'),
-    'joint, linear': _joint(30, 'linear'),
-    'joint, RBF': _joint(8, 'rbf'),
-    'local experts': lambda count: LocalExperts(BEST_OF, max(min(40, count // 3), 8)),
+    'nearest neighbours': _of_kind('nearest'),
+    'one RVM': _of_kind('relevance-vector'),
+    'conditional, linear': _of_kind('conditional', 8),
+    'conditional, RBF': _of_kind('conditional', 8, basis='rbf'),
+    'joint, linear': _of_kind('joint', 30),
+    'joint, RBF': _of_kind('joint', 8, basis='rbf'),
+    'local experts': _of_kind('local'),
 }
 NETWORK, SHIPPED = 'network', 'what ships'
 
@@ -191,8 +188,8 @@ def pairs_of(cue: str, *, quick: bool = False) -> tuple[Pairs, dict[str, Any]]:
     scored = {
         k: _scores(found, tests[k], pairs)
         for k, found in shipped.items()
-        # The lifter has learned from these people.
-        if not (cue == KEYPOINTS and k == 'sitting' and not quick)
+        # What ships has learned from those who sit.
+        if k != 'sitting'
     }
     return pairs, scored
 
@@ -235,11 +232,9 @@ def _silhouettes(
         of_tests[activity] = training.descriptor.describe(masks), _joints(some.poses)
         found = []
         for row, pose in zip(predictor.descriptor.describe(masks), some.poses, strict=True):
-            targets = predictor.targets_after(row, max_components=BEST_OF)
-            roots = np.repeat(pose[None, :3], len(targets), axis=0)
-            joints = _joints(predictor.encoding.decode(targets.means, roots), pose)
-            more = BEST_OF - len(targets)
-            weights = np.log(np.append(targets.weights, np.full(more, 1e-12)))
+            poses, shares = predictor.poses_at(row, pose[:3], BEST_OF)
+            joints, more = _joints(poses, pose), BEST_OF - len(poses)
+            weights = np.log(np.append(shares, np.full(more, 1e-12)))
             found.append((weights, np.concatenate([joints, np.repeat(joints[:1], more, axis=0)])))
         weights, means = (np.array(x) for x in zip(*found, strict=True))
         shipped[activity] = weights, means, None

@@ -134,13 +134,11 @@ def _predicted(
     rows = parts.describe([silhouette_parts(mask, parts.points) for mask in masks])
     result = []
     for row, true in zip(rows, poses, strict=True):
-        targets = predictor.targets_after(row, max_components=BEST_OF)
-        roots = np.repeat(true[None, :3], len(targets), axis=0)
-        found = predictor.encoding.decode(targets.means, roots)
+        found, weights = predictor.poses_at(row, true[:3], BEST_OF)
         joints = body.joint_positions(np.concatenate([true[None], found]))
         off = joints[:, scored] - joints[:, pelvis]
         errors = 1e3 * np.linalg.norm(off[1:] - off[0], axis=2).mean(1)
-        result.append((found, targets.weights, errors))
+        result.append((found, weights, errors))
     return result
 
 

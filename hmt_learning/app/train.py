@@ -228,9 +228,7 @@ def _scores(predictor: PosePredictor, tested: list[PoseSequence]) -> str:
     scored, pelvis = (body.skeleton.joint_index(x) for x in (EVALUATED_JOINTS, (ORIGIN,)))
     heaviest, best = [], []
     for row, pose in zip(rows, pairs.poses, strict=True):
-        targets = predictor.targets_after(row, max_components=BEST_OF)
-        roots = np.repeat(pose[None, :3], len(targets), axis=0)
-        found = predictor.encoding.decode(targets.means, roots)
+        found, _ = predictor.poses_at(row, pose[:3], BEST_OF)
         joints = body.joint_positions(np.concatenate([pose[None], found]))
         relative = joints[:, scored] - joints[:, pelvis]
         distances = np.linalg.norm(relative[1:] - relative[0], axis=2).mean(1)

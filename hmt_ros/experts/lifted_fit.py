@@ -264,12 +264,10 @@ class KeypointPredictor:
         Args:
             up: (3,) unit vector against gravity, camera frame; None: unknown.
         """
-        lifted = (
-            None
-            if self._shown is None
-            else self._history.lift(self._lifter, up, None, EXCHANGE_SHARES)
-        )
-        if lifted is None or self._shown is None:
+        if self._shown is None:
+            return None
+        lifted = self._history.lift(self._lifter, up, exchanges=EXCHANGE_SHARES)
+        if lifted is None:
             return None
         rays, confidences = self._shown
         (found,) = poses_of(self._body, [lifted], rays[None], confidences[None], self._spread)

@@ -47,7 +47,14 @@ from hmt_ros.experts.network_experts import Floats, Layers
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.image.keypoint_schemes import AUTO, landmarks, landmarks_of, position_deviations
 from hmt_ros.image.lifted_poses import WHOLE, LiftedPoses, bone_lengths, from_positions
-from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
+from hmt_ros.image.terms.keypoints import (
+    ARMS,
+    CENTRE,
+    EXCHANGED,
+    LEGS,
+    USUAL_STATURE,
+    Keypoints,
+)
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.mixture import GaussianMixture
@@ -107,18 +114,13 @@ MOST = 12
 LEAST_CONFIDENCE, FEWEST = 0.02, 5
 # Length of the inputs of a window.
 INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
-# Landmarks (rows) that stand in the place of each one where a detector calls nothing, all, arms or
-# legs by the other side, as `terms.keypoints.EXCHANGED`.
-SIDES = np.array([LANDMARKS.index(other_side(name)) for name in LANDMARKS])
-ARMS, LEGS = (
-    np.array([name.endswith(joints) for name in LANDMARKS])
-    for joints in (
-        ('shoulder', 'elbow', 'wrist'),
-        ('left_hip', 'right_hip', 'knee', 'ankle', 'heel', 'toe'),
-    )
-)
+# Landmarks (E, L) in the place of each one under each exchange of `terms.keypoints.EXCHANGED`.
+_ARM, _LEG = ('shoulder', 'elbow', 'wrist'), ('hip', 'knee', 'ankle', 'heel', 'toe')
+_GROUPS = [ARMS if x.endswith(_ARM) else LEGS if x.endswith(_LEG) else CENTRE for x in LANDMARKS]
 EXCHANGES = np.where(
-    np.stack([np.zeros_like(ARMS), np.ones_like(ARMS), ARMS, LEGS]), SIDES, np.arange(len(SIDES))
+    EXCHANGED[:, _GROUPS],
+    [LANDMARKS.index(other_side(name)) for name in LANDMARKS],
+    np.arange(len(LANDMARKS)),
 )
 
 

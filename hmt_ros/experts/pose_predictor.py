@@ -265,6 +265,12 @@ class PosePredictor:
         whole = _heaviest(reduced(whole, max_components), max_components)
         return _transformed(whole, self._from_basis)
 
+    def poses_at(self, descriptor: Array, root: Array, max_components: int) -> tuple[Array, Array]:
+        """Poses (K, d) with a known root (3,) for one descriptor, heaviest first; weights (K,)."""
+        targets = self.targets_after(descriptor, max_components=max_components)
+        roots = np.repeat(root[None], len(targets), axis=0)
+        return self.encoding.decode(targets.means, roots), targets.weights
+
     def _expected(self, poses: GaussianMixture, interval: float) -> GaussianMixture:
         """The mixture over poses after an interval, s, by the motion prior of the body."""
         if interval <= 0.0:

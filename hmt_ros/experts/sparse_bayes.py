@@ -217,8 +217,8 @@ class _GreedyState:
         half = columns @ self.covariance
         self.S = np.diagonal(self.gram) - (half * columns).sum(1)
         self.Q = whitened - half @ whitened[self.active]
-        spread = np.linalg.solve(factor, np.linalg.solve(factor, sums.outer).T)
-        variance = max(float(np.trace(spread)) / (self.outputs * sums.total), 1e-300)
+        total = float(np.trace(np.linalg.solve(found.noise, sums.outer)))
+        variance = max(total / (self.outputs * sums.total), 1e-300)
         self.least_precision = 1.0 / (LARGEST_WEIGHT**2 * variance)
         self.least = INDEPENDENT * np.maximum(np.diagonal(self.gram), 1e-300)
         self.is_active = np.zeros(len(self.gram), dtype=bool)

@@ -11,6 +11,7 @@ be evidence, too.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -40,7 +41,7 @@ class LandmarkOffsets:
     precision: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     pull: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
-    @property
+    @cached_property
     def offsets(self) -> Array:
         """The most probable offsets (n, 3), m."""
         known = self.precision + np.eye(3) / PRIOR**2
@@ -48,10 +49,9 @@ class LandmarkOffsets:
 
     def applied(self, keypoints: Keypoints | None) -> Keypoints | None:
         """Keypoints of the landmarks where this person has them."""
-        if keypoints is None or not self.landmarks or keypoints.landmarks != self.landmarks:
+        if keypoints is None or keypoints.offsets is None or keypoints.landmarks != self.landmarks:
             return keypoints
-        own = np.zeros(self.pull.shape) if keypoints.offsets is None else keypoints.offsets
-        return replace(keypoints, offsets=own + self.offsets)
+        return replace(keypoints, offsets=keypoints.offsets + self.offsets)
 
     def after(
         self, keypoints: Keypoints, body: Body, camera: Camera, pose: Array, dt: float
