@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from threading import Event, Thread
 from typing import Any, TypeAlias, TypeVar
 
@@ -49,6 +49,15 @@ class _Bar(tqdm):
         super().__init__(**options)
         if not self.disable:
             Thread(target=self._show_time, name='progress', daemon=True).start()
+
+    def __iter__(self) -> Iterator[Any]:
+        """Counts each item at once; tqdm would count when it draws, which the thread does here."""
+        try:
+            for item in self.iterable:
+                yield item
+                self.update()
+        finally:
+            self.close()
 
     def _show_time(self) -> None:
         while not self._ended.wait(self._interval):

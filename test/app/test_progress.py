@@ -40,6 +40,14 @@ def test_a_line_every_interval(capsys):
     assert not any('\r' in line for line in lines)
 
 
+def test_the_lines_count_the_items(capsys, often):
+    for _ in with_progress(range(3), 'reading', 'files', 3):
+        time.sleep(0.12)
+    lines = capsys.readouterr().err.splitlines()
+    assert any('1/3' in line for line in lines)
+    assert '3/3' in lines[-1]
+
+
 @pytest.mark.parametrize('columns', [100, 0])
 def test_bar_on_a_terminal_that_has_room(monkeypatch, columns):
     monkeypatch.setattr(progress, 'INTERVAL', 1e-2)
