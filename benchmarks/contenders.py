@@ -5,10 +5,11 @@ twice as many pairs, or a network in twice as many steps, until the next time wo
 last one counts. All are calibrated on motions left out, within that time.
 
 keypoints      windows of keypoints of a detector that errs, `experts.lifter`
+features       the units of the last layer of the lifter that ships, on such windows
 silhouettes    descriptors of silhouettes as uneven as those of background subtraction
 targets        joints along the axes of a camera that looks at the person
 
-Both are reduced to principal components. Nobody of the tested motions is learned from. Distances
+All are reduced to principal components. Nobody of the tested motions is learned from. Distances
 are those of the joints from the truth, seen from the pelvis: of the heaviest component, and of the
 best of the five heaviest. The log density is that of the components of targets, nats a number;
 regions are those of single coordinates of joints. What ships learned from more, for hours, and
@@ -49,7 +50,6 @@ from hmt_learning.training.training_set import (
 )
 from hmt_ros.body import load_body
 from hmt_ros.experts.conditional_density import ConditionalDensity
-from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.lifter import load_lifter
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.experts.pose_predictor import load_predictor
@@ -58,9 +58,9 @@ from hmt_ros.image.lifted_poses import HIPS
 Array = NDArray[np.float64]
 
 BUDGET = 60.0  # s of processor time for each model
-KEYPOINTS, SILHOUETTES = 'keypoints', 'silhouettes'
-CUES = (KEYPOINTS, SILHOUETTES)
-PAIRS = {KEYPOINTS: 24_000, SILHOUETTES: 12_000}
+KEYPOINTS, FEATURES, SILHOUETTES = 'keypoints', 'features', 'silhouettes'
+CUES = (KEYPOINTS, FEATURES, SILHOUETTES)
+PAIRS = {KEYPOINTS: 24_000, FEATURES: 24_000, SILHOUETTES: 12_000}
 TESTED = 250  # pairs of an activity
 INPUTS, TARGETS = 40, 24  # principal components
 FIRST, FIRST_STEPS = 400, 250  # pairs, and steps, of the first time
@@ -161,10 +161,13 @@ def pairs_of(cue: str, *, quick: bool = False) -> tuple[Pairs, dict[str, Any]]:
     """Pairs of a cue, and what the model that ships says of the tested ones, by activity."""
     learned, tested = _motions(quick)
     count, few = (QUICK, 12) if quick else (PAIRS[cue], TESTED)
-    if cue == KEYPOINTS:
+    if cue != SILHOUETTES:
         seen, joints, groups = _windows(learned, count, 0)
         of_tests = {k: _windows(x, few, 1)[:2] for k, x in tested.items()}
         shipped = {k: _lifted(x) for k, (x, _) in of_tests.items()}
+        if cue == FEATURES:
+            seen = _features(seen)
+            of_tests = {k: (_features(x), y) for k, (x, y) in of_tests.items()}
     else:
         seen, joints, groups, of_tests, shipped = _silhouettes(learned, tested, count, few)
     centre, scale = seen.mean(0), seen.std(0) + 1e-6
@@ -218,6 +221,12 @@ def _lifted(inputs: Array) -> tuple[Array, Array, Array]:
     return gates, means, np.square(deviations).reshape(*gates.shape, -1)
 
 
+def _features(inputs: Array) -> Array:
+    """Units (n, H) of the last layer of the lifter that ships."""
+    network = load_lifter().network
+    return network.features(network.whitened(inputs.astype(np.float32))).astype(np.float64)
+
+
 def _silhouettes(
     learned: list[PoseSequence], tested: dict[str, list[PoseSequence]], count: int, few: int
 ) -> Any:
@@ -228,10 +237,10 @@ def _silhouettes(
     predictor = load_predictor()
     for activity, motions in tested.items():
         some = training_set(body, motions, TrainingSettings(samples=few, seed=1))
-        masks = [silhouette_parts(x, training.descriptor.points) for x in some.masks()]
-        of_tests[activity] = training.descriptor.describe(masks), _joints(some.poses)
+        parts = [some.parts(i, training.descriptor.points) for i in range(len(some))]
+        of_tests[activity] = training.descriptor.describe(parts), _joints(some.poses)
         found = []
-        for row, pose in zip(predictor.descriptor.describe(masks), some.poses, strict=True):
+        for row, pose in zip(predictor.descriptor.describe(parts), some.poses, strict=True):
             poses, shares = predictor.poses_at(row, pose[:3], BEST_OF)
             joints, more = _joints(poses, pose), BEST_OF - len(poses)
             weights = np.log(np.append(shares, np.full(more, 1e-12)))

@@ -89,12 +89,16 @@ def speed(folder: Path, seconds: float) -> dict[str, float]:
     """Times on the first image of a clip, ms: of the descriptor, and of the whole prediction."""
     clip, predictor = read_clip(folder, 1), load_predictor()
     assert clip.background is not None
-    silhouette = BackgroundModel.from_image(clip.background).silhouette(clip.images[0])
+    image = clip.images[0]
+    silhouette = BackgroundModel.from_image(clip.background).silhouette(image)
     mask = silhouette.view(np.uint8)
     return {
         'descriptor': 1e3
-        * best_time(lambda: predictor.described(person_blob(mask), clip.camera), seconds=seconds),
-        'whole': 1e3 * best_time(lambda: predictor.predict(mask, clip.camera), seconds=seconds),
+        * best_time(
+            lambda: predictor.described(person_blob(mask), clip.camera, image), seconds=seconds
+        ),
+        'whole': 1e3
+        * best_time(lambda: predictor.predict(mask, clip.camera, image), seconds=seconds),
     }
 
 
@@ -179,7 +183,9 @@ def predictions(
     for i in rows.tolist():
         if clip.stamps[i] in clip.truth.joints:
             with contextlib.suppress(NoSilhouetteError):
-                seen = predictor.observe(masks[i], clip.camera, max_components=BEST_OF)
+                seen = predictor.observe(
+                    masks[i], clip.camera, max_components=BEST_OF, image=clip.images[i]
+                )
                 result[i] = seen.mixture
     return result
 

@@ -29,7 +29,7 @@ from hmt_ros.sessions.smoother_session import LIVELINESS
 from hmt_ros.smoothing import ImageModes, Link, MotionSmoother, TrajectoryMixture
 from hmt_ros.smoothing.image_refinement import refined_on_images
 from hmt_ros.smoothing.likelihood import LikelihoodPart
-from hmt_ros.smoothing.motion_smoother import ANEW, PATHS, SmoothedMotions
+from hmt_ros.smoothing.motion_smoother import PATHS, SmoothedMotions
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.smoothing.variational_mixture import VariationalMixture, minimise_free_energy
 
@@ -117,8 +117,7 @@ class ClipTrajectories:
     def prior(self, count: int) -> TrajectoryPrior:
         """Of the states of the first images, as that of the refinement."""
         of = self.origins[self.refined]
-        begins = self.found.begins[of, 1:count].any(0)
-        noise = np.where(begins, ANEW, self.found.liveliness[of].max())
+        noise = self.found.liveliness[of].max()
         return self.smoother.dynamics.prior(np.diff(self.seconds[:count]), noise=noise)
 
     def spectrum(self, count: int) -> Array:

@@ -203,7 +203,9 @@ def draw_real(predictor: PosePredictor, folder: Path) -> None:
     )
     for column, k in enumerate(np.linspace(0, len(seen) - 1, REAL_PICTURES).astype(int)):
         mask = masks[seen[k]]
-        found = predictor.observe(mask, camera, max_components=BEST_OF).mixture
+        found = predictor.observe(
+            mask, camera, max_components=BEST_OF, image=images[seen[k]]
+        ).mixture
         rows, columns = np.nonzero(mask)
         box = box_of(np.stack([columns, rows], axis=1).astype(np.float64), 0.15)
         frame_image(axes[0, column], np.repeat(255 * (1 - mask[..., None]), 3, axis=2), box)

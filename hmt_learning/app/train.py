@@ -224,7 +224,7 @@ def _scores(predictor: PosePredictor, tested: list[PoseSequence]) -> str:
     """Scores on silhouettes of other people, seen as those that were learned from, as text."""
     body, descriptor = predictor.body, predictor.descriptor
     pairs = training_set(body, tested, TrainingSettings(samples=TESTED))
-    rows = descriptor.describe([silhouette_parts(x, descriptor.points) for x in pairs.masks()])
+    rows = descriptor.describe([pairs.parts(i, descriptor.points) for i in range(len(pairs))])
     scored, pelvis = (body.skeleton.joint_index(x) for x in (EVALUATED_JOINTS, (ORIGIN,)))
     heaviest, best = [], []
     for row, pose in zip(rows, pairs.poses, strict=True):

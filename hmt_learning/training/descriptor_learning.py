@@ -1,6 +1,6 @@
 """Learning of the descriptor of silhouettes: its codebook, weights and principal components.
 
-K-means over shape contexts of the training silhouettes gives the codebook. The four parts of the
+K-means over shape contexts of the training silhouettes gives the codebook. The five parts of the
 descriptor are weighted by their spread, and projected on their principal components.
 """
 
@@ -19,7 +19,9 @@ from hmt_ros.inference.clustering import k_means
 
 FOR_CODEBOOK = 20_000  # maximum number of shape contexts that are clustered
 # Share of each part in the distance between two silhouettes.
-WEIGHTS = {'shape_contexts': 1.0, 'edge_pairs': 0.5, 'distances': 1.0, 'moments': 0.5}
+WEIGHTS = {
+    'shape_contexts': 1.0, 'edge_pairs': 0.5, 'distances': 1.0, 'moments': 0.5, 'edges': 0.7,
+}  # fmt: skip
 # Components are divided by their standard deviation to this power: 0 keeps the metric of the parts,
 # 1 would make noise as important as everything else.
 WHITENING = 0.3
@@ -43,7 +45,7 @@ def learned_descriptor(
     *,
     codebook_size: int = 50,
     points: int = 100,
-    components: int = 64,
+    components: int = 96,
 ) -> SilhouetteDescriptor:
     """The descriptor that silhouettes give.
 
@@ -67,8 +69,10 @@ def learned_descriptor(
     columns = {name: np.array([row[name] for row in rows]) for name in names}
     scale = np.concatenate([_weights(name, columns[name]) for name in names])
     features = np.concatenate([columns[name] for name in names], axis=1) * scale
-    centre = features.mean(0)
-    _, deviations, directions = np.linalg.svd(features - centre, full_matrices=False)
+    unknown = np.isnan(features)
+    centre = np.where(unknown, 0.0, features).sum(0) / np.maximum((~unknown).sum(0), 1)
+    off = np.where(unknown, 0.0, features - centre)
+    _, deviations, directions = np.linalg.svd(off, full_matrices=False)
     count = min(components, int((deviations > 1e-6 * deviations[0]).sum()))
     # The sign of a direction is arbitrary: make its largest entry positive.
     signs = np.sign(directions[np.arange(count), np.abs(directions[:count]).argmax(1)])
@@ -82,5 +86,7 @@ def _weights(name: str, columns: Array) -> Array:
     if name == 'moments':
         spread = np.sqrt(columns.shape[1]) * np.maximum(columns.std(0), 1e-6)
     else:
-        spread = np.full(columns.shape[1], max(float(np.sqrt(columns.var(0).sum())), 1e-9))
+        known = columns[~np.isnan(columns).any(1)]
+        width = float(np.sqrt(known.var(0).sum())) if len(known) else 1.0
+        spread = np.full(columns.shape[1], max(width, 1e-9))
     return np.asarray(WEIGHTS[name] / spread)

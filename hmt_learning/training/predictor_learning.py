@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_learning.training.calibration_learning import LearningCalibration
 from hmt_learning.training.descriptor_learning import learned_descriptor
@@ -22,10 +21,7 @@ from hmt_learning.training.network_learning import LearningNetwork, tools_are_th
 from hmt_learning.training.training_set import TrainingSet
 from hmt_ros.body import Body
 from hmt_ros.experts.conditional_density import ConditionalDensity
-from hmt_ros.experts.descriptor.silhouette_descriptor import (
-    SilhouetteDescriptor,
-    silhouette_parts,
-)
+from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor
 from hmt_ros.experts.expert_mixture import (
     ConditionalExperts,
     JointExperts,
@@ -38,8 +34,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import k_means, squared_distances
 
-Bytes = NDArray[np.uint8]
-Progress = Callable[[Iterable[Bytes], int], Iterable[Bytes]]
+Progress = Callable[[Iterable[int], int], Iterable[int]]
 
 SAMPLES_PER_EXPERT = 40  # minimum for a linear expert of the joint model
 NEIGHBOURS = 40  # of the local model
@@ -105,7 +100,7 @@ def _network(experts: int, seed: int, _: int | None) -> ConditionalDensity:
 
 
 KINDS = {
-    'network': ModelKind(_network, 5, folds=2),
+    'network': ModelKind(_network, 5, 96, folds=2),
     'local': ModelKind(_local, 5),
     'conditional': ModelKind(_conditional, 8, 40, 6, few=True, folds=2),
     'joint': ModelKind(_joint, 30, 40, few=True, folds=2),
@@ -184,13 +179,11 @@ def described(
     """
     # Shape contexts of all silhouettes would fill the memory.
     some = np.sort(np.random.default_rng(0).permutation(len(pairs))[:FOR_DESCRIPTOR])
-    descriptor = learned_descriptor(
-        [silhouette_parts(pairs.mask(i)) for i in some], **of_descriptor
-    )
-    masks: Iterable[Bytes] = pairs.masks()
+    descriptor = learned_descriptor([pairs.parts(i) for i in some.tolist()], **of_descriptor)
+    samples: Iterable[int] = range(len(pairs))
     if progress is not None:
-        masks = progress(masks, len(pairs))
-    rows = [descriptor.describe([silhouette_parts(mask, descriptor.points)])[0] for mask in masks]
+        samples = progress(samples, len(pairs))
+    rows = [descriptor.describe([pairs.parts(i, descriptor.points)])[0] for i in samples]
     encoding = PoseEncoding(body)
     return Described(
         descriptor,

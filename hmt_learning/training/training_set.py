@@ -3,14 +3,15 @@
 Recorded or procedural motions become poses of one body, and poses that are nearly equal are
 dropped. Some are mirrored left to right, some get the arms and trunk of another pose. Each is
 turned to a random heading, seen from a random height and distance with a random build, and
-drawn as a silhouette with an outline as uneven as that of background subtraction. The same seed
-gives the same set.
+drawn as a silhouette with an outline as uneven as that of background subtraction. Most are drawn
+in clothes as well, for edges inside the silhouette, and some are cut off at the waist, as by a
+table. The same seed gives the same set.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,9 +22,18 @@ from numpy.typing import NDArray
 from hmt_learning.motion.motion_file import read_motion
 from hmt_learning.motion.procedural_motion import procedural_motion
 from hmt_learning.motion.retarget import body_from_motion, retarget
+from hmt_learning.rendering.renderer import render
+from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.mirror import mirror, root_angles, root_rotations
 from hmt_ros.body.rasterisation import render_silhouettes
+from hmt_ros.experts.descriptor.contour import SMALLEST
+from hmt_ros.experts.descriptor.internal_edges import EDGES
+from hmt_ros.experts.descriptor.silhouette_descriptor import (
+    FEWEST_POINTS,
+    SilhouetteParts,
+    silhouette_parts,
+)
 from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
 from hmt_ros.experts.pose_predictor import RATE
 from hmt_ros.inference.arrays import Array, Index
@@ -40,6 +50,9 @@ FILLED = 0.86  # share of it that the largest person of a group fills
 ROOM = 0.36  # length of the flesh beyond the joints, both ends together, m
 GROUP = 16  # silhouettes of one person
 LEGS = ('hip', 'knee', 'ankle')
+# Where people are cut, from the pelvis to the neck as a share of the way; light from everywhere.
+WAIST, NECK, CUT = 'pelvis', 'neck', (-0.15, 0.45)
+AMBIENT = (0.4, 0.8)
 
 
 @dataclass(frozen=True)
@@ -60,6 +73,8 @@ class TrainingSettings:
         width_range: Range of the factor on the thickness of the whole body.
         width_spread: Relative standard deviation of the thickness of each part.
         boundary_noise: Standard deviation of the outline, px of a person 200 px tall.
+        dressed: Share of the people who are drawn in clothes; of others edges inside are unknown.
+        cut: Share of the people who are cut off somewhere about the waist.
         seed: Seed of all random choices.
 
     Raises:
@@ -78,12 +93,14 @@ class TrainingSettings:
     width_range: tuple[float, float] = (0.82, 1.4)
     width_spread: float = 0.12
     boundary_noise: float = 1.0
+    dressed: float = 0.8
+    cut: float = 0.25
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.samples < 1:
             raise ValueError(f'samples must be at least 1, saw {self.samples}')
-        for name in ('mirrored', 'mixed'):
+        for name in ('mirrored', 'mixed', 'dressed', 'cut'):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f'{name} is a share from 0 to 1, saw {getattr(self, name)}')
 
@@ -124,6 +141,7 @@ class TrainingSet:
         poses: (N, d) in the frame of the image's camera.
         previous: (N, d) of the same person 1 / RATE s before.
         packed: (N, SIDE, SIDE / 8) silhouettes, bits.
+        edges: (N, EDGES) inside them, see `internal_edges`; NaN: unknown.
         activities: (N,) activity of each pair.
         sequences, frames: (N,) sequence and frame of each pose.
     """
@@ -131,6 +149,7 @@ class TrainingSet:
     poses: Array
     previous: Array
     packed: Bytes
+    edges: NDArray[np.float16]
     activities: tuple[str, ...]
     sequences: Index
     frames: Index
@@ -142,9 +161,10 @@ class TrainingSet:
         """Silhouette (SIDE, SIDE) of a sample."""
         return np.unpackbits(self.packed[sample], axis=1)
 
-    def masks(self) -> Iterator[Bytes]:
-        """Iterates over all silhouettes."""
-        return (self.mask(i) for i in range(len(self)))
+    def parts(self, sample: int, points: int = 100) -> SilhouetteParts:
+        """The descriptions of a sample, with so many points on the outline."""
+        found = silhouette_parts(self.mask(sample), points)
+        return replace(found, edges=self.edges[sample].astype(np.float64))
 
 
 def motion_files(folder: Path) -> list[Path]:
@@ -242,14 +262,40 @@ def training_set(
     distances = np.repeat(rng.uniform(*s.distances, len(groups)), GROUP)[: len(poses)]
     poses, previous = _seen(body, poses, previous, view, distances)
     packed = np.empty((len(poses), SIDE, SIDE // 8), np.uint8)
+    edges = np.empty((len(poses), EDGES), np.float16)
     for rows in groups if progress is None else progress(groups, len(groups)):
         person = random_build(body, s, rng)
-        masks = render_silhouettes(person, poses[rows], _fitting_camera(person, poses[rows]))
-        for row, mask in zip(rows, masks, strict=True):
-            noisy = _uneven(mask.view(np.uint8), s.boundary_noise, rng)
-            packed[row] = np.packbits(noisy, axis=1)
+        for row, (mask, grey) in zip(rows, _drawn_people(person, poses[rows], s, rng), strict=True):
+            packed[row] = np.packbits(mask, axis=1)
+            edges[row] = silhouette_parts(mask, FEWEST_POINTS, grey).edges
     activities = tuple(sequences[i].activity for i in which.tolist())
-    return TrainingSet(poses, previous, packed, activities, which, frames)
+    return TrainingSet(poses, previous, packed, edges, activities, which, frames)
+
+
+def _drawn_people(
+    person: Body, poses: Array, s: TrainingSettings, rng: np.random.Generator
+) -> Iterator[tuple[Bytes, Bytes | None]]:
+    """Masks and grey levels (SIDE, SIDE) of a person at poses (n, d); None: not in clothes."""
+    camera = _fitting_camera(person, poses)
+    dressed = rng.random() < s.dressed
+    light = (*rng.normal(size=2).tolist(), 1.0)
+    scene = Scene(
+        seed=int(rng.integers(2**32)), light=light, ambient=rng.uniform(*AMBIENT), shadow=0.0,
+        clutter=0,
+    )  # fmt: skip
+    waists = person.joint_positions(poses)[:, person.skeleton.joint_index((WAIST, NECK))]
+    for pose, (low, high) in zip(poses, camera.project(waists)[..., 1], strict=True):
+        if dressed:
+            picture = render(person, pose, camera, scene)
+            mask, grey = picture.mask, cv2.cvtColor(picture.image, cv2.COLOR_BGR2GRAY)
+        else:
+            mask, grey = render_silhouettes(person, pose[None], camera)[0], None
+        seen = _uneven(mask.view(np.uint8), s.boundary_noise, rng)
+        if rng.random() < s.cut and low > high:
+            upper = seen.copy()
+            upper[max(round(low - rng.uniform(*CUT) * (low - high)), 0) :] = 0
+            seen = upper if np.count_nonzero(upper) > SMALLEST else seen
+        yield seen, None if grey is None else np.asarray(grey, np.uint8)
 
 
 def novel_frames(body: Body, poses: Array, distance: float) -> Index:

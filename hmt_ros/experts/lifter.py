@@ -284,14 +284,17 @@ class Network(Layers):
 
     def __call__(self, inputs: Floats) -> tuple[Array, Array, Array]:
         """Log gates (N, K), means (N, K, J, 3) and deviations (N, K, J, 3), m, of inputs (N, p)."""
-        whitened: Floats = (inputs - self.mean) / self.scale
-        out = self.outputs(whitened).astype(np.float64)
+        out = self.outputs(self.whitened(inputs)).astype(np.float64)
         n, j = len(inputs), len(self.middle)
         k = out.shape[1] // (1 + 6 * j)
         gates, means = out[:, :k], out[:, k : k * (1 + 3 * j)].reshape(n, k, j, 3)
         spreads = out[:, k * (1 + 3 * j) :].reshape(n, k, j, 3)
         deviations = elementary.exp(np.clip(spreads + SPREAD, *SPREADS))
         return log_softmax(gates), MEANS * means + self.middle, deviations
+
+    def whitened(self, inputs: Floats) -> Floats:
+        """Inputs (N, p) as the layers take them."""
+        return np.asarray((inputs - self.mean) / self.scale)
 
 
 # Scale of the means, m; log of the usual deviation, and its limits, log m.

@@ -59,10 +59,14 @@ class Layers:
 
     def outputs(self, inputs: Floats) -> Floats:
         """The numbers (N, O) at inputs (N, p) that are whitened."""
+        return np.asarray(product(self.features(inputs), self.last) + self.last_bias)
+
+    def features(self, inputs: Floats) -> Floats:
+        """The units (N, H) of the last layer at inputs (N, p) that are whitened."""
         units = _leaky(product(inputs, self.first) + self.first_bias)
         for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
             units = units + _leaky(product(units, weights) + bias)
-        return np.asarray(product(units, self.last) + self.last_bias)
+        return units
 
     def jacobians(self, inputs: Floats, which: slice | Index) -> Floats:
         """Derivatives (N, o, p) of some of the numbers by inputs (N, p) that are whitened."""

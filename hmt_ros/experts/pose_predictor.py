@@ -1,6 +1,6 @@
 """From a silhouette to a mixture over full poses: descriptor, experts, encoding and root.
 
-    mask -> centred view -> descriptor -> experts -> mixture over targets
+    mask, image -> centred view -> descriptor -> experts -> mixture over targets
     mask -> bounding box -> root of each component -> mixture over poses
 
 One object and one file hold everything that is learned. The mixture of the image before can be
@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -40,6 +41,7 @@ from hmt_ros.experts.descriptor.silhouette_descriptor import (
     ANGULAR,
     FIXED,
     MAP,
+    MOMENTS,
     PAIR_BINS,
     RADIAL,
     SilhouetteDescriptor,
@@ -53,7 +55,7 @@ from hmt_ros.experts.root_placement import (
     placed_gaussians,
 )
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.linear_algebra import inverse, product, singular_values
 from hmt_ros.inference.reduction import reduced
 
@@ -159,9 +161,11 @@ class PosePredictor:
             self.notes,
         )
 
-    def predict(self, mask: ArrayLike, camera: Camera) -> GaussianMixture:
+    def predict(
+        self, mask: ArrayLike, camera: Camera, image: Image | None = None
+    ) -> GaussianMixture:
         """Mixture over poses of the person in a mask (H, W); see `observe`."""
-        return self.observe(mask, camera).mixture
+        return self.observe(mask, camera, image=image).mixture
 
     def observe(
         self,
@@ -173,6 +177,7 @@ class PosePredictor:
         propagation: str = ALONE,
         max_components: int = MAX_COMPONENTS,
         size_spread: float = SIZE_SPREAD,
+        image: Image | None = None,
     ) -> Prediction:
         """The prediction from the silhouette of a person.
 
@@ -184,10 +189,11 @@ class PosePredictor:
             max_components: Maximum number of components of the mixture; the heaviest stay.
             size_spread: Relative standard deviation of the person's size; 0 if the body has the
                 lengths of the person.
+            image: (H, W, 3) BGR, in which edges inside the mask are looked for; None: unknown.
 
         Raises:
             NoSilhouetteError: the mask has no person.
-            ValueError: the mask has not the size of the camera's image.
+            ValueError: mask or image have not the size of the camera's image.
         """
         seen = np.asarray(mask)
         require(
@@ -195,8 +201,10 @@ class PosePredictor:
             f'the mask has shape {seen.shape}, but the camera gives '
             f'({camera.height}, {camera.width})',
         )
+        right = image is None or image.shape == (*seen.shape, 3)
+        require(right, f'the image must have the size of the mask, {seen.shape}, and 3 channels')
         blob = person_blob(seen)
-        descriptor = self.described(blob, camera)
+        descriptor = self.described(blob, camera, image)
         support = float(self.model.support(descriptor[None])[0])
         targets = self.targets_after(
             descriptor, previous, interval, propagation=propagation, max_components=max_components
@@ -216,10 +224,13 @@ class PosePredictor:
         mixture = GaussianMixture(targets.weights, means, covariances)
         return Prediction(mixture, blob, support)
 
-    def described(self, blob: PersonBlob, camera: Camera) -> Array:
+    def described(self, blob: PersonBlob, camera: Camera, image: Image | None = None) -> Array:
         """Descriptor (p,) of a person."""
-        view = centred_view(blob, camera, self.body.level)
-        parts = silhouette_parts(view, self.descriptor.points)
+        grey = None
+        if image is not None:
+            grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+        view, seen = centred_view(blob, camera, self.body.level, grey)
+        parts = silhouette_parts(view, self.descriptor.points, seen)
         return np.asarray(self.descriptor.describe([parts])[0])
 
     def targets_after(
@@ -345,7 +356,7 @@ class PosePredictor:
 
     def answer(self, given: Array) -> GaussianMixture:
         """The mixture over targets (D,) for the parts of a silhouette; with dynamics, by these."""
-        contexts, *others = np.split(given, np.cumsum([-FIXED, PAIR_BINS, MAP * MAP]))
+        contexts, *others = np.split(given, np.cumsum([-FIXED, PAIR_BINS, MAP * MAP, MOMENTS]))
         parts = SilhouetteParts(contexts.reshape(-1, RADIAL * ANGULAR), *others)
         row = self.descriptor.describe([parts])[0]
         found = self.model.answer(row)

@@ -333,7 +333,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if self._height < LEAST_HEIGHT:
             return None
         try:
-            found = self._seen(mask, camera, *self._known_before(waiting.stamp_ns))
+            before = self._known_before(waiting.stamp_ns)
+            found = self._seen(mask, waiting.image, camera, *before)
         except NoSilhouetteError:
             return None
         self._support = found.support
@@ -366,6 +367,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     def _seen(
         self,
         mask: Mask,
+        image: NDArray[np.uint8],
         camera: Camera,
         previous: GaussianMixture | None = None,
         interval: float = STEP,
@@ -378,6 +380,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             propagation=self.parameters.propagation,
             max_components=self.parameters.max_hypotheses,
             size_spread=self._size_spread,
+            image=image,
         )
 
     def _publish_silhouette(self, of: WaitingImage, mask: Mask | None = None) -> None:
@@ -440,7 +443,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 f'nobody is seen: the silhouette is {_height(mask)} px high, wanted at least '
                 f'{LEAST_HEIGHT}'
             )
-        mixture = self._seen(mask, camera).mixture
+        mixture = self._seen(mask, image, camera).mixture
         return self._message(mixture, time_ns(message.header.stamp), str(message.header.frame_id))
 
     def _present_state(self) -> BmeState:

@@ -28,7 +28,7 @@ def body() -> Body:
 @pytest.fixture(scope='module')
 def training(body: Body) -> Described:
     sequences = [procedural_sequence('walk', body, 5.0, seed) for seed in (1, 2)]
-    settings = TrainingSettings(samples=600, elevation_spread=3.0)
+    settings = TrainingSettings(samples=600, elevation_spread=3.0, dressed=0.0, cut=0.0)
     pairs = training_set(body, sequences, settings)
     return described(body, pairs, codebook_size=25, components=30)
 

@@ -305,10 +305,11 @@ class StubPredictor:
 
     def observe(
         self, mask, camera, previous=None, interval=1 / 30, *, propagation='none',
-        max_components=8, size_spread=0.06,
+        max_components=8, size_spread=0.06, image=None,
     ):  # fmt: skip
         if self.fault is not None:
             raise self.fault
+        assert image.shape == (*mask.shape, 3)
         StubPredictor.asked.append((mask, previous, size_spread))
         StubPredictor.intervals.append(interval)
         means = np.tile(self.body.prior_mean, (2, 1))

@@ -200,20 +200,29 @@ def _smooth(outline: Array) -> Array:
     return total / (2 * (SMOOTHING // 2) + 1)
 
 
-def centred_view(blob: PersonBlob, camera: Camera, level: Array = UPRIGHT) -> Bytes:
+def centred_view(
+    blob: PersonBlob, camera: Camera, level: Array = UPRIGHT, grey: Bytes | None = None
+) -> tuple[Bytes, Bytes | None]:
     """The person (h, w), 1 inside, seen by the camera turned to the middle of the box.
 
     Args:
         blob: the person.
         camera: that saw it.
         level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
+        grey: (H, W) grey levels of the camera's image, or None.
+
+    Returns:
+        The person, and the grey levels (h, w) seen so, or None.
     """
+    if grey is not None:
+        height, width = blob.mask.shape
+        grey = grey[blob.top : blob.top + height, blob.left : blob.left + width]
     left, top, right, bottom = blob.box
     middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
     axis = camera.rays(middle)
     upright = np.array_equal(level, UPRIGHT)
     if upright and not camera.distortion and axis[2] > elementary.cos(STRAIGHT):
-        return blob.mask
+        return blob.mask, grey
     corners = np.array([[x, y] for x in (left, middle[0], right) for y in (top, middle[1], bottom)])
     # From the view to the camera.
     turn = product(level, ray_rotations(product(axis[None], level))[0])
@@ -228,4 +237,11 @@ def centred_view(blob: PersonBlob, camera: Camera, level: Array = UPRIGHT) -> By
     columns, rows = pixels[0] - np.float32(blob.left), pixels[1] - np.float32(blob.top)
     drawn = cv2.remap(blob.mask * np.uint8(255), columns, rows, cv2.INTER_LINEAR)
     result: Bytes = (drawn > 127).astype(np.uint8)
-    return result if result.any() else blob.mask
+    if not result.any():
+        return blob.mask, grey
+    if grey is not None:
+        border = cv2.BORDER_REPLICATE
+        grey = np.asarray(
+            cv2.remap(grey, columns, rows, cv2.INTER_LINEAR, borderMode=border), np.uint8
+        )
+    return result, grey

@@ -1,11 +1,13 @@
 """The descriptor of a silhouette: the vector from which a pose is predicted (BME 3).
 
-Four descriptions of one outline, brought to one size first:
+Five descriptions of one person, brought to one size first:
 
 - the histogram of shape contexts over a codebook: which local shapes occur;
 - the histogram of edge pairs across the inside: how thick and how bent limbs are;
 - a map of the signed distance to the outline: where limbs are;
-- moments and proportions of the whole.
+- moments and proportions of the whole;
+- edges inside, where there is an image (`internal_edges`). Without one they are unknown, and the
+  descriptor has their mean in their place.
 
 None of them changes with the position and the size of the person in the image. Edge pairs do not
 change with rotation either; the others do, because a camera stands upright and up has a meaning. A
@@ -36,6 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from hmt_ros.body.learned_file import require
 from hmt_ros.core import elementary
 from hmt_ros.experts.descriptor.contour import person_blob, sample_contour
+from hmt_ros.experts.descriptor.internal_edges import EDGES, internal_edges
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import smallest_columns, squared_distances
 from hmt_ros.inference.linear_algebra import product
@@ -148,7 +151,7 @@ MAP = 16  # cells of a side of the map of distances
 EXTENT = 4.4  # width of the map in radii of gyration; stretched arms and legs are inside
 DEEPEST, FURTHEST = 0.25, 0.60  # limits of the distances inside and outside, radii of gyration
 MOMENTS = 12
-FIXED = PAIR_BINS + MAP * MAP + MOMENTS  # features besides those of the codebook
+FIXED = PAIR_BINS + MAP * MAP + MOMENTS + EDGES  # features besides those of the codebook
 FEWEST_POINTS, MOST_POINTS = 8, 500  # on the outline; time and memory grow with their square
 
 
@@ -161,29 +164,40 @@ class SilhouetteParts:
         edge_pairs: (48,) histogram.
         distances: (MAP * MAP,) signed distances to the outline, positive inside, radii of gyration.
         moments: (12,) second and third moments, proportions.
+        edges: (EDGES,) see `internal_edges`; NaN: unknown.
     """
 
     contexts: Array
     edge_pairs: Array
     distances: Array
     moments: Array
+    edges: Array
 
 
-def silhouette_parts(mask: ArrayLike, points: int = 100) -> SilhouetteParts:
+def silhouette_parts(
+    mask: ArrayLike, points: int = 100, grey: Bytes | None = None
+) -> SilhouetteParts:
     """The descriptions of the person in a mask (H, W).
 
     Args:
         mask: (H, W), not zero in the foreground.
+        grey: (H, W) grey levels of the image; None: edges inside are unknown.
 
     Raises:
         NoSilhouetteError: the mask has no person.
     """
-    person = _at_one_size(person_blob(mask).mask)
+    blob = person_blob(mask)
+    person = _at_one_size(blob.mask)
     outline, directions = sample_contour(person, points)
-    distances, moments = _map_and_moments(person)
-    return SilhouetteParts(
-        shape_contexts(outline), edge_pairs(outline, directions, person), distances, moments
-    )
+    distances, moments, centre, width = _map_and_moments(person)
+    edges = np.full(EDGES, np.nan)
+    if grey is not None:
+        height, across = blob.mask.shape
+        own = grey[blob.top : blob.top + height, blob.left : blob.left + across]
+        resized = cv2.resize(own, person.shape[::-1], interpolation=_interpolation(blob.mask))
+        edges = internal_edges(np.asarray(resized, np.uint8), person, centre, width)
+    pairs = edge_pairs(outline, directions, person)
+    return SilhouetteParts(shape_contexts(outline), pairs, distances, moments, edges)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +242,8 @@ class SilhouetteDescriptor:
     def describe(self, parts: Iterable[SilhouetteParts]) -> Array:
         """Vectors (n, p) of silhouettes."""
         features = [np.concatenate([*features_of(self.codebook, x).values()]) for x in parts]
-        return np.asarray(product(np.array(features) * self.scale - self.centre, self.basis))
+        off = np.array(features) * self.scale - self.centre
+        return np.asarray(product(np.where(np.isnan(off), 0.0, off), self.basis))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The learned arrays in single precision, for a file."""
@@ -261,6 +276,7 @@ def features_of(codebook: ShapeContextCodebook, parts: SilhouetteParts) -> dict[
         'edge_pairs': np.sqrt(parts.edge_pairs),
         'distances': parts.distances,
         'moments': parts.moments,
+        'edges': parts.edges,
     }
 
 
@@ -268,9 +284,12 @@ def _at_one_size(mask: Bytes) -> Bytes:
     """The person, resized so that the longer side has SIZE pixels."""
     factor = SIZE / max(mask.shape)
     height, width = (max(round(side * factor), 3) for side in mask.shape)
-    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
-    resized = cv2.resize(mask * np.uint8(255), (width, height), interpolation=how)
+    resized = cv2.resize(mask * np.uint8(255), (width, height), interpolation=_interpolation(mask))
     return (resized > 127).astype(np.uint8)
+
+
+def _interpolation(mask: Bytes) -> int:
+    return cv2.INTER_AREA if max(mask.shape) > SIZE else cv2.INTER_LINEAR
 
 
 def _interpolated(values: Array, rows: Array, columns: Array) -> Array:
@@ -282,8 +301,8 @@ def _interpolated(values: Array, rows: Array, columns: Array) -> Array:
     return np.asarray(upper[:, j] * (1.0 - right) + upper[:, j + 1] * right)
 
 
-def _map_and_moments(mask: Bytes) -> tuple[Array, Array]:
-    """Signed distances (MAP * MAP,) around the centroid, and moments (MOMENTS,)."""
+def _map_and_moments(mask: Bytes) -> tuple[Array, Array, tuple[float, float], float]:
+    """Signed distances (MAP * MAP,) around the centroid, moments (MOMENTS,), centroid and width."""
     m = cv2.moments(mask, binaryImage=True)
     area = m['m00']
     x, y = m['m10'] / area, m['m01'] / area
@@ -311,4 +330,5 @@ def _map_and_moments(mask: Bytes) -> tuple[Array, Array]:
         (y - 0.5 * height) / radius,
         0.5 * np.sqrt(area) / radius,
     ]
-    return cells.ravel().astype(np.float64), np.concatenate([second, third, proportions])
+    moments = np.concatenate([second, third, proportions])
+    return cells.ravel().astype(np.float64), moments, (x, y), 2 * half

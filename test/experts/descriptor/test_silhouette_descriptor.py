@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from hmt_learning.training.descriptor_learning import learned_descriptor
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError, centred_view, person_blob
+from hmt_ros.experts.descriptor.internal_edges import EDGES
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
     SilhouetteDescriptor,
     silhouette_parts,
@@ -138,7 +141,7 @@ def test_the_centred_view_undoes_place_and_lens() -> None:
     for camera in (plain, lens):
         blob = person_blob(render_silhouettes(body, aside, camera)[0])
         assert not any(blob.cut)
-        found, raw = silhouette_parts(centred_view(blob, camera)), silhouette_parts(blob.mask)
+        found, raw = silhouette_parts(centred_view(blob, camera)[0]), silhouette_parts(blob.mask)
         error, without = (np.abs(x.distances - wanted.distances).mean() for x in (found, raw))
         assert error < 0.006  # radii of gyration
         assert error < 0.62 * without
@@ -151,3 +154,25 @@ def test_parts_have_their_sizes(masks: np.ndarray) -> None:
     assert parts.moments.shape == (12,)
     assert np.isfinite(parts.moments).all()
     assert parts.moments[0] + parts.moments[1] == pytest.approx(1.0)
+
+
+def test_unknown_edges_are_the_usual_ones(
+    descriptor: SilhouetteDescriptor, masks: np.ndarray
+) -> None:
+    rng = np.random.default_rng(0)
+    parts = [silhouette_parts(x) for x in masks]
+    seen = [replace(x, edges=rng.random(EDGES)) for x in parts[::2]]
+    mixed = learned_descriptor([*seen, *parts[1::2]], codebook_size=30, components=40)
+    usual = np.mean([x.edges for x in seen], axis=0)
+    found = mixed.describe([parts[0], replace(parts[0], edges=usual)])
+    np.testing.assert_allclose(found[0], found[1], atol=1e-9)
+
+
+def test_the_image_of_a_person_in_a_corner(masks: np.ndarray) -> None:
+    grey = np.tile(np.arange(320, dtype=np.uint8), (240, 1))
+    whole = silhouette_parts(masks[3], grey=grey)
+    rows, columns = np.nonzero(masks[3])
+    cut = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    np.testing.assert_array_equal(
+        silhouette_parts(masks[3][cut], grey=grey[cut]).edges, whole.edges
+    )

@@ -37,10 +37,10 @@ def test_the_mirror_image_of_a_pose(body, sequences):
 
 
 def test_pairs_are_seen_whole_from_all_around(body, sequences):
-    pairs = training_set(body, sequences, TrainingSettings(samples=96, seed=2))
+    pairs = training_set(body, sequences, TrainingSettings(samples=96, cut=0.0, seed=2))
     assert len(pairs) == 96
-    for mask in pairs.masks():
-        rows, columns = np.nonzero(mask)
+    for i in range(96):
+        rows, columns = np.nonzero(pairs.mask(i))
         assert rows.min() > 0
         assert columns.min() > 0
         assert rows.max() < SIDE - 1
@@ -59,6 +59,26 @@ def test_the_same_seed_gives_the_same_set(body, sequences):
     np.testing.assert_array_equal(first.packed, second.packed)
     np.testing.assert_array_equal(first.poses, second.poses)
     assert (first.packed != other.packed).any()
+
+
+def test_some_are_cut_at_the_waist_and_some_are_not_dressed(body, sequences):
+    whole, cut = (
+        training_set(body, sequences, TrainingSettings(samples=64, cut=x, dressed=0.5, seed=3))
+        for x in (0.0, 1.0)
+    )
+    for pairs in (whole, cut):
+        known = np.isfinite(pairs.edges)
+        assert (known.all(1) | ~known.any(1)).all()
+        assert 0 < known.all(1).sum() < 64
+    np.testing.assert_array_equal(whole.poses, cut.poses)
+
+    def middle(pairs):
+        return np.array([np.nonzero(pairs.mask(i))[0].mean() for i in range(64)])
+
+    assert np.median(middle(whole) - middle(cut)) > 0.1 * SIDE
+    parts = whole.parts(0, 60)
+    assert parts.contexts.shape == (60, 60)
+    np.testing.assert_array_equal(parts.edges, whole.edges[0])
 
 
 @pytest.mark.parametrize(
