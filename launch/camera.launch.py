@@ -1,11 +1,13 @@
-"""Starts everything for one person before a webcam, or in a video file: camera, detector, nodes.
+"""Starts everything for people before a webcam, or in a video file: camera, detector, nodes.
 
     ros2 launch hmt_ros camera.launch.py
     ros2 launch hmt_ros camera.launch.py video:=walk.mp4 fov:=70 rviz:=true
     ros2 launch hmt_ros camera.launch.py video:=/dev/video2 calibration:=camera.yaml
+    ros2 launch hmt_ros camera.launch.py people:=3 rviz:=true
     ros2 launch hmt_ros camera.launch.py --show-args
 
-What else hmt.launch.py takes can be given, too, but for image and nodes.
+What else hmt.launch.py takes can be given, too, but for image and nodes; with more than one of
+people, people_node takes the place of the nodes for one.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ PACKAGE = 'hmt_ros'
 CAMERA = 'camera'
 WITH_DETECTOR = 'filter_node smoother_node keypoints_node'
 WITHOUT_DETECTOR = 'filter_node smoother_node bme_node'
+SEVERAL = 'people_node keypoints_node'
 DETECTOR = DETECTORS[USUAL_DETECTOR]
 # Arguments of hmt.launch.py that tell where the person is in place of the detector.
 FINDERS = ('background_file', 'keypoints', 'detections_source', 'mask', 'depth', 'subject_file')
@@ -120,8 +123,14 @@ def actions_of(
     for name in ('fov', 'calibration'):
         if given[name]:
             options += [f'--{name}', given[name]]
-    nodes = WITH_DETECTOR if _has_detector(given['detector']) else WITHOUT_DETECTOR
-    namespace = handed.get('namespace') or f'/humans/bodies/{handed.get("body_id") or "p1"}'
+    people = handed.get('people') or '1'
+    several, detector = people != '1', _has_detector(given['detector'])
+    if several and not detector:
+        raise ValueError(f'people: {people} people need {DETECTOR.title}; run {INSTALL}')
+    nodes = SEVERAL if several else WITH_DETECTOR if detector else WITHOUT_DETECTOR
+    namespace = handed.get('namespace') or (
+        '' if several else f'/humans/bodies/{handed.get("body_id") or "p1"}'
+    )
     camera = Node(
         package=PACKAGE,
         executable='camera_node',

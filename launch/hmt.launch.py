@@ -58,13 +58,18 @@ ARGUMENTS = (
         'nodes',
         ' '.join(USUAL_NODES),
         f'nodes to start, separated by blanks; besides these {DETECTOR}, whose keypoints the '
-        f'filter then uses; {PEOPLE} alone tracks several people',
+        f'filter then uses; {PEOPLE}, alone or with {DETECTOR}, tracks several people',
     ),
     (
         'one_process',
         'true',
         f"'false': each node has a process of its own, which takes twice the memory and is faster "
         f'with three cores or more; {PEOPLE} always has one',
+    ),
+    (
+        'people',
+        '4',
+        f'maximum number of people, with {PEOPLE}; more than 1 start it in camera.launch.py',
     ),
     ('image', '/camera/image_raw', 'topic of the images, without /compressed'),
     ('camera_info', '', 'topic of the calibration; empty: camera_info beside the images'),
@@ -167,8 +172,10 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
     info = given['camera_info'] or f'{image.rpartition("/")[0]}/camera_info'
     remappings = [('image', image), ('image/compressed', f'{image}/compressed')]
     remappings.append(('camera_info', info))
-    if PEOPLE in names and len(names) > 1:
-        raise ValueError(f'nodes: {PEOPLE} stands alone, saw {given["nodes"]!r}')
+    if PEOPLE in names and not {PEOPLE, DETECTOR}.issuperset(names):
+        raise ValueError(
+            f'nodes: {PEOPLE} stands alone, or with {DETECTOR}, saw {given["nodes"]!r}'
+        )
     if PEOPLE in names:
         namespace = given['namespace']
     source = given['detections_source']
@@ -217,13 +224,18 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             # While the person is tracked the filter needs the processor more.
             'tracked_interval': TRACKED_INTERVAL if 'filter_node' in names else 0.0,
         },
-        DETECTOR: {**common, 'image_transport': transport},
+        DETECTOR: {
+            **common,
+            'image_transport': transport,
+            **({'people': _count(given, 'people')} if PEOPLE in names else {}),
+        },
         PEOPLE: {
             **camera,
             **lens,
             **_named(given, 'gravity_frame'),
             **_named(given, 'fixed_frame'),
             'source': source or 'people',
+            'max_people': _count(given, 'people'),
         },
     }
     own = [given['params_file']] if given['params_file'] else []
@@ -393,6 +405,13 @@ def _frame(namespace: str) -> str:
 def _logger(namespace: str, name: str) -> str:
     """Name of a node's logger."""
     return f'{namespace}/{name}'.strip('/').replace('/', '.')
+
+
+def _count(given: Mapping[str, str], name: str) -> int:
+    text = given[name]
+    if not (re.fullmatch(r'\d+', text) and 1 <= int(text) <= 20):
+        raise ValueError(f'{name}: wanted a number from 1 to 20, saw {text!r}')
+    return int(text)
 
 
 def _fraction(given: Mapping[str, str], name: str) -> float:

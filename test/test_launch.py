@@ -225,8 +225,15 @@ def test_several_people(actions):
     assert dict(node['remappings'])['detections'] == '/yolo'
     own = parameters(actions(nodes='people_node', namespace='/lab')['people_node'])
     assert own['source'] == 'people'
-    with pytest.raises(ValueError, match='people_node stands alone'):
+    with pytest.raises(ValueError, match='people_node stands alone, or with keypoints_node'):
         actions(nodes='filter_node people_node')
+    made = actions(nodes='people_node keypoints_node', people='3')
+    assert {node['namespace'] for node in made.values()} == {''}
+    assert parameters(made['keypoints_node'])['people'] == 3
+    assert parameters(made['people_node'])['max_people'] == 3
+    for wrong in ('0', '21', 'all', '-1', ''):
+        with pytest.raises(ValueError, match='people: wanted a number from 1 to 20'):
+            actions(nodes='people_node', people=wrong)
 
 
 def test_rep_155(actions):
@@ -357,6 +364,21 @@ def test_one_line_from_a_webcam_to_a_person(given, options, nodes, monkeypatch):
     assert source.arguments == (str(ROOT / 'hmt_ros' / 'launch' / 'hmt.launch.py'),)
     # Neither file has an argument of the other's name.
     assert not context.keys() & {name for name, _, _ in with_stand_ins(FILE)['ARGUMENTS']}
+
+
+def test_several_people_before_a_webcam(monkeypatch):
+    camera_file = with_stand_ins(CAMERA_FILE)
+    made, names = camera_file['actions_of'], camera_file['actions_of'].__globals__
+    given = {name: default for name, default, _ in camera_file['ARGUMENTS']}
+    monkeypatch.setitem(names, 'DETECTOR', detector(True))
+    camera, people = made(given, ROOT / 'hmt_ros', {'people': '3'})
+    assert camera.options['parameters'][0]['wait_for'] == '/people_node /keypoints_node'
+    assert dict(people.options['launch_arguments'])['nodes'] == 'people_node keypoints_node'
+    _, one = made(given, ROOT / 'hmt_ros', {'people': '1'})
+    assert 'filter_node' in dict(one.options['launch_arguments'])['nodes']
+    monkeypatch.setitem(names, 'DETECTOR', detector(False))
+    with pytest.raises(ValueError, match=r'people: 3 people need .*; run "ros2 run hmt_ros '):
+        made(given, ROOT / 'hmt_ros', {'people': '3'})
 
 
 def test_rviz_shows_topics_of_the_nodes_relative_to_a_namespace():

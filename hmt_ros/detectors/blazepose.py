@@ -14,6 +14,7 @@ MediaPipe 0.10.21. The networks run in this process, in one thread, without Pyth
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.core import elementary
 from hmt_ros.detectors import blazepose_models
 from hmt_ros.detectors.detector import DetectorKind
 from hmt_ros.detectors.square import Square, sigmoid
@@ -42,6 +44,8 @@ _PERSON_SIZE, _LANDMARK_SIZE, _HEAT_SIZE = 224, 256, 64
 _STRIDES, _PREDICTIONS, _SAME = (8, 16, 32), (2, 2, 6), 0.3
 # Probability from which somebody is there, and from which a pixel belongs to them.
 _SEEN = 0.5
+# Quality of somebody who lies or hangs against that of somebody upright.
+_LYING = 0.6
 # Half the side of the window of a heat map about its landmark; its least peak.
 _HEAT_REACH, _HEAT_PEAK = 4, 0.5
 # Cutoffs f_0 of the one-euro filters, Hz, and factors b on velocities, which raise them.
@@ -69,13 +73,10 @@ class BlazePose:
     def __init__(self, *, with_mask: bool = False) -> None:
         self.mask: Mask | None = None
         self._with_mask = with_mask
-        self._names = schemes()[SCHEME].names
-        self._person = _Network(blazepose_models.PERSON)
-        self._landmark = _Network(blazepose_models.LANDMARKS)
-        self._anchors = _anchors()
+        self._networks = Networks()
         self._size = (0, 0)
         self._newest = 0
-        self._followed: _Followed | None = None
+        self._followed: Followed | None = None
 
     def detect(self, image: Image, stamp_ns: int) -> Keypoints | None:
         """The landmarks of the person in an image, named as in the scheme 'mediapipe33'.
@@ -96,48 +97,64 @@ class BlazePose:
             self._followed = None
         self._newest, self._size = stamp_ns, image.shape[:2]
         circle = self._circle(image) if self._followed is None else self._followed.circle
-        found = None if circle is None else self._landmarks_in(image, Square.about(circle))
+        found = None if circle is None else self._networks.landmarks(image, Square.about(circle))
         if found is None:
             self._followed = None
             if self._with_mask:
                 self.mask = np.zeros(self._size, dtype=np.bool_)
             return None
         if self._followed is None:
-            self._followed = _Followed()
-        pixels, confidences, positions = self._followed.smooth(found, interval * 1e-9)
+            self._followed = Followed()
         if self._with_mask:
             self.mask = found.square.spread(sigmoid(found.mask), self._size) >= _SEEN
-        # The network counts from the edge of the first pixel.
-        return Keypoints(
-            self._names, pixels - 0.5, np.full((LANDMARKS, 2, 2), np.nan), confidences, positions
-        )
+        return self._followed.smooth(found, interval * 1e-9)
 
     def _circle(self, image: Image) -> Array | None:
         """Centre and a point (2, 2) of the circle about the most certain person."""
         height, width = image.shape[:2]
-        side = max(height, width)
-        square = Square((width / 2, height / 2), side, 0.0)
+        whole = Square((width / 2, height / 2), max(height, width), 0.0)
+        return next((circle for _, circle in self._networks.circles(image, whole)), None)
+
+
+class Networks:
+    """The two networks: people in a square of an image, and the landmarks of one person.
+
+    Raises:
+        DetectorError: they are not installed.
+    """
+
+    def __init__(self) -> None:
+        self._person = _Network(blazepose_models.PERSON)
+        self._landmark = _Network(blazepose_models.LANDMARKS)
+        self._anchors = _anchors()
+
+    def circles(self, image: Image, square: Square) -> Iterator[tuple[float, Array]]:
+        """Scores and circles, centre and a point (2, 2), px, about people, the surest first.
+
+        Predictions that overlap with the surest one left are averaged with it.
+        """
         seen = square.seen(image, _PERSON_SIZE, cv2.BORDER_CONSTANT)
         boxes, logits = self._person(seen * np.float32(2 / 255) - np.float32(1))
         scores = sigmoid(logits[:, 0].astype(np.float64))
         chosen = np.flatnonzero(scores >= _SEEN)
-        if not len(chosen):
-            return None
         scores = scores[chosen]
         # Middle and size of the face, then points of the body, in parts of the square.
         points = boxes[chosen].astype(np.float64).reshape(-1, 6, 2) / _PERSON_SIZE
         points[:, [0, 2, 3]] += self._anchors[chosen, None]
-        lower, upper = points[:, 0] - points[:, 1] / 2, points[:, 0] + points[:, 1] / 2
-        best = int(scores.argmax())
-        common = np.minimum(upper, upper[best]) - np.maximum(lower, lower[best])
-        area = np.prod(common.clip(0.0), axis=1)
-        areas = np.prod(upper - lower, axis=1)
-        same = area > _SAME * (areas + areas[best] - area)
-        middle = np.average(points[same, 2:4], axis=0, weights=scores[same])
-        result: Array = square.corner + middle * side
-        return result
+        while len(scores):
+            lower, upper = points[:, 0] - points[:, 1] / 2, points[:, 0] + points[:, 1] / 2
+            best = int(scores.argmax())
+            common = np.minimum(upper, upper[best]) - np.maximum(lower, lower[best])
+            area = np.prod(common.clip(0.0), axis=1)
+            areas = np.prod(upper - lower, axis=1)
+            same = area > _SAME * (areas + areas[best] - area)
+            same[best] = True
+            middle = np.average(points[same, 2:4], axis=0, weights=scores[same])
+            yield float(scores[best]), square.corner + middle * square.side
+            points, scores = points[~same], scores[~same]
 
-    def _landmarks_in(self, image: Image, square: Square) -> _Found | None:
+    def landmarks(self, image: Image, square: Square) -> Found | None:
+        """The landmarks of the person in a square; None: nobody is there."""
         if square.side < 1.0:
             return None
         seen = square.seen(image, _LANDMARK_SIZE, cv2.BORDER_REPLICATE)
@@ -148,12 +165,13 @@ class BlazePose:
         points = _refined(rows[:, :2] / _LANDMARK_SIZE, heat)[: LANDMARKS + 2]
         positions = world.astype(np.float64).reshape(-1, 3)[:LANDMARKS]
         positions[:, :2] = product(positions[:, :2], square.axes)
-        return _Found(
+        return Found(
             square,
             square.corner + product(square.side * points, square.axes),
             sigmoid(rows[:LANDMARKS, 3]),
             positions,
             mask[..., 0],
+            float(presence[0]),
         )
 
 
@@ -163,7 +181,7 @@ MEDIAPIPE = DetectorKind(
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class Found:
     """The output of the second network for one image.
 
     Attributes:
@@ -172,6 +190,7 @@ class _Found:
         visibilities: (33,) of the landmarks.
         positions: (33, 3) of the landmarks, m.
         mask: (256, 256) logits of the person in the square.
+        presence: probability that somebody is there.
     """
 
     square: Square
@@ -179,9 +198,17 @@ class _Found:
     visibilities: Array
     positions: Array
     mask: _Tensor
+    presence: float
+
+    @property
+    def quality(self) -> float:
+        """Presence and visibility, 0 to 1; less for somebody who is not upright."""
+        upright = max(float(elementary.cos(self.square.angle)), 0.0)
+        share = _LYING + (1.0 - _LYING) * upright
+        return self.presence * float(self.visibilities.mean()) * share
 
 
-class _Followed:
+class Followed:
     """The smoothed values of a person, from image to image.
 
     Attributes:
@@ -195,8 +222,8 @@ class _Followed:
         self._of_circle = _OneEuroFilter(*_CIRCLE_CUTOFF)
         self._of_positions = _OneEuroFilter(*_POSITION_CUTOFF)
 
-    def smooth(self, found: _Found, interval: float) -> tuple[Array, Array, Array]:
-        """Landmarks, px, visibilities and positions, m; `interval` s after the image before."""
+    def smooth(self, found: Found, interval: float) -> Keypoints:
+        """The keypoints that are found, smoothed, `interval` s after the image before."""
         landmarks, circle = found.points[:LANDMARKS], found.points[LANDMARKS:]
         diameter = max(2 * math.hypot(*(circle[1] - circle[0])), 1.0)
         self.circle = self._of_circle(circle, interval, diameter)
@@ -204,10 +231,12 @@ class _Followed:
             self._visibilities = found.visibilities
         change = found.visibilities - self._visibilities
         self._visibilities = self._visibilities + _NEW_VISIBILITY * change
-        return (
-            self._of_landmarks(landmarks, interval, diameter),
-            self._visibilities,
-            self._of_positions(found.positions, interval, 1.0),
+        pixels = self._of_landmarks(landmarks, interval, diameter)
+        positions = self._of_positions(found.positions, interval, 1.0)
+        unknown = np.full((LANDMARKS, 2, 2), np.nan)
+        # The network counts from the edge of the first pixel.
+        return Keypoints(
+            schemes()[SCHEME].names, pixels - 0.5, unknown, self._visibilities, positions
         )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic, image_topic
-from hmt_ros.sessions.image_inputs import MASK
+from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS, KEYPOINTS_3D, MASK
 from hmt_ros.sessions.keypoints_session import KeypointsParameters, KeypointsSession
 
 
@@ -21,8 +21,10 @@ class KeypointsNode(SessionNode[KeypointsSession, KeypointsParameters]):
     DEFAULTS = KeypointsParameters()
 
     def _offered_topics(self) -> Iterable[str]:
-        masks = self._settings.publish_mask
-        return (topic for topic in self.SESSION.TOPICS if masks or topic != MASK)
+        p = self._settings
+        if p.people:
+            return (DETECTIONS,)
+        return (KEYPOINTS, KEYPOINTS_3D, MASK) if p.publish_mask else (KEYPOINTS, KEYPOINTS_3D)
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield image_topic(self._settings.image_transport)

@@ -254,8 +254,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return TransitionCallbackReturn.FAILURE
         self._failure = ''
         self._session = session
-        for topic, published in self.SESSION.TOPICS.items():
-            self._outputs[topic] = self._new_publisher(topic, *published_with(published))
+        for topic in self._offered_topics():
+            published = published_with(self.SESSION.TOPICS[topic])
+            self._outputs[topic] = self._new_publisher(topic, *published)
         self._handled = self._new_publisher('~/handled', HANDLED, ANSWERS)
         self._offered = [
             self.create_service(kind, name, partial(self._serve, callback))

@@ -1,8 +1,9 @@
-"""A detector of keypoints behind its topics: images in, keypoints of one person out.
+"""A detector of keypoints behind its topics: images in, keypoints of one person or several out.
 
-- Every image that can be used gets one keypoints, one keypoints_3d and, with `publish_mask`, one
-  mask, all with its stamp and frame. Messages without names, and a mask of zeros, say that nobody
-  was seen.
+- With `people` above 0 every image that can be used gets one detections, with all people and their
+  identities, and nothing else. Otherwise it gets one keypoints, one keypoints_3d and, with
+  `publish_mask`, one mask. Messages without names, and a mask of zeros, say that nobody was seen.
+- All have the stamp and the frame of the image.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
@@ -13,8 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from hmt_ros.detectors.detector import Detector
+from hmt_ros.detectors.people import PeopleDetector, SeenPerson
 from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.declared_parameters import (
     NEXT_CONFIGURE,
@@ -22,17 +26,25 @@ from hmt_ros.sessions.declared_parameters import (
     check_choices,
     parameter_field,
 )
-from hmt_ros.sessions.image_inputs import KEYPOINTS, KEYPOINTS_3D, MASK
+from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS, KEYPOINTS_3D, MASK
 from hmt_ros.sessions.session import PublishedTopic, Session, SessionState
 from msg_tools.messages import keypoints
-from msg_tools.messages.detections import NO_KEYPOINTS
+from msg_tools.messages.detections import (
+    NO_KEYPOINTS,
+    PEOPLE_2D,
+    DetectedPerson,
+    people_message,
+)
 from msg_tools.messages.images import ImageError, image_message
 from msg_tools.messages.keypoints import keypoints_message, positions_message
+
+MOST_PEOPLE = 20
 
 TOPICS = {
     KEYPOINTS: PublishedTopic(keypoints.KEYPOINTS_2D),
     KEYPOINTS_3D: PublishedTopic(keypoints.KEYPOINTS_3D),
     MASK: PublishedTopic('sensor_msgs/msg/Image'),
+    DETECTIONS: PublishedTopic(PEOPLE_2D),
 }
 
 
@@ -44,14 +56,22 @@ class KeypointsParameters(ImageNodeParameters):
         detector: Detector of keypoints; 'mediapipe' is MediaPipe Pose, 'mediapipe+movenet' asks
             MoveNet Thunder as well, at five times the cost.
         publish_mask: If true, the node also publishes the mask of the person.
+        people: Maximum number of people whom the node follows and publishes on detections, for
+            people_node; 0: it follows one person, and publishes keypoints.
     """
 
     detector: str = parameter_field(USUAL_DETECTOR, NEXT_CONFIGURE)
     publish_mask: bool = parameter_field(False, NEXT_CONFIGURE)
+    people: int = parameter_field(0, NEXT_CONFIGURE, (0, MOST_PEOPLE))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choices(self, detector=tuple(DETECTORS))
+        if self.people and self.detector != USUAL_DETECTOR:
+            raise ValueError(
+                f'detector {self.detector!r} finds one person, but people is {self.people}: wanted '
+                f'detector {USUAL_DETECTOR!r}, or people 0'
+            )
 
 
 @dataclass(frozen=True)
@@ -61,14 +81,16 @@ class KeypointsState(SessionState):
     Of the counts 'detected' are images with or without somebody, 'empty' those without.
 
     Attributes:
-        landmarks: number of those that were found in the last image.
+        landmarks: number of those that were found in the last image, of all people.
+        people: number of them; None: only one is looked for.
     """
 
     landmarks: int = 0
+    people: int | None = None
 
     def summary(self) -> str:
         """The present detection in a few words."""
-        return f'{self.landmarks} landmarks'
+        return f'{self.landmarks} landmarks' if self.people is None else f'{self.people} people'
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -88,37 +110,67 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
     ESTIMATE = 'the sequence'
 
     def _set_up(self) -> None:
-        kind = DETECTORS[self.parameters.detector]
-        self._detector = kind.make(with_mask=self.parameters.publish_mask)
+        p = self.parameters
+        self._detector: Detector | PeopleDetector = (
+            PeopleDetector(p.people)
+            if p.people
+            else DETECTORS[p.detector].make(with_mask=p.publish_mask)
+        )
         self.restart()
 
     def restart(self) -> None:
         """See `Session`."""
         # The detector sees by the stamps that a new sequence begins.
         self._landmarks: int | None = None
+        self._count: int | None = None
         super().restart()
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
+        detector = self._detector
         try:
             image = self.decode_image(message)
-            found = self._detector.detect(image, stamp)
+            found = detector.detect(image, stamp)
         except ImageError as error:
             self._log.skip('image', str(error))
             return
-        self._landmarks = 0 if found is None else len(found.names)
+        frame = str(message.header.frame_id)
         self._log.counts['detected'] += 1
-        self._log.counts['empty'] += found is None
-        self._publish_found(
-            NO_KEYPOINTS if found is None else found, stamp, str(message.header.frame_id)
-        )
+        self._log.counts['empty'] += not found
+        if isinstance(detector, PeopleDetector):
+            assert isinstance(found, list)
+            self._publish_people(found, detector.left_out, stamp, frame)
+        else:
+            assert not isinstance(found, list)
+            self._landmarks = 0 if found is None else len(found.names)
+            self._publish_found(found or NO_KEYPOINTS, detector.mask, stamp, frame)
 
-    def _publish_found(self, found: Keypoints, stamp: int, frame_id: str) -> None:
+    def _publish_people(
+        self, seen: list[SeenPerson], left_out: int, stamp: int, frame_id: str
+    ) -> None:
+        people = []
+        for one in seen:
+            left, top, right, bottom = one.corners.ravel().tolist()
+            people.append(DetectedPerson(one.name, one.keypoints, (left, top, right, bottom)))
+        self._landmarks, self._count = sum(len(x.keypoints.names) for x in people), len(people)
+        if left_out:
+            self._log.note(
+                'too many people',
+                f'{len(people) + left_out} people are seen in the image of {stamp} ns, but people '
+                f'is {self.parameters.people}: the smallest are left out',
+            )
+        if self._wanted(DETECTIONS):
+            self._publish(
+                DETECTIONS, stamp, people_message(self._messages, people, stamp, frame_id)
+            )
+
+    def _publish_found(
+        self, found: Keypoints, mask: Mask | None, stamp: int, frame_id: str
+    ) -> None:
         messages = self._messages
         if self._wanted(KEYPOINTS):
             self._publish(KEYPOINTS, stamp, keypoints_message(messages, found, stamp, frame_id))
         if self._wanted(KEYPOINTS_3D):
             self._publish(KEYPOINTS_3D, stamp, positions_message(messages, found, stamp, frame_id))
-        mask = self._detector.mask
         if mask is not None and self._wanted(MASK):
             picture = np.where(mask, np.uint8(255), np.uint8(0))
             self._publish(MASK, stamp, image_message(messages, picture, stamp, frame_id))
@@ -128,4 +180,4 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
         if landmarks is None:
             return KeypointsState('waiting', 'an image', **self._totals())
         status = 'detecting' if landmarks else 'nobody'
-        return KeypointsState(status, '', **self._totals(), landmarks=landmarks)
+        return KeypointsState(status, '', **self._totals(), landmarks=landmarks, people=self._count)

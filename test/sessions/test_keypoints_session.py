@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from hmt_ros.detectors.detector import DetectorKind
+from hmt_ros.detectors.people import SeenPerson
 from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions import keypoints_session
 from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
@@ -116,3 +118,55 @@ def test_time_that_jumps_back(session, outputs, somebody):
     handled = one.take(IMAGE, somebody.image(2))
     assert 'the sequence starts anew' in handled.warnings[0]
     assert len(handled.published) == 4
+
+
+class StubPeople:
+    """What `PeopleDetector` shows: up to `most` of two people where the image is white."""
+
+    def __init__(self, most):
+        self.most, self.left_out = most, 0
+
+    def detect(self, image, stamp_ns):
+        seen = (image == 250).all(2)
+        if not seen.any():
+            self.left_out = 0
+            return []
+        row, column = np.argwhere(seen)[0]
+        unknown = np.full((33, 2, 2), np.nan)
+        keypoints = Keypoints(NAMES, np.full((33, 2), float(column)), unknown, np.full(33, 0.5))
+        corners = np.array([[column, row], [column + 10.0, row + 24.0]])
+        self.left_out = max(2 - self.most, 0)
+        return [SeenPerson(x, keypoints, corners) for x in ('p1', 'p7')[: self.most]]
+
+
+def test_several_people_are_detections(session, outputs, somebody, monkeypatch):
+    monkeypatch.setattr(keypoints_session, 'PeopleDetector', StubPeople)
+    one = session(people=2)
+    assert one.state.status == 'waiting'
+    stamp = somebody.stamp(0)
+    assert one.take(IMAGE, somebody.image(0)).published == (('detections', stamp),)
+    ((topic, _, data),) = outputs
+    message = deserialise(data, TOPICS[topic].msgtype)
+    assert (message.header.frame_id, message.ids) == ('lens', ['p1', 'p7'])
+    assert [(x.x_offset, x.y_offset, x.width, x.height) for x in message.boxes] == [
+        (20, 12, 10, 24)
+    ] * 2
+    assert keypoints_of(message.keypoints[0], 5.0).names == NAMES
+    assert (one.state.summary(), one.state.status) == ('2 people', 'detecting')
+    one.take(IMAGE, somebody.empty(1))
+    assert (one.state.summary(), one.state.status) == ('0 people', 'nobody')
+    assert one.state.counts == {'received': 2, 'detected': 2, 'empty': 1}
+
+
+def test_people_beyond_the_maximum_are_told_once(session, outputs, somebody, monkeypatch):
+    monkeypatch.setattr(keypoints_session, 'PeopleDetector', StubPeople)
+    one = session(people=1)
+    (warning,) = one.take(IMAGE, somebody.image(0)).warnings
+    assert '2 people are seen' in warning
+    assert 'people is 1: the smallest are left out' in warning
+    assert one.take(IMAGE, somebody.image(1)).warnings == ()
+
+
+def test_a_detector_of_one_person_finds_no_two():
+    with pytest.raises(ValueError, match=r"finds one person, but people is 2: wanted detector 'me"):
+        KeypointsParameters(detector='mediapipe+movenet', people=2)

@@ -1,0 +1,356 @@
+"""Several people in the images of one camera, with identities: BlazePose with a crop for each.
+
+- The network that looks for people finds those who fill 0.4 to 0.8 of what it sees, for sure. It
+  sees the whole image, and tiles of it that overlap, down to the size of people `SMALLEST` px high:
+  in the first image all, later one after the other, all of them in `SEARCH` s. While somebody is
+  lost it sees the place where they are expected, too. Who is followed already is left out.
+- The network of landmarks sees the square about each person where the last image had them, moved
+  on by their velocity.
+- Two squares that have found one body leave it to the one that fits better.
+- Those found are assigned to those known by place, motion and the colours of their clothes
+  (`association`, `clothes`). Who is lost for longer than `KEPT` gets a new identity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from hmt_ros.detectors.blazepose import SCHEME, Followed, Found, Networks
+from hmt_ros.detectors.clothes import VISIBLE, Clothes
+from hmt_ros.detectors.square import Square
+from hmt_ros.image.association import ImageTrack, Sighting
+from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array, Image
+from hmt_ros.inference.error_model import seconds
+
+MOST = 4  # people
+# Time in which all tiles are seen; time between two looks at the place of a lost person, and for
+# which they are known, s.
+SEARCH, LOOK, KEPT = 1.0, 0.1, 3.0
+# Time after which smoothing begins again; time in which somebody is confirmed who appears beside
+# another or is seen badly, s; quality from which somebody is seen well.
+LOST, CONFIRMED, EVIDENT = 0.5, 0.3, 0.75
+# Height of the smallest people who are looked for, px; what they fill of the smallest tile; the
+# ratio of the sizes of tiles; the part of a tile that the next one shows, too.
+SMALLEST, FILLED, RATIO, OVERLAP = 150.0, 0.4, 1.9, 0.4
+# Distance of circles, over their radius, and of bodies, over their size, below which two are one.
+SAME_CIRCLE, SAME_BODY, ALIKE, CONTAINED = 0.6, 0.08, 0.25, 0.8
+# Ratio of sizes from which two bodies are not one; distance, in sizes, from which one is alone.
+LARGEST_RATIO, BESIDE = 1.6, 1.0
+# The circles that the first network finds may be too small.
+SCALES = (1.0, 1.5, 2.4)
+# Standard deviation of the place of a person, in sizes, and its growth a second.
+NEAR, SPEED = 0.08, 0.35
+# Distance of clothes that is as likely of one person as of two, what changes it by a nat, and what
+# colours say at most, nats. Of one person 99 % of the distances are below 0.47; of two 95 % above.
+DIFFERENT, DOUBT, MOST_NATS = 0.4, 0.06, 4.0
+# The largest cost of a pair, nats; below this one the clothes of a person are learned.
+LARGEST, SURE = 3.0, 0.0
+# Time constant of the clothes of a person, s; the fewest landmarks of somebody.
+CLOTHES_TIME, FEWEST = 2.0, 8
+
+
+# Rows of the landmarks of trunk and limbs, which of these are the same on the other side.
+_NAMES = schemes()[SCHEME].names
+_JOINTS = [
+    f'{side}_{x}'
+    for x in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
+    for side in ('left', 'right')
+]
+_BODY = [_NAMES.index(x) for x in _JOINTS]
+_SWAP = [i ^ 1 for i in range(len(_JOINTS))]
+
+
+class SeenPerson(NamedTuple):
+    """A person in an image.
+
+    Attributes:
+        name: identity, p1, p2, ...
+        keypoints: landmarks of the scheme 'mediapipe33'.
+        corners: (2, 2) left top and right bottom of the visible ones, px.
+    """
+
+    name: str
+    keypoints: Keypoints
+    corners: Array
+
+
+@dataclass(eq=False)
+class _Person:
+    """Somebody who is known.
+
+    Attributes:
+        name: identity.
+        place: where they were last seen, and how they move.
+        clothes: usual colours.
+        followed: smoothed values; None: lost.
+        keypoints: of the last image that showed them.
+        seen, begun: stamps of the last and of the first image that showed them, ns.
+        looked: stamp of the last image whose part about the place of a lost person was searched.
+        sure: whether this is somebody: one who appears beside another may be that one again.
+    """
+
+    name: str
+    place: ImageTrack
+    clothes: Clothes
+    followed: Followed
+    keypoints: Keypoints
+    seen: int
+    begun: int
+    looked: int
+    sure: bool
+
+    def cost(self, one: _Sighted, stamp: int) -> float:
+        """Of taking somebody for this person, nats against taking them for somebody else."""
+        dt = seconds(stamp - self.place.stamp)
+        away = self.place.cost(one.sighting, stamp) / (NEAR + SPEED * dt)
+        colours = (self.clothes.distance(one.clothes) - DIFFERENT) / DOUBT
+        return 0.5 * away * away + float(np.clip(np.nan_to_num(colours), -MOST_NATS, MOST_NATS))
+
+    def update(self, one: _Sighted, stamp: int) -> None:
+        """Takes what the next image that shows them says."""
+        interval = seconds(stamp - self.seen)
+        known = seconds(stamp - self.begun)
+        if known < CLOTHES_TIME or self.cost(one, stamp) < SURE:
+            share = interval / min(known, CLOTHES_TIME)
+            self.clothes = self.clothes.mixed(one.clothes, min(share, 1.0))
+        if interval > LOST:
+            self.followed = Followed()
+        self.keypoints = self.followed.smooth(one.found, interval)
+        self.place.update(one.sighting, stamp)
+        self.seen, self.sure = stamp, self.sure or known >= CONFIRMED
+
+
+@dataclass(frozen=True, eq=False)
+class _Sighted:
+    """Somebody in an image.
+
+    Attributes:
+        found: what the network of landmarks says.
+        keypoints: the same, not smoothed.
+        sighting: those of them that are visible.
+        clothes: colours.
+    """
+
+    found: Found
+    keypoints: Keypoints
+    sighting: Sighting
+    clothes: Clothes
+
+    @property
+    def circle(self) -> Array:
+        """Centre and a point (2, 2) of the circle about the body, px."""
+        return self.found.points[-2:]
+
+
+class PeopleDetector:
+    """Finds and follows several people.
+
+    Args:
+        most: maximum number of people.
+
+    Attributes:
+        left_out: number of people beyond `most` in the last image that was searched.
+
+    Raises:
+        DetectorError: the detector is not installed.
+    """
+
+    def __init__(self, most: int = MOST, networks: Networks | None = None) -> None:
+        self.left_out = 0
+        self._most = most
+        self._networks = networks or Networks()
+        self._people: list[_Person] = []
+        self._size, self._newest, self._count = (0, 0), 0, 0
+        # Number of the next tile, and how many are due.
+        self._next_tile, self._due_tiles = 0, 0.0
+
+    def detect(self, image: Image, stamp_ns: int) -> list[SeenPerson]:
+        """The people in an image, with identities, in the order in which they came.
+
+        An image that is not younger than the one before, or of another size, begins a new sequence;
+        identities are not given again.
+
+        Args:
+            image: (H, W, 3) BGR.
+            stamp_ns: of the image.
+        """
+        interval = stamp_ns - self._newest
+        if interval <= 0 or image.shape[:2] != self._size:
+            self._people, interval = [], round(SEARCH * 1e9)
+        self._size, self._newest = image.shape[:2], stamp_ns
+        known = [x for x in self._people if x.seen + interval == stamp_ns]
+        sighted = [
+            self._look(image, x.followed.circle + x.place.shift(stamp_ns)) for x in known
+        ]  # fmt: skip
+        found = [x for x in sighted if x is not None]
+        lost = [x for x in self._people if x not in known]
+        lost += [x for x, one in zip(known, sighted, strict=True) if one is None]
+        found += self._searched(image, found, self._tiles_due(interval) + _places(lost, stamp_ns))
+        self._assign(_single(found), stamp_ns)
+        self._people = [
+            x for x in self._people if seconds(stamp_ns - x.seen) <= (KEPT if x.sure else 0.0)
+        ]
+        return [
+            SeenPerson(x.name, x.keypoints, x.place.sighting.corners)
+            for x in self._people
+            if x.seen == stamp_ns and x.sure
+        ]
+
+    # Finding.
+
+    def _look(self, image: Image, circle: Array, scales: tuple[float, ...] = ()) -> _Sighted | None:
+        """Somebody in the square about a circle, or upright in squares of other sizes."""
+        found = self._networks.landmarks(image, Square.about(circle))
+        for scale in scales:
+            radius = scale * float(np.linalg.norm(circle[1] - circle[0]))
+            other = circle[0] + np.array([[0.0, 0.0], [0.0, -radius]])
+            for _ in range(2):
+                again = self._networks.landmarks(image, Square.about(other))
+                if again is None:
+                    break
+                if found is None or again.quality > found.quality:
+                    found = again
+                other = again.points[-2:]
+        if found is None:
+            return None
+        keypoints = Followed().smooth(found, 0.0)
+        seen = keypoints[np.flatnonzero(keypoints.confidences >= VISIBLE)]
+        if len(seen.names) < FEWEST:
+            return None
+        corners = np.stack([seen.pixels.min(0), seen.pixels.max(0)])
+        clothes = Clothes.of(image, keypoints)
+        return _Sighted(found, keypoints, Sighting.of(seen, corners), clothes)
+
+    def _tiles_due(self, interval: int) -> list[Square]:
+        """The tiles of the image that are to be searched `interval` ns after the image before."""
+        tiles = _tiles(*self._size[::-1])
+        due = self._due_tiles + len(tiles) * seconds(interval) / SEARCH
+        count = int(min(due, len(tiles)))
+        result = [tiles[(self._next_tile + i) % len(tiles)] for i in range(count)]
+        self._next_tile, self._due_tiles = self._next_tile + count, min(due - count, 1.0)
+        return result
+
+    def _searched(
+        self, image: Image, known: list[_Sighted], squares: list[Square]
+    ) -> list[_Sighted]:
+        """People in squares of an image; of those who are known, such as may be seen better so."""
+        looked: list[Array] = []
+        result = []
+        for square in squares:
+            for _, circle in self._networks.circles(image, square):
+                if any(_apart(x, circle) < SAME_CIRCLE for x in looked):
+                    continue
+                looked.append(circle)
+                if not any(_alike(x.circle, circle) for x in known):
+                    one = self._look(image, circle, SCALES)
+                    result += [] if one is None else [one]
+        return result
+
+    # Identities.
+
+    def _assign(self, sighted: list[_Sighted], stamp: int) -> None:
+        costs = np.array([[x.cost(one, stamp) for one in sighted] for x in self._people])
+        pairs: dict[int, _Person] = {}
+        if costs.size:
+            rows, columns = linear_sum_assignment(np.minimum(costs, LARGEST))
+            pairs = {j: self._people[i] for i, j in zip(rows, columns) if costs[i, j] < LARGEST}
+        room = self._most - len(pairs)
+        left = [one for j, one in enumerate(sighted) if j not in pairs]
+        left.sort(key=lambda x: -x.sighting.size)
+        self.left_out = max(len(left) - room, 0)
+        for j, person in pairs.items():
+            person.update(sighted[j], stamp)
+        for one in left[:room]:
+            self._people.append(self._new(one, stamp))
+
+    def _new(self, one: _Sighted, stamp: int) -> _Person:
+        self._count += 1
+        before = [x for x in self._people if x.begun < stamp]
+        beside = any(x.place.cost(one.sighting, stamp) < BESIDE for x in before)
+        followed = Followed()
+        keypoints = followed.smooth(one.found, 0.0)
+        return _Person(
+            f'p{self._count}', ImageTrack(one.sighting, stamp), one.clothes, followed, keypoints,
+            stamp, stamp, stamp, one.found.quality >= EVIDENT and not beside,
+        )  # fmt: skip
+
+
+def _places(lost: list[_Person], stamp: int) -> list[Square]:
+    """Squares about the places where lost people are expected, if they are due."""
+    result = []
+    for person in lost:
+        if seconds(stamp - person.looked) >= LOOK:
+            person.looked = stamp
+            middle = person.place.sighting.middle + person.place.shift(stamp)
+            result.append(Square((middle[0], middle[1]), person.place.size / FILLED, 0.0))
+    return result
+
+
+@lru_cache(maxsize=4)
+def _tiles(width: int, height: int) -> list[Square]:
+    """The whole image, and squares of it that overlap, the largest first."""
+    whole, least = float(max(width, height)), SMALLEST / FILLED
+    levels = max(math.ceil(math.log(whole / least) / math.log(RATIO)), 0)
+    result = [Square((width / 2, height / 2), whole, 0.0)]
+    for level in range(1, levels + 1):
+        side = whole * (least / whole) ** (level / levels)
+        across, down = (_middles(x, side) for x in (width, height))
+        result += [Square((x, y), side, 0.0) for y in down for x in across]
+    return result
+
+
+def _middles(length: int, side: float) -> list[float]:
+    """Middles of the tiles along one axis of the image."""
+    beyond = length - (1.0 + 0.25 * OVERLAP) * side
+    count = 1 + max(math.ceil(beyond / ((1.0 - OVERLAP) * side)), 0)
+    if count == 1:
+        return [length / 2]
+    return [float(x) for x in np.linspace(side / 2, length - side / 2, count)]
+
+
+def _apart(circle: Array, other: Array) -> float:
+    """Distance of the centres of circles (2, 2), over the smaller radius."""
+    radius = min(float(np.linalg.norm(x[1] - x[0])) for x in (circle, other))
+    return float(np.linalg.norm(circle[0] - other[0])) / max(radius, 1.0)
+
+
+def _alike(circle: Array, other: Array) -> bool:
+    one, two = (float(np.linalg.norm(x[1] - x[0])) for x in (circle, other))
+    return _apart(circle, other) < ALIKE and max(one, two) < (1.0 + ALIKE) * min(one, two)
+
+
+def _single(sighted: list[_Sighted]) -> list[_Sighted]:
+    """The best sighting of each body."""
+    kept: list[_Sighted] = []
+    for one in sorted(sighted, key=lambda x: -x.found.quality):
+        if not any(_same_body(one, other) for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _same_body(one: _Sighted, other: _Sighted) -> bool:
+    """Whether two squares have found one body: landmarks together, or a box in that of the other.
+
+    Sides may be exchanged, and of the second kind colours must be alike.
+    """
+    sizes = sorted((one.sighting.size, other.sighting.size))
+    if sizes[1] > LARGEST_RATIO * sizes[0]:
+        # A child before an adult is somebody else.
+        return False
+    first, second = (x.keypoints.pixels[_BODY] for x in (one, other))
+    away = min(float(np.median(np.linalg.norm(first - x, axis=1))) for x in (second, second[_SWAP]))
+    if away < SAME_BODY * sizes[0]:
+        return True
+    low, high = one.sighting.corners, other.sighting.corners
+    common = np.minimum(low[1], high[1]) - np.maximum(low[0], high[0])
+    areas = [float(np.prod(x[1] - x[0])) for x in (low, high)]
+    within = float(np.prod(common.clip(0.0))) > CONTAINED * min(areas)
+    return within and not one.clothes.distance(other.clothes) > DIFFERENT
