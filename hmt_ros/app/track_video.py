@@ -1,6 +1,7 @@
 """track-video: from a video to a report: import-video, replay and report in one command.
 
 track-video walk.mp4
+track-video street.mp4 --people 3
 
 What is not given is found or assumed: keypoints by the detector, where it is installed; the field
 of view by the metadata of the video, else that of common cameras, with an error that is in all
@@ -45,7 +46,8 @@ Without --keypoints the surest detector that install-detector has installed find
 Pose, with MoveNet if it is there. Without --fov or --camera the field of view is taken from the
 metadata of the video, or assumed; the error that this may make is in all published depths. Without
 --level or --gravity lines of the scene show the tilt of the camera where they can; an unknown tilt
-is taken for a lean of the person.
+is taken for a lean of the person. With --people MediaPipe Pose finds so many people, and the page
+shows each on a topic of their own.
 
 The track starts from the keypoints, or without any from a prediction. --subject names a subject
 file instead, and --stature writes one from the keypoints of an image.
@@ -54,6 +56,7 @@ examples:
   track-video walk.mp4
   track-video walk.mp4 -o walk --fov 60 --keypoints walk.json
   track-video walk.mp4 -o walk --camera camera.yaml --stature 1.75 --level
+  track-video street.mp4 --people 3
 
 exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 """
@@ -107,9 +110,14 @@ def _track(arguments: argparse.Namespace) -> int:
         if not quiet:
             say(text)
 
-    if arguments.keypoints is None and arguments.detector is None and not arguments.no_detector:
+    several = arguments.people is not None
+    for option in ('subject', 'stature'):
+        if several and getattr(arguments, option) is not None:
+            raise ValueError(f'--{option} is of one person, and does not go with --people')
+    given = several or arguments.keypoints is not None or arguments.detector is not None
+    if not (given or arguments.no_detector):
         arguments.detector = surest_detector()
-    with_keypoints = arguments.keypoints is not None or arguments.detector is not None
+    with_keypoints = given or arguments.detector is not None
     if stature is not None and not with_keypoints:
         raise ValueError(
             '--stature goes with --keypoints, or with a detector: python -m hmt_ros '
@@ -150,6 +158,7 @@ def _track(arguments: argparse.Namespace) -> int:
         subject=subject,
         background=arguments.background,
         seed=arguments.seed,
+        people=several,
         settings=[*settings, *_of_gravity(arguments), *arguments.settings],
     )
     replayed = replay_bag(video, folder / TRACKED, options, tell)

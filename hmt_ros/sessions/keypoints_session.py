@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -147,10 +148,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
     def _publish_people(
         self, seen: list[SeenPerson], left_out: int, stamp: int, frame_id: str
     ) -> None:
-        people = []
-        for one in seen:
-            left, top, right, bottom = one.corners.ravel().tolist()
-            people.append(DetectedPerson(one.name, one.keypoints, (left, top, right, bottom)))
+        people = detected_people(seen)
         self._landmarks, self._count = sum(len(x.keypoints.names) for x in people), len(people)
         if left_out:
             self._log.note(
@@ -181,3 +179,12 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
             return KeypointsState('waiting', 'an image', **self._totals())
         status = 'detecting' if landmarks else 'nobody'
         return KeypointsState(status, '', **self._totals(), landmarks=landmarks, people=self._count)
+
+
+def detected_people(seen: Sequence[SeenPerson]) -> list[DetectedPerson]:
+    """People as a message holds them."""
+    result = []
+    for one in seen:
+        left, top, right, bottom = one.corners.ravel().tolist()
+        result.append(DetectedPerson(one.name, one.keypoints, (left, top, right, bottom)))
+    return result

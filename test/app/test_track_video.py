@@ -170,6 +170,15 @@ def test_what_is_given_is_not_assumed(walk_video, begun, installed, tmp_path, ca
     assert begun.settings[-1] == ['focal_length_sigma=0.2', 'focal_length_sigma=0.05']
 
 
+def test_several_people(walk_video, begun, tmp_path, monkeypatch):
+    replayed = []
+    monkeypatch.setattr(track_video, 'replay_bag', lambda *given: replayed.append(given[2]))
+    assert run(walk_video, '-o', str(tmp_path / 'out'), '--people', '3') == 0
+    (options,) = begun.imports
+    assert (options.people, options.detector) == (3, None)
+    assert replayed[0].people is True
+
+
 def test_metadata_tell_the_lens(walk_video, begun, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(track_video, 'told_fov', lambda path: 69.4)
     out = ['-o', str(tmp_path / 'out'), '--no-detector']
@@ -186,6 +195,8 @@ def test_metadata_tell_the_lens(walk_video, begun, tmp_path, monkeypatch, capsys
         (['--subject', 'nothing.yaml'], 'nothing.yaml: no such file'),
         (['--subject', 'a.yaml', '--stature', '1.7'], '--stature: not allowed with argument'),
         (['--keypoints', 'nothing.json'], 'nothing.json: no such file'),
+        (['--people', '2', '--stature', '1.7'], '--stature is of one person'),
+        (['--people', '2', '--subject', 'a.yaml'], '--subject is of one person'),
         (['--camera', 'camera.yaml'], '--camera: not allowed with argument --fov'),
     ],
 )

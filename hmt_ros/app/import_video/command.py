@@ -1,7 +1,8 @@
 """import-video: writes a video, its camera and the output of a detector into a bag for replay.
 
 The bag has the topics `/image/compressed` and `/camera_info`, and as far as they are known
-`/keypoints`, `/keypoints_3d` and `/mask`, with the stamp of the frame that they belong to.
+`/keypoints`, `/keypoints_3d` and `/mask`, or `/detections` of several people, with the stamp of the
+frame that they belong to.
 """
 
 from __future__ import annotations
@@ -35,20 +36,22 @@ from hmt_ros.app.import_video.keypoint_files.reading import (
 from hmt_ros.app.progress import Tell, say, tell_user, with_progress
 from hmt_ros.body import Camera
 from hmt_ros.detectors.detector import Detector
-from hmt_ros.detectors.registry import DETECTORS
+from hmt_ros.detectors.people import PeopleDetector, SeenPerson
+from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.inference.arrays import Mask
+from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.sessions.camera_file import camera_of_view, read_camera
+from hmt_ros.sessions.keypoints_session import MOST_PEOPLE, detected_people
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
-from msg_tools.messages.detections import NO_KEYPOINTS
+from msg_tools.messages.detections import NO_KEYPOINTS, people_message
 from msg_tools.messages.headers import FRAME_ID, START_NS
 from msg_tools.messages.images import encode_jpeg, image_message, jpeg_message
 from msg_tools.messages.keypoints import keypoints_message, positions_message
 
 IMAGE, CAMERA_INFO, MASK = 'image/compressed', 'camera_info', 'mask'
-KEYPOINTS, KEYPOINTS_3D = 'keypoints', 'keypoints_3d'
+KEYPOINTS, KEYPOINTS_3D, DETECTIONS = 'keypoints', 'keypoints_3d', 'detections'
 
 EPILOG = """\
 SOURCE is any video file that OpenCV reads, or a folder of images in the order of the numbers in
@@ -75,6 +78,7 @@ examples:
   import-video walk.mp4 -o walk --fov 60 --keypoints walk.json
   import-video frames -o walk --fps 25 --camera camera.yaml --keypoints openpose --masks masks
   import-video walk.mp4 -o walk --fov 60 --detector mediapipe --start 2 --end 10 --every 2
+  import-video street.mp4 -o street --fov 60 --people 3
 
 exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 """
@@ -183,6 +187,12 @@ def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) 
         '--detector',
         choices=tuple(DETECTORS),
         help='find keypoints with a detector that is installed, such as MediaPipe Pose',
+    )
+    found.add_argument(
+        '--people',
+        type=whole_number(1, MOST_PEOPLE),
+        metavar='N',
+        help=f'follow up to N people with {DETECTORS[USUAL_DETECTOR].title}, for replay --people',
     )
     add_keypoint_arguments(person)
     person.add_argument(
@@ -347,15 +357,37 @@ def _seer(
 
 def _detected(detector: Detector, frame: Frame, stamp_ns: int) -> Keypoints | None:
     """The keypoints of a frame, which the detector sees with square pixels."""
+    found = detector.detect(_with_square_pixels(frame), stamp_ns)
+    return None if found is None else _in_frame(frame, found)
+
+
+def _people_in(detector: PeopleDetector, frame: Frame, stamp_ns: int) -> list[SeenPerson]:
+    """The people in a frame, whom the detector sees with square pixels."""
+    return [
+        one._replace(keypoints=_in_frame(frame, one.keypoints), corners=one.corners * _scale(frame))
+        for one in detector.detect(_with_square_pixels(frame), stamp_ns)
+    ]
+
+
+def _scale(frame: Frame) -> Array:
+    """Widths and heights (2,) in a frame over those in its image with square pixels."""
+    width = frame.image.shape[1]
+    return np.array([width / round(width * frame.aspect), 1.0])
+
+
+def _with_square_pixels(frame: Frame) -> Image:
     if frame.aspect == 1.0:
-        return detector.detect(frame.image, stamp_ns)
+        return frame.image
     height, width = frame.image.shape[:2]
-    wide = round(width * frame.aspect)
-    square = cv2.resize(frame.image, (wide, height), interpolation=cv2.INTER_AREA)
-    found = detector.detect(np.asarray(square, dtype=np.uint8), stamp_ns)
-    if found is None:
-        return None
-    scale = np.array([width / wide, 1.0])
+    size = round(width * frame.aspect), height
+    return np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _in_frame(frame: Frame, found: Keypoints) -> Keypoints:
+    """Keypoints of the image with square pixels, in those of the frame."""
+    if frame.aspect == 1.0:
+        return found
+    scale = _scale(frame)
     covariances = found.covariances * np.outer(scale, scale)
     return replace(found, pixels=(found.pixels + 0.5) * scale - 0.5, covariances=covariances)
 
@@ -410,7 +442,9 @@ def _write(
     """
     messages = RosbagsMessages()
     result, camera = Imported(), None
-    if options.keypoints is not None or options.detector is not None:
+    people = None if options.people is None else PeopleDetector(options.people)
+    alone = options.keypoints is not None or options.detector is not None
+    if alone or people is not None:
         result.with_keypoints = 0
     if options.masks is not None or options.detector_masks:
         result.with_masks = 0
@@ -422,7 +456,11 @@ def _write(
         bag.write(IMAGE, stamp, jpeg_message(messages, jpeg, stamp, FRAME_ID))
         bag.write(CAMERA_INFO, stamp, camera_info_message(messages, camera, stamp, FRAME_ID))
         keypoints, mask = see(frame, stamp)
-        if result.with_keypoints is not None:
+        if people is not None and result.with_keypoints is not None:
+            seen = detected_people(_people_in(people, frame, stamp))
+            result.with_keypoints += bool(seen)
+            bag.write(DETECTIONS, stamp, people_message(messages, seen, stamp, FRAME_ID))
+        elif result.with_keypoints is not None:
             result.with_keypoints += keypoints is not None
             content = keypoints or NO_KEYPOINTS
             message = keypoints_message(messages, content, stamp, FRAME_ID)

@@ -7,6 +7,7 @@ import pytest
 
 from hmt_ros.app.import_video import command
 from hmt_ros.app.replay.inputs import recorded_input
+from hmt_ros.detectors.people import SeenPerson
 from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagReader
@@ -189,6 +190,36 @@ def test_detector_sees_square_pixels(video, with_pixel_aspect, tmp_path, monkeyp
     assert camera.fy == pytest.approx(2 * camera.fx)
 
 
+class FakePeople:
+    """Two people, and nobody in every other image; it sees square pixels."""
+
+    def __init__(self, most):
+        self.most, self.calls = most, 0
+
+    def detect(self, image, stamp_ns):
+        assert image.shape[:2] == (48, 128)
+        self.calls += 1
+        if self.calls % 2 == 0:
+            return []
+        keypoints = Keypoints(NAMES, np.full((3, 2), 8.5), np.full((3, 2, 2), np.nan), np.ones(3))
+        return [SeenPerson(f'p{i}', keypoints, np.array([[8.0, 4], [40, 44]])) for i in (1, 2)]
+
+
+def test_several_people(video, with_pixel_aspect, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, 'PeopleDetector', FakePeople)
+    video.write_bytes(with_pixel_aspect(video.read_bytes(), 2, 1))
+    options = [str(video), '-o', str(tmp_path / 'bag'), '--fov', '60', '--people', '2']
+    assert command.main(options) == 0
+    assert '10 images, 5 with keypoints' in capsys.readouterr().out
+    found = content(tmp_path / 'bag')
+    assert not found.keys() & {'/keypoints', '/keypoints_3d'}
+    assert [x.ids for _, x in found['/detections'][:2]] == [['p1', 'p2'], []]
+    (_, first), *_ = found['/detections']
+    assert [first.keypoints[0].u[0], first.keypoints[0].v[0]] == [4.0, 8.5]
+    box = first.boxes[1]
+    assert (box.x_offset, box.y_offset, box.width, box.height) == (4, 4, 16, 40)
+
+
 def test_video_that_breaks_off_is_told(video, tmp_path, capsys):
     path = tmp_path / 'broken.avi'
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 25.0, (64, 48))
@@ -240,6 +271,8 @@ def test_a_part_of_the_video_in_which_nobody_is(video, tmp_path, capsys):
         (['--masks', '{}/full'], 'mask 3.png is zero nowhere'),
         (['--masks', '{}/late'], 'late has frame 12, but'),
         (['--masks', '{}/named'], 'person.png is not the name of a frame and has no number'),
+        (['--people', '2', '--detector', 'mediapipe'], '--detector: not allowed with argument'),
+        (['--people', '0'], '--people: wanted a whole number from 1 to 20'),
         (['--detector-masks'], '--detector-masks goes with --detector'),
         (['--camera', 'c.yaml'], '--camera: not allowed with argument --fov'),
         (['--detector', 'mediapipe', '--person', 'track:1'], '--person goes with --keypoints'),

@@ -7,9 +7,23 @@ import re
 import shutil
 import subprocess
 
+import numpy as np
 import pytest
 
-from test.app.conftest import FRAMES, TRAJECTORIES, make, write_out
+from msg_tools import BagWriter
+from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.headers import FRAME_ID
+from msg_tools.messages.pose_mixtures import MixtureKind
+from test.app.conftest import (
+    FRAMES,
+    MESSAGES,
+    STAMPS,
+    TRAJECTORIES,
+    make,
+    mixture_of,
+    pose_message,
+    write_out,
+)
 from test.app.report.test_command import with_ground
 from test.app.report.test_detector import with_detector
 
@@ -360,6 +374,37 @@ def test_filter_and_smoother_are_drawn_side_by_side(page, made, tmp_path):
 
 @pytest.mark.usefixtures('no_pictures')
 @in_a_browser
+def test_several_people_are_shown_together(body, poses, tmp_path):
+    out = tmp_path / 'out'
+    rng = np.random.default_rng(0)
+    with BagWriter(out) as bag:
+        named = message_of_body(MESSAGES, body, STAMPS[0], FRAME_ID)
+        for name in ('p1', 'p2'):
+            bag.write(f'humans/bodies/{name}/body', STAMPS[0], named)
+        for i, stamp in enumerate(STAMPS):
+            for name in ('p1', 'p2'):
+                mixture = mixture_of(body, poses[i], 2, rng)
+                for topic, kind in (
+                    ('pose_mixture', MixtureKind.POSTERIOR),
+                    ('likelihood_mixture', MixtureKind.LIKELIHOOD),
+                ):
+                    message = pose_message(body, mixture, stamp, kind)
+                    bag.write(f'humans/bodies/{name}/{topic}', stamp, message)
+    steps = """
+        const buttons = [...get('layers').children].slice(0, 4);
+        seen.names = buttons.map((button) => button.textContent.slice(1));
+        seen.on = buttons.map(pressed);
+        look('both'); get('layer-1').click(); look('one');
+    """
+    seen = visit(make(out, tmp_path / 'report'), steps, tmp_path)
+    assert sorted(seen['names']) == ['p1', 'p1, likelihood', 'p2', 'p2, likelihood']
+    assert [on for name, on in zip(seen['names'], seen['on']) if ',' not in name] == [True, True]
+    assert sum(seen['on']) == 2
+    assert seen['both'] != seen['one']
+
+
+@pytest.mark.usefixtures('no_pictures')
+@in_a_browser
 def test_motions_are_switched_on_and_off(page, body, poses, tmp_path):
     assert visit(page, "seen.hidden = get('motions-figure').hidden;", tmp_path)['hidden'] is True
     out = write_out(tmp_path / 'out', body, poses, change=with_identities)
@@ -379,8 +424,9 @@ def test_motions_are_switched_on_and_off(page, body, poses, tmp_path):
     """
     seen = visit(make(out, tmp_path / 'report'), steps, tmp_path)
     names = [name.partition(',')[0] for name in seen['names']]
-    assert (sorted(names[:2]), names[2:]) == (['motion 5', 'motion 8'], ['motion none'])
-    assert sorted(seen['motions']) == ['-', '5', '8']
+    span = f'0.0 to {(STAMPS[-1] - STAMPS[0]) * 1e-9:.1f} s'
+    assert names == [span, span, 'without identity']
+    assert sorted(seen['motions']) == sorted(names)
     views = ['all', 'without the first', 'without both']
     assert len({seen[name] for name in views}) == len(views)
     assert seen['weights of all'] != seen['weights without']

@@ -58,8 +58,16 @@ const layers = report.layers.map((layer) => {
   };
 });
 
+/** The person of a topic, as in humans/bodies/p1/pose_mixture; '' if it is of one alone. */
+const personOf = (layer) => (layer.topic.match(/humans\/bodies\/(\w+)\//) || ['', ''])[1];
+const several = new Set(layers.map(personOf)).size > 1;
+
 /** What a topic is called on the page. */
-const nameOf = (layer) => (layer.kind === 'posterior' ? 'filter' : layer.kind);
+function nameOf(layer) {
+  const kind = layer.kind === 'posterior' ? 'filter' : layer.kind;
+  if (!several) return kind;
+  return kind === 'filter' ? personOf(layer) : `${personOf(layer)}, ${kind}`;
+}
 
 /** Layers that are compared: the filter's and the smoother's, as far as they are there. */
 const compared = ['posterior', 'smoothed'].map((kind) => layers.find((layer) => layer.kind === kind)).filter(Boolean);
@@ -75,7 +83,17 @@ function motionsOf(layer) {
   }));
   return [...found.values()].sort((a, b) => b.total - a.total);
 }
-layers.forEach((layer) => { layer.motions = motionsOf(layer); });
+
+/** What a motion is called: the times at which it is there. */
+function nameOfMotion({ identity, weights }) {
+  if (!identity) return 'without identity';
+  const there = TIMES.filter((_, t) => weights[t] !== null);
+  return `${there[0].toFixed(1)} to ${there[there.length - 1].toFixed(1)} s`;
+}
+layers.forEach((layer) => {
+  layer.motions = motionsOf(layer);
+  layer.motionNames = new Map(layer.motions.map((motion) => [motion.identity, nameOfMotion(motion)]));
+});
 
 /** One skeleton at each time for which it is known, with its number or -1. */
 function single(figure) {

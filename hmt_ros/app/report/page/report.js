@@ -19,7 +19,7 @@ const film = report.images ? new Film(element('image')) : null;
 /** Mixtures whose weights can be shown: layers, then mixtures over trajectories. */
 const choices = [
   ...layers.map((layer, index) => ({
-    name: `${nameOf(layer)} (${layer.topic})`, layer, index, weightsAt: (t) => layer.weights[t], what: 'modes',
+    name: several ? nameOf(layer) : `${nameOf(layer)} (${layer.topic})`, layer, index, weightsAt: (t) => layer.weights[t], what: 'modes',
   })),
   ...trajectories.map((topic, index) => ({
     name: `trajectories (${topic.topic})`, layer: null, index: layers.length + index,
@@ -119,7 +119,7 @@ function tellModes() {
     bar.append(made('span'));
     bar.firstChild.style.width = `${100 * weight}%`;
     row.append(first, made('td', `${(100 * weight).toFixed(1)} %`), bar);
-    if (motions) row.append(made('td', motions[shown.time][rank] || '-'));
+    if (motions) row.append(made('td', layer.motionNames.get(motions[shown.time][rank])));
     if (errorsKnown()) row.append(made('td', errors ? fixed(errors[rank]) : '-'));
     return row;
   });
@@ -170,7 +170,7 @@ function tellMotions() {
   const boxes = [];
   for (let i = 0; i < layer.motions.length; i += i < TOLD_MOTIONS ? 1 : layer.motions.length) {
     const some = layer.motions.slice(i, i < TOLD_MOTIONS ? i + 1 : undefined);
-    const what = i < TOLD_MOTIONS ? `motion ${some[0].identity || 'none'}` : `${some.length} others`;
+    const what = i < TOLD_MOTIONS ? nameOfMotion(some[0]) : `${some.length} others`;
     const share = some.reduce((total, motion) => total + motion.total, 0) / sum;
     boxes.push(toggle(
       `motion-${i}`, `${what}, ${percent(share)}`, !some.every(({ identity }) => hidden.has(identity)),
@@ -244,10 +244,12 @@ function buildLayers() {
   const sides = (style) => [`${style}-left`, `${style}-right`];
   const kinds = layers.map(nameOf);
   layers.forEach((layer, index) => {
-    if (index === 0) shown.layers.add(index);
+    // Everybody, if there are several.
+    const first = index === 0 || (several && layer.kind === 'posterior');
+    if (first) shown.layers.add(index);
     const alone = kinds.filter((kind) => kind === kinds[index]).length === 1;
     place.append(toggle(
-      `layer-${index}`, alone ? kinds[index] : `${kinds[index]} (${layer.topic})`, index === 0, sides(layer.style),
+      `layer-${index}`, alone ? kinds[index] : `${kinds[index]} (${layer.topic})`, first, sides(layer.style),
       (on) => { if (on) shown.layers.add(index); else shown.layers.delete(index); },
     ));
     place.lastChild.title = layer.topic;
