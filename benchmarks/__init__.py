@@ -11,6 +11,7 @@ BENCHMARKS = {
     'absence': 'whether a visible person is taken for nobody, an empty scene for somebody',
     'bags': 'what replay adds to the time of the estimate',
     'blind': 'what is said of a person whom nothing explains, and of one whom something does',
+    'composites': 'people cut from clips who cross in one image: are they told apart?',
     'contenders': 'models of p(pose | image) with the same pairs and the same processor time',
     'contour_noise': 'how far contours of people lie from those of the model',
     'detectors': 'what each detector that is installed sees, and what poses come of it',

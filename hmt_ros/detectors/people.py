@@ -44,10 +44,13 @@ SMALLEST, FILLED, RATIO, OVERLAP = 150.0, 0.4, 1.9, 0.4
 SAME_CIRCLE, SAME_BODY, ALIKE, CONTAINED = 0.6, 0.08, 0.25, 0.8
 # Ratio of sizes from which two bodies are not one; distance, in sizes, from which one is alone.
 LARGEST_RATIO, BESIDE = 1.6, 1.0
+# What people are painted over with, grey levels.
+GREY = 128
 # The circles that the first network finds may be too small.
 SCALES = (1.0, 1.5, 2.4)
-# Standard deviation of the place of a person, in sizes, and its growth a second.
-NEAR, SPEED = 0.08, 0.35
+# Standard deviation of the place of a person, in sizes, and its growth a second; that by the speed of
+# one who may turn round.
+NEAR, SPEED, TURN = 0.08, 0.35, 0.5
 # Distance of clothes that is as likely of one person as of two, what changes it by a nat, and what
 # colours say at most, nats. Of one person 99 % of the distances are below 0.47; of two 95 % above.
 DIFFERENT, DOUBT, MOST_NATS = 0.4, 0.06, 4.0
@@ -110,7 +113,8 @@ class _Person:
     def cost(self, one: _Sighted, stamp: int) -> float:
         """Of taking somebody for this person, nats against taking them for somebody else."""
         dt = seconds(stamp - self.place.stamp)
-        away = self.place.cost(one.sighting, stamp) / (NEAR + SPEED * dt)
+        speed = float(np.linalg.norm(self.place.velocity)) / self.place.size
+        away = self.place.cost(one.sighting, stamp) / (NEAR + (SPEED + TURN * speed) * dt)
         colours = (self.clothes.distance(one.clothes) - DIFFERENT) / DOUBT
         return 0.5 * away * away + float(np.clip(np.nan_to_num(colours), -MOST_NATS, MOST_NATS))
 
@@ -194,7 +198,7 @@ class PeopleDetector:
         lost = [x for x in self._people if x not in known]
         lost += [x for x, one in zip(known, sighted, strict=True) if one is None]
         found += self._searched(image, found, self._tiles_due(interval) + _places(lost, stamp_ns))
-        self._assign(_single(found), stamp_ns)
+        self._assign(image, _single(found), stamp_ns)
         self._people = [
             x for x in self._people if seconds(stamp_ns - x.seen) <= (KEPT if x.sure else 0.0)
         ]
@@ -256,7 +260,8 @@ class PeopleDetector:
 
     # Identities.
 
-    def _assign(self, sighted: list[_Sighted], stamp: int) -> None:
+    def _assign(self, image: Image, sighted: list[_Sighted], stamp: int) -> None:
+        """Tells people in an image who they are, and looks behind them for those who are hidden."""
         costs = np.array([[x.cost(one, stamp) for one in sighted] for x in self._people])
         pairs: dict[int, _Person] = {}
         if costs.size:
@@ -266,10 +271,33 @@ class PeopleDetector:
         left = [one for j, one in enumerate(sighted) if j not in pairs]
         left.sort(key=lambda x: -x.sighting.size)
         self.left_out = max(len(left) - room, 0)
+        hidden = [x for x in self._people if x not in pairs.values()]
         for j, person in pairs.items():
             person.update(sighted[j], stamp)
+        for person in hidden:
+            one = self._behind(image, person, sighted, stamp)
+            if one is not None:
+                person.update(one, stamp)
+                sighted = [*sighted, one]
         for one in left[:room]:
             self._people.append(self._new(one, stamp))
+
+    def _behind(
+        self, image: Image, person: _Person, sighted: list[_Sighted], stamp: int
+    ) -> _Sighted | None:
+        """A lost person where they are expected, with those who are seen there painted over."""
+        circle = person.followed.circle + person.place.shift(stamp)
+        before = [x for x in sighted if _apart(x.circle, circle) < BESIDE]
+        if not before:
+            return None
+        painted = image.copy()
+        for other in before:
+            body = other.found.square.spread(other.found.mask, self._size) > 0.0
+            painted[body] = GREY
+        one = self._look(painted, circle)
+        if one is None or any(_same_body(one, other) for other in before):
+            return None
+        return one if person.cost(one, stamp) < LARGEST else None
 
     def _new(self, one: _Sighted, stamp: int) -> _Person:
         self._count += 1
