@@ -1,6 +1,7 @@
 """The demonstration on a small rendered bag, and what it draws."""
 
 import io
+import re
 import shutil
 from contextlib import redirect_stdout
 
@@ -17,7 +18,16 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.keypoints import keypoints_message, positions_message
-from tools.demonstration.demo import main
+from tools.demonstration.demo import (
+    CLIPS,
+    DETECTORS,
+    NOBODY,
+    OURS,
+    RATE,
+    REGIONS,
+    SMOOTHED,
+    main,
+)
 
 PICTURES = ('overview.png', 'overlays.png', 'side_views.png', 'weights.png', 'calibration.png')
 
@@ -69,24 +79,33 @@ def test_it_leaves_a_bag_and_a_report(output):
 
 
 def told(printed):
-    """Errors by what they are of, mm, and the other lines."""
-    head, table = printed.split('mean error of the joints of arms and legs, mm\n')
-    table, rest = table.split('\n\n', 1)
-    rows = {line[:42].strip(): float(line[42:]) for line in table.splitlines()}
+    """What is told of the poses, by its name, and the other lines."""
+    head, table, rest = printed.split('\n\n', 2)
+    rows = {line[:60].strip(): line[60:] for line in table.splitlines()}
     return rows, [*head.splitlines(), *rest.splitlines()]
+
+
+def millimetres(text):
+    value, unit = text.split()
+    assert unit == 'mm'
+    return float(value)
 
 
 def test_it_tells_what_came_out(output):
     folder, _, printed = output
-    errors, lines = told(printed)
-    assert list(errors) == ['images', 'images, smoothed', 'the nearest of the poses of each image']
-    assert 0 < errors['the nearest of the poses of each image'] <= errors['images'] < 300
+    rows, lines = told(printed)
+    assert list(rows) == [OURS, SMOOTHED, REGIONS, NOBODY, RATE, CLIPS]
+    assert 0 < millimetres(rows[OURS]) < 300
+    assert rows[REGIONS].endswith(' %')
+    assert rows[NOBODY] == '0 of 5 images'
+    assert float(rows[RATE]) > 0
+    assert re.fullmatch(r"\d\d mm, and \d\d\d of the detector's 3D", rows[CLIPS])
     assert lines[-1] == f'open in a browser: {folder / "report" / "report.html"}'
     for name in (*(f'report/{picture}' for picture in PICTURES), 'report/report.html', 'small'):
         assert any(line.startswith(f'{folder / name}: ') for line in lines), name
 
 
-def test_keypoints_are_told_apart_from_images(source, tmp_path):
+def test_a_detector_is_beside_ours(source, tmp_path):
     """Beside a detector's own 3D, which here is right but for 1 cm of depth at the left knee."""
     truth, scheme = read_truth(source / 'truth.npz'), schemes()['mediapipe33']
     bag, messages = tmp_path / 'detected', RosbagsMessages()
@@ -109,12 +128,7 @@ def test_keypoints_are_told_apart_from_images(source, tmp_path):
     printed = io.StringIO()
     with redirect_stdout(printed):
         assert main([str(bag), '-o', str(tmp_path / 'out')]) == 0
-    errors, _ = told(printed.getvalue())
-    assert list(errors) == [
-        "the detector's own 3D", 'images alone', 'images and keypoints',
-        'images and keypoints, smoothed', 'the nearest of the poses of each image',
-    ]  # fmt: skip
-    assert errors["the detector's own 3D"] == 10.0
-    assert errors['images and keypoints'] < errors['images alone']
-    with BagReader(tmp_path / 'out' / 'images_alone') as alone:
-        assert alone.topic('pose_mixture').message_count == 5
+    rows, _ = told(printed.getvalue())
+    assert list(rows) == [DETECTORS, OURS, SMOOTHED, REGIONS, NOBODY, RATE, CLIPS]
+    assert millimetres(rows[DETECTORS]) == 10.0
+    assert millimetres(rows[OURS]) < 100

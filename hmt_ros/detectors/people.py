@@ -48,8 +48,8 @@ LARGEST_RATIO, BESIDE = 1.6, 1.0
 GREY = 128
 # The circles that the first network finds may be too small.
 SCALES = (1.0, 1.5, 2.4)
-# Standard deviation of the place of a person, in sizes, and its growth a second; that by the speed of
-# one who may turn round.
+# Standard deviation of the place of a person, in sizes, its growth a second, and the share of the
+# speed in that: one who moves may turn round.
 NEAR, SPEED, TURN = 0.08, 0.35, 0.5
 # Distance of clothes that is as likely of one person as of two, what changes it by a nat, and what
 # colours say at most, nats. Of one person 99 % of the distances are below 0.47; of two 95 % above.
