@@ -47,7 +47,7 @@ def test_the_readme_names_every_example():
     programs = [
         path.name for path in EXAMPLES.iterdir() if path.suffix in ('.py', '.cpp', '.ipynb')
     ]
-    assert len(programs) == 9
+    assert len(programs) == 10
     assert all(f'`{name}`' in text for name in programs)
 
 
@@ -108,6 +108,38 @@ def test_a_raised_hand_is_as_probable_as_its_modes():
     nobody = mixture(0.5, 0.5)
     nobody.state = 3
     assert math.isnan(told(nobody))
+
+
+def test_a_forearm_that_points_both_ways_leaves_both_objects_their_share():
+    told = example('pointing')['pointing']
+    objects = [0.0, 0.0, 1.0, 0.0, 0.0, 5.0, 2.0, 0.0, 3.0]
+
+    def pointed(*ways, weights=(0.7, 0.3), deviation=0.02):
+        modes = [
+            SimpleNamespace(
+                weight=weight,
+                joint_positions=[
+                    SimpleNamespace(x=0.0, y=0.0, z=3.0), SimpleNamespace(**dict(zip('xyz', way)))
+                ],
+                joint_covariances_relative=[*(deviation**2 * np.eye(3)).ravel()] * 2,
+            )
+            for way, weight in zip(ways, weights, strict=False)
+        ]  # fmt: skip
+        names = ['right_elbow', 'right_wrist']
+        return SimpleNamespace(state=1, STATE_TRACKING=1, joint_names=names, components=modes)
+
+    near, far = (0.0, 0.0, 2.75), (0.0, 0.0, 3.25)
+    both = told(pointed(near, far), objects)
+    assert both[:2] == pytest.approx([0.7, 0.3], abs=0.02)
+    assert sum(both) == pytest.approx(1.0)
+    assert told(pointed((0.0, 0.25, 3.0), weights=(1.0,)), objects)[-1] > 0.99
+    # An arm that is hardly known points at none for sure.
+    vague = told(pointed(near, weights=(1.0,), deviation=0.3), objects)
+    assert told(pointed(near, weights=(1.0,)), objects)[0] > vague[0] > vague[1]
+    nobody = pointed(near, far)
+    nobody.state = 3
+    assert len(told(nobody, objects)) == 4
+    assert all(map(math.isnan, told(nobody, objects)))
 
 
 class StandIn(SimpleNamespace):
@@ -219,6 +251,16 @@ def test_examples_tell_what_the_demonstration_shows(demonstration):
     above = hands[..., 1].min(1) < joints[:, names.index('head'), 1]
     wrong = np.array([raised(x) > 0.5 for x in mixtures]) != above
     assert (above.sum(), wrong.sum() <= 1) == (6, True)
+    pointing = example('pointing')['pointing']
+    # At what is a metre beyond the true hand, along the true forearm; at its mirror image.
+    elbow = joints[:, names.index('right_elbow')]
+    forearm = hands[:, 1] - elbow
+    beyond = hands[:, 1] + forearm / np.linalg.norm(forearm, axis=1, keepdims=True)
+    found = [
+        pointing(x, [*there, *(there * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * hand[2]])])
+        for x, there, hand in zip(mixtures, beyond, hands[:, 1], strict=True)
+    ]
+    assert np.mean(found, axis=0)[0] > np.mean(found, axis=0)[1]
     stop = example('stop_near_hand')
     assert not any(stop['must_stop'](x) for x in mixtures)
     # The hands are 3.08 to 3.52 m away.
@@ -294,8 +336,10 @@ def check_answers(standing, programs):
     publishers, processes = [], []
 
     def hear(name, told):
-        several = hasattr(told, 'info')
-        heard[name].append(np.mean(np.array(told.data) == 100) if several else float(told.data))
+        if hasattr(told, 'info'):
+            heard[name].append(np.mean(np.array(told.data) == 100))
+        else:
+            heard[name].append(float(np.sum(told.data)))
 
     for name, (command, source, topic, kind, _) in programs.items():
         node.create_subscription(kind, f'/{name}_lab/{topic}', partial(hear, name), 10)
@@ -328,12 +372,13 @@ def check_answers(standing, programs):
 @pytest.mark.ros
 def test_examples_answer(standing):
     from nav_msgs.msg import OccupancyGrid
-    from std_msgs.msg import Bool, Float64
+    from std_msgs.msg import Bool, Float64, Float64MultiArray
 
     programs = {
         'keep_distance': ('keep_out', 'speed_scale', Float64, 0.5),
         'stop_near_hand': ('pose_mixture', 'stop', Bool, 0.0),
         'raised_hand': ('pose_mixture', 'raised_hand', Float64, 0.0),
+        'pointing': ('pose_mixture', 'pointing', Float64MultiArray, 1.0),
         'keep_out_grid': ('keep_out', 'keep_out_grid', OccupancyGrid, LYING),
     }
     check_answers(standing, {name: (python(name), *rest) for name, rest in programs.items()})
