@@ -5,9 +5,10 @@
         -p objects:="[0.5, 0.2, 2.0, -0.8, 0.2, 2.5]" -p side:=right
 
 It takes `pose_mixture` (hmt_msgs/PoseMixture) and publishes `pointing`
-(std_msgs/Float64MultiArray): the probabilities of the objects, whose places are x, y, z in the frame of the mixture, m, and last
-that of none; all NaN where nobody is tracked. A forearm that points towards the camera looks like
-one that points away: where both are modes, both objects keep their share.
+(std_msgs/Float64MultiArray): the probabilities of the objects, whose places are x, y, z in the
+frame of the mixture, m, and last that of none; all NaN where nobody is tracked. A forearm that
+points towards the camera looks like one that points away: where both are modes, both objects keep
+their share.
 """
 
 from __future__ import annotations

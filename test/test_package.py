@@ -353,3 +353,30 @@ def test_a_wheel_has_the_library_and_one_command(tmp_path):
 
 def test_tests_that_begin_first_exist():
     assert [name for name in LONGEST if not (ROOT / 'test' / name).is_file()] == []
+
+
+def test_a_release_is_refused_while_addresses_are_not_public(tmp_path):
+    """In a repository of its own, with the script and what it looks at."""
+    files = ('package.xml', 'setup.py', 'examples/package.xml', 'msg_tools/hmt_msgs/package.xml')
+    for name in (*files, 'tools/release.sh'):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+
+    def refused():
+        done = subprocess.run(
+            [tmp_path / 'tools' / 'release.sh'], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 1
+        assert not (tmp_path / 'build').exists()
+        (line,) = done.stderr.splitlines()
+        return line
+
+    def git(*words):
+        who = ('-c', 'user.name=a', '-c', 'user.email=a@b.c')
+        subprocess.run(['git', '-C', tmp_path, *who, *words], check=True, capture_output=True)
+
+    git('init')
+    assert 'wanted a tree without changes' in refused()
+    git('add', '-A')
+    git('commit', '-m', 'all')
+    assert refused().startswith(f'release: example.com stands for addresses in {" ".join(files)}')
