@@ -1,4 +1,4 @@
-"""The modes of a mixture, drawn as skeletons on the image that they explain.
+"""The modes of a mixture, drawn as skeletons on the image that they explain, and notes for a user.
 
 Colours are those of the markers: the heaviest mode orange, the others blue, the lighter the
 fainter. The same modes on the same image give the same picture.
@@ -17,6 +17,7 @@ from hmt_ros.inference.arrays import Array, Image
 _FIRST, _OTHERS = (13, 115, 230), (204, 115, 26)  # BGR
 _FAINTEST = 0.2
 _SHIFT = 4  # fractional bits of coordinates
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
 _FAR = 2.0**14  # px; OpenCV draws nothing that begins further away
 
 
@@ -68,6 +69,24 @@ def draw_modes(
         share = float(weights[order[rank]] / weights[order[0]]) if weights[order[0]] > 0 else 1.0
         strength = _FAINTEST + (1 - _FAINTEST) * share
         cv2.addWeighted(layer, strength, part, 1 - strength, 0.0, dst=part)
+    return result
+
+
+def draw_notes(image: Image, notes: Sequence[str]) -> Image:
+    """A copy of an image (H, W, 3) with lines of text at its lower left, light on dark."""
+    result = image.copy()
+    height, width = image.shape[:2]
+    bottom = height
+    for note in reversed(notes):
+        # At most as wide as the image.
+        (wide, _), _ = cv2.getTextSize(note, _FONT, 1.0, 1)
+        scale = min(max(height / 700.0, 0.35), 0.95 * width / max(wide, 1))
+        top = bottom - round(36 * scale)
+        right = min(round(scale * (wide + 24)), width)
+        cv2.rectangle(result, (0, max(top, 0)), (right, bottom), (0, 0, 0), cv2.FILLED)
+        place = round(12 * scale), bottom - round(10 * scale)
+        cv2.putText(result, note, place, _FONT, scale, (255, 255, 255), 1, cv2.LINE_AA)
+        bottom = top
     return result
 
 

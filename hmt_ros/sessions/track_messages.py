@@ -23,7 +23,7 @@ from hmt_ros.sessions.camera_session import WaitingImage
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.focal_length import depth_covariances
 from hmt_ros.sessions.handled import Output
-from hmt_ros.sessions.overlay import draw_modes
+from hmt_ros.sessions.overlay import draw_modes, draw_notes
 from hmt_ros.sessions.robot_outputs import RobotOutputs
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.sessions.tracking_parameters import FilterParameters
@@ -160,6 +160,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
             posterior.weights,
             OVERLAY_MODES,
         )
+        drawn = draw_notes(drawn, _notes(p))
         yield 'overlay/compressed', compressed_image_message(MESSAGES, drawn, stamp, frame)
 
 
@@ -168,7 +169,7 @@ def nobody_messages(
 ) -> Iterator[tuple[str, Any]]:
     """Topics and messages of an image that ends a track: nobody is in view, or it was of nobody.
 
-    The overlay shows the image without modes; markers of all ranks are removed.
+    The overlay shows the image without modes and says why; markers of all ranks are removed.
     """
     body, stamp = tracker.estimate.body, waiting.stamp_ns
     frame = f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id
@@ -197,8 +198,15 @@ def nobody_messages(
         markers.markers += removed_ground(MESSAGES, stamp, frame)
         yield 'markers', markers
     if wanted('overlay/compressed'):
-        picture = compressed_image_message(MESSAGES, waiting.image, stamp, frame)
-        yield 'overlay/compressed', picture
+        why = tracker.estimate.reason or 'nobody is in view'
+        shown = draw_notes(waiting.image, [why, *_notes(p)])
+        yield 'overlay/compressed', compressed_image_message(MESSAGES, shown, stamp, frame)
+
+
+def _notes(p: FilterParameters) -> list[str]:
+    """What is missing, for those who look at the overlay."""
+    sigma = p.focal_length_sigma
+    return [f'no calibration: distances may be off by {sigma:.0%}'] if sigma else []
 
 
 def robot_messages(

@@ -12,7 +12,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.camera_session import WaitingImage
-from hmt_ros.sessions.overlay import draw_modes
+from hmt_ros.sessions.overlay import draw_modes, draw_notes
 from hmt_ros.sessions.track_messages import TOPICS, TrackedImage, track_messages
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.tracking import Status
@@ -322,6 +322,25 @@ def test_overlay_shows_the_modes(track, body):
     assert red[0][2] > red[0][0] + 100
     assert red[1][0] > red[1][2] + 10
     assert red[1][0] - red[1][2] > red[2][0] - red[2][2]
+
+
+def test_overlay_says_what_is_missing(track):
+    plain = decode_image(made(track)['overlay/compressed'])
+    guessed = replace(track, parameters=replace(track.parameters, focal_length_sigma=0.2))
+    noted = decode_image(made(guessed)['overlay/compressed'])
+    changed = np.nonzero(cv2.absdiff(noted, plain).max(2) > 60)
+    assert len(changed[0]) > 100
+    assert changed[0].min() > 0.8 * plain.shape[0]
+
+
+@pytest.mark.parametrize('size', [(480, 640), (60, 80), (20, 500)])
+def test_notes_fit_into_the_image(size):
+    image = np.full((*size, 3), 120, np.uint8)
+    drawn = draw_notes(image, ['nobody is in view', 'no calibration: distances may be off by 20%'])
+    assert drawn.shape == image.shape
+    assert drawn.max() > 150
+    assert np.all(image == 120)
+    np.testing.assert_array_equal(draw_notes(image, []), image)
 
 
 def test_overlay_with_people_partly_outside_and_behind(body):
