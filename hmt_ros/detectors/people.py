@@ -26,6 +26,7 @@ from hmt_ros.detectors.clothes import VISIBLE, Clothes
 from hmt_ros.detectors.square import Square
 from hmt_ros.image.association import ImageTrack, Sighting
 from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.still_picture import StillPicture
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.error_model import seconds
@@ -40,6 +41,8 @@ LOST, CONFIRMED, EVIDENT = 0.5, 0.3, 0.75
 # Height of the smallest people who are looked for, px; what they fill of the smallest tile; the
 # ratio of the sizes of tiles; the part of a tile that the next one shows, too.
 SMALLEST, FILLED, RATIO, OVERLAP = 150.0, 0.4, 1.9, 0.4
+# Time without a change after which somebody is a picture, and from look to look, s.
+STILL, COMPARED = 10.0, 1.0
 # Distance of circles, over their radius, and of bodies, over their size, below which two are one.
 SAME_CIRCLE, SAME_BODY, ALIKE, CONTAINED = 0.6, 0.08, 0.25, 0.8
 # Ratio of sizes from which two bodies are not one; distance, in sizes, from which one is alone.
@@ -78,11 +81,13 @@ class SeenPerson(NamedTuple):
         name: identity, p1, p2, ...
         keypoints: landmarks of the scheme 'mediapipe33'.
         corners: (2, 2) left top and right bottom of the visible ones, px.
+        still: whether the image about them has not changed for `STILL` s: a poster, or a statue.
     """
 
     name: str
     keypoints: Keypoints
     corners: Array
+    still: bool = False
 
 
 @dataclass(eq=False)
@@ -98,6 +103,8 @@ class _Person:
         seen, begun: stamps of the last and of the first image that showed them, ns.
         looked: stamp of the last image whose part about the place of a lost person was searched.
         sure: whether this is somebody: one who appears beside another may be that one again.
+        picture: the last image that showed something else about them, looked at once a second.
+        changed, compared: stamps of that image, and of the last look, ns.
     """
 
     name: str
@@ -109,6 +116,9 @@ class _Person:
     begun: int
     looked: int
     sure: bool
+    picture: StillPicture
+    changed: int
+    compared: int
 
     def cost(self, one: _Sighted, stamp: int) -> float:
         """Of taking somebody for this person, nats against taking them for somebody else."""
@@ -118,8 +128,12 @@ class _Person:
         colours = (self.clothes.distance(one.clothes) - DIFFERENT) / DOUBT
         return 0.5 * away * away + float(np.clip(np.nan_to_num(colours), -MOST_NATS, MOST_NATS))
 
-    def update(self, one: _Sighted, stamp: int) -> None:
+    def update(self, image: Image, one: _Sighted, stamp: int) -> None:
         """Takes what the next image that shows them says."""
+        if seconds(stamp - self.compared) >= COMPARED:
+            self.compared = stamp
+            if not self.picture.shows_again(image, one.keypoints):
+                self.changed = stamp
         interval = seconds(stamp - self.seen)
         known = seconds(stamp - self.begun)
         if known < CLOTHES_TIME or self.cost(one, stamp) < SURE:
@@ -203,7 +217,12 @@ class PeopleDetector:
             x for x in self._people if seconds(stamp_ns - x.seen) <= (KEPT if x.sure else 0.0)
         ]
         return [
-            SeenPerson(x.name, x.keypoints, x.place.sighting.corners)
+            SeenPerson(
+                x.name,
+                x.keypoints,
+                x.place.sighting.corners,
+                seconds(stamp_ns - x.changed) >= STILL,
+            )
             for x in self._people
             if x.seen == stamp_ns and x.sure
         ]
@@ -273,11 +292,11 @@ class PeopleDetector:
         self.left_out = max(len(left) - room, 0)
         hidden = [x for x in self._people if x not in pairs.values()]
         for j, person in pairs.items():
-            person.update(sighted[j], stamp)
+            person.update(image, sighted[j], stamp)
         for person in hidden:
             one = self._behind(image, person, sighted, stamp)
             if one is not None:
-                person.update(one, stamp)
+                person.update(image, one, stamp)
                 sighted = [*sighted, one]
         for one in left[:room]:
             self._people.append(self._new(one, stamp))
@@ -307,7 +326,8 @@ class PeopleDetector:
         keypoints = followed.smooth(one.found, 0.0)
         return _Person(
             f'p{self._count}', ImageTrack(one.sighting, stamp), one.clothes, followed, keypoints,
-            stamp, stamp, stamp, one.found.quality >= EVIDENT and not beside,
+            stamp, stamp, stamp, one.found.quality >= EVIDENT and not beside, StillPicture(), stamp,
+            stamp,
         )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.detectors.detector import Detector
-from hmt_ros.detectors.people import PeopleDetector, SeenPerson
+from hmt_ros.detectors.people import STILL, PeopleDetector, SeenPerson
 from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
@@ -156,6 +156,12 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
                 f'{len(people) + left_out} people are seen in the image of {stamp} ns, but people '
                 f'is {self.parameters.people}: the smallest are left out',
             )
+        for one in seen:
+            if one.still:
+                self._log.note(
+                    f'{one.name} is still',
+                    f'nothing about {one.name} has changed for {STILL:g} s: a picture or a statue?',
+                )
         if self._wanted(DETECTIONS):
             self._publish(
                 DETECTIONS, stamp, people_message(self._messages, people, stamp, frame_id)

@@ -52,6 +52,8 @@ class Scene:
                 (round(x + 0.13 * h), round(y + 0.5 * h)),
             ]
             cv2.rectangle(image, *corners, person.colour, -1)
+            belt = [(corners[0][0], round(y)), (corners[1][0], round(y + 0.05 * h))]
+            cv2.rectangle(image, *belt, (0, 0, 0), -1)
         return image
 
     def seen(self):
@@ -203,6 +205,20 @@ def test_a_mirror_image_is_another_person():
     people = [Person(RED, walking(100, 280)), Person(RED, walking(540, 360))]
     names = names_over(Scene(people, noise=1.0))
     assert [len(kept(names, x)) for x in people] == [1, 1]
+
+
+def test_a_poster_is_named_as_one_and_somebody_who_sways_is_not():
+    poster = Person(RED, standing(150))
+    swaying = Person(GREEN, lambda t: (450 + 4 * np.sin(t), 240.0))
+    scene = Scene([poster, swaying])
+    detector = PeopleDetector(2, scene)
+    still = []
+    for number in range(65):
+        scene.time = number / 5
+        found = detector.detect(scene.image(), 10**9 + number * 200_000_000)
+        still.append({x.keypoints.pixels[0, 0] < 300: x.still for x in found})
+    assert not any(x[True] for x in still[:50])
+    assert still[-1] == {True: True, False: False}
 
 
 def test_a_new_sequence_gives_new_names():

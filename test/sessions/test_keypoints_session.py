@@ -136,7 +136,7 @@ class StubPeople:
         keypoints = Keypoints(NAMES, np.full((33, 2), float(column)), unknown, np.full(33, 0.5))
         corners = np.array([[column, row], [column + 10.0, row + 24.0]])
         self.left_out = max(2 - self.most, 0)
-        return [SeenPerson(x, keypoints, corners) for x in ('p1', 'p7')[: self.most]]
+        return [SeenPerson(x, keypoints, corners, x == 'p7') for x in ('p1', 'p7')[: self.most]]
 
 
 def test_several_people_are_detections(session, outputs, somebody, monkeypatch):
@@ -144,7 +144,9 @@ def test_several_people_are_detections(session, outputs, somebody, monkeypatch):
     one = session(people=2)
     assert one.state.status == 'waiting'
     stamp = somebody.stamp(0)
-    assert one.take(IMAGE, somebody.image(0)).published == (('detections', stamp),)
+    handled = one.take(IMAGE, somebody.image(0))
+    assert handled.published == (('detections', stamp),)
+    assert handled.warnings == ('nothing about p7 has changed for 10 s: a picture or a statue?',)
     ((topic, _, data),) = outputs
     message = deserialise(data, TOPICS[topic].msgtype)
     assert (message.header.frame_id, message.ids) == ('lens', ['p1', 'p7'])
