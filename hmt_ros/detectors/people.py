@@ -6,9 +6,11 @@
   lost it sees the place where they are expected, too. Who is followed already is left out.
 - The network of landmarks sees the square about each person where the last image had them, moved
   on by their velocity.
-- Two squares that have found one body leave it to the one that fits better.
-- Those found are assigned to those known by place, motion and the colours of their clothes
-  (`association`, `clothes`). Who is lost for longer than `KEPT` gets a new identity.
+- Two squares that have found one body leave it to the one in which it is seen better.
+- Those found are assigned to those known by place, motion and the colours of their clothes, with
+  the least sum of costs, nats (`_Person.cost`, `clothes`).
+- Who is then lost beside somebody is looked for with those who are seen painted over. Who is lost
+  for longer than `KEPT` gets a new identity.
 """
 
 from __future__ import annotations
@@ -62,8 +64,7 @@ LARGEST, SURE = 3.0, 0.0
 # Time constant of the clothes of a person, s; the fewest landmarks of somebody.
 CLOTHES_TIME, FEWEST = 2.0, 8
 
-
-# Rows of the landmarks of trunk and limbs, which of these are the same on the other side.
+# Rows of the landmarks of trunk and limbs; which of these are the same on the other side.
 _NAMES = schemes()[SCHEME].names
 _JOINTS = [
     f'{side}_{x}'
