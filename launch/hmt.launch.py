@@ -31,6 +31,8 @@ DETECTOR = 'keypoints_node'
 # Several people: its topics are in the root namespace.
 PEOPLE = 'people_node'
 NODES = (*USUAL_NODES, DETECTOR, PEOPLE)
+# Layouts of RViz for one person, and for several.
+LAYOUTS = 'hmt.rviz', 'people.rviz'
 # Runs nodes of one person in one process.
 TOGETHER = 'person_node'
 # Default frame of images in the nodes; and the frame for views, which need z up.
@@ -303,7 +305,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
                 executable='rviz2',
                 name='rviz2',
                 namespace=namespace,
-                arguments=['-d', str(share / 'rviz' / 'hmt.rviz')],
+                arguments=['-d', str(share / 'rviz' / LAYOUTS[PEOPLE in names])],
                 parameters=[{'use_sim_time': sim_time}],
                 output='log',
             )

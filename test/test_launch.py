@@ -25,6 +25,7 @@ from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.keypoints_session import KeypointsParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
+from hmt_ros.sessions.people_session import PeopleSession
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from msg_tools import BagReader
@@ -407,6 +408,17 @@ def test_rviz_shows_topics_of_the_nodes_relative_to_a_namespace():
     }
     assert any(one['Class'].endswith('/TF') for one in displays)
     assert 'robot_description' not in text
+
+
+def test_rviz_shows_everybody(actions):
+    made = actions(nodes='people_node keypoints_node', rviz='true')
+    assert made['rviz2']['arguments'][1].endswith('rviz/people.rviz')
+    assert actions(rviz='true')['rviz2']['arguments'][1].endswith('rviz/hmt.rviz')
+    text = (ROOT / 'rviz' / 'people.rviz').read_text('utf-8')
+    displays = yaml.safe_load(text)['Visualization Manager']['Displays']
+    shown = {one['Topic']['Value'] for one in displays if 'Topic' in one}
+    assert shown == {'markers', 'overlay/compressed'}
+    assert shown <= PeopleSession.TOPICS.keys()
 
 
 def test_page_lists_the_arguments(description):

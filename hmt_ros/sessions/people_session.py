@@ -10,7 +10,8 @@ The rules, besides those of `CameraSession`:
 - The nearest person is tracked first. For each person the pixels of nearer people are unknown, and
   the pixels that only somebody farther away covers (`Tracker.step`, others).
 - The background is learned while nobody is detected, or read from `background_file`.
-- With every image whose detections are known a list of the people who are tracked goes out.
+- With every image whose detections are known a list of the people who are tracked goes out, and
+  markers and an overlay with all of them.
 """
 
 from __future__ import annotations
@@ -48,10 +49,11 @@ from hmt_ros.sessions.image_inputs import (
     SOURCES,
     ImageInput,
 )
+from hmt_ros.sessions.overlay import draw_modes, draw_notes
 from hmt_ros.sessions.people_inputs import Found, PeopleReader
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.sessions.track import BODIES, Seen, Track, person_of
-from hmt_ros.sessions.track_messages import TOPICS_OF_NODE
+from hmt_ros.sessions.track_messages import OVERLAY_MODES, TOPICS_OF_NODE, notes_of
 from hmt_ros.sessions.track_start import TrackStart
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
@@ -64,8 +66,10 @@ from msg_tools.messages.detections import (
     people_message,
 )
 from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.markers import skeleton_markers
 
-PEOPLE = 'people'
+PEOPLE, MARKERS, OVERLAY = 'people', 'markers', 'overlay/compressed'
 
 
 def published_topic(topic: str) -> PublishedTopic:
@@ -168,7 +172,7 @@ class PeopleSession(TrackingSession):
     # Each person has those of `track_messages` besides, with the prefix of `track`.
     TOPICS: ClassVar[Mapping[str, PublishedTopic]] = {
         PEOPLE: PublishedTopic(PEOPLE_2D),
-        '/tf': TOPICS_OF_NODE['/tf'],
+        **{topic: TOPICS_OF_NODE[topic] for topic in ('/tf', MARKERS, OVERLAY)},
     }
     ESTIMATE = 'every track'
     CHECKED = ('background_file', 'body_model', 'lifter')
@@ -185,6 +189,8 @@ class PeopleSession(TrackingSession):
         self._scene: Silhouettes | None = None
         self._watch = SceneWatch()
         self._next, self._detected, self._begun = 1, 0, False
+        # Those of whom markers are shown.
+        self._marked: tuple[str, ...] = ()
 
     def restart(self, start: TrackStart | None = None) -> None:
         """See `TrackingSession`."""
@@ -231,8 +237,10 @@ class PeopleSession(TrackingSession):
             self._look_at_scene(waiting, self._scene.background, 'call ~/reset')
         yield from self._nearest_first(waiting, camera, own, left, detected is not None)
         self._drop_those_who_left(stamp)
-        if detected is not None and self._wanted(PEOPLE):
-            self._publish_people(waiting, camera)
+        if detected is not None:
+            if self._wanted(PEOPLE):
+                self._publish_people(waiting, camera)
+            self._show_people(waiting, camera)
         self._begun = True
 
     def _background_for(self, camera: Camera) -> BackgroundModel:
@@ -355,6 +363,47 @@ class PeopleSession(TrackingSession):
             people.append(DetectedPerson(person.person, keypoints, box))
         stamp, frame = waiting.stamp_ns, waiting.frame_id
         self._publish(PEOPLE, stamp, people_message(self._messages, people, stamp, frame))
+
+    def _show_people(self, waiting: WaitingImage, camera: Camera) -> None:
+        """Markers and an overlay with everybody, for those who look at them."""
+        stamp, frame = waiting.stamp_ns, waiting.frame_id
+        tracked = {x.person: x.tracker for x in self.tracks if x.begun and x.tracker is not None}
+        body = self.start.body
+        names, bones = body.joint_names, body.skeleton.bones
+        modes = {
+            person: (x.estimate.body.joint_positions(x.estimate.modes.poses), x.estimate.modes)
+            for person, x in tracked.items()
+        }
+        if self._wanted(MARKERS):
+            edges = [(names[a], names[b]) for a, b in bones]
+            nobody = np.empty((0, len(names), 3)), np.empty(0)
+            ranks = self.parameters.tracker.max_hypotheses
+            array = None
+            for person in dict.fromkeys((*self._marked, *modes)):
+                joints, weights = nobody
+                if person in modes:
+                    joints, weights = modes[person][0], np.exp(modes[person][1].log_weights)
+                own = skeleton_markers(
+                    self._messages, joints, names, edges, weights, stamp, frame,
+                    ranks=ranks, namespace=person,
+                )  # fmt: skip
+                if array is None:
+                    array = own
+                else:
+                    array.markers += own.markers
+            self._marked = tuple(modes)
+            if array is not None:
+                self._publish(MARKERS, stamp, array)
+        if self._wanted(OVERLAY):
+            picture = waiting.image
+            for joints, found in modes.values():
+                weights = np.exp(found.log_weights)
+                picture = draw_modes(picture, camera, joints, bones, weights, OVERLAY_MODES)
+            notes = [f'{len(modes)} of {self._detected} people', *notes_of(self.parameters)]
+            message = compressed_image_message(
+                self._messages, draw_notes(picture, notes), stamp, frame
+            )
+            self._publish(OVERLAY, stamp, message)
 
     # State.
 

@@ -160,7 +160,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
             posterior.weights,
             OVERLAY_MODES,
         )
-        drawn = draw_notes(drawn, _notes(p))
+        drawn = draw_notes(drawn, notes_of(p))
         yield 'overlay/compressed', compressed_image_message(MESSAGES, drawn, stamp, frame)
 
 
@@ -199,11 +199,11 @@ def nobody_messages(
         yield 'markers', markers
     if wanted('overlay/compressed'):
         why = tracker.estimate.reason or 'nobody is in view'
-        shown = draw_notes(waiting.image, [why, *_notes(p)])
+        shown = draw_notes(waiting.image, [why, *notes_of(p)])
         yield 'overlay/compressed', compressed_image_message(MESSAGES, shown, stamp, frame)
 
 
-def _notes(p: FilterParameters) -> list[str]:
+def notes_of(p: FilterParameters) -> list[str]:
     """What is missing, for those who look at the overlay."""
     sigma = p.focal_length_sigma
     return [f'no calibration: distances may be off by {sigma:.0%}'] if sigma else []

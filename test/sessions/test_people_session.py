@@ -11,7 +11,7 @@ from hmt_ros.sessions import track_start
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.image_inputs import DETECTIONS
-from hmt_ros.sessions.people_session import PEOPLE, PeopleSession, published_topic
+from hmt_ros.sessions.people_session import OVERLAY, PEOPLE, PeopleSession, published_topic
 from hmt_ros.sessions.tracking_parameters import PeopleParameters
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.beginning import Source
@@ -23,6 +23,7 @@ from msg_tools.messages.detections import (
     people_of_message,
 )
 from msg_tools.messages.headers import header_message
+from msg_tools.messages.images import decode_image
 from msg_tools.messages.keep_out import KEEP_OUT, keep_out_of
 from test.sessions.conftest import StubTracker
 
@@ -30,6 +31,7 @@ NAMES = (
     'left_shoulder', 'right_shoulder', 'left_hip', 'right_hip', 'left_knee', 'right_knee',
     'left_ankle', 'right_ankle',
 )  # fmt: skip
+IMAGE_TYPE = published_topic(OVERLAY).msgtype
 SHAPE = np.array([[3, -10], [-3, -10], [2, 0], [-2, 0], [2, 7], [-2, 7], [2, 14], [-2, 14.0]])
 
 
@@ -146,12 +148,35 @@ def test_two_people_have_topics_of_their_own(session, outputs, small_camera):
     assert first.silhouettes.background is second.silhouettes.background
 
 
+def test_everybody_is_shown_together_until_they_leave(session, outputs, small_camera):
+    one = started(session(), small_camera)
+    show(one, small_camera, 0, somebody_at(15), somebody_at(50))
+    for i in range(1, 7):
+        show(one, small_camera, i, somebody_at(15))
+    kind = published_topic('markers').msgtype
+    arrays = [deserialise(x.data, kind).markers for x in outputs if x.topic == 'markers']
+    # By person, the actions on their markers: 0 adds, 2 deletes.
+    actions = [
+        {name: {x.action for x in each if x.ns.startswith(name)} for name in ('p1', 'p2')}
+        for each in arrays
+    ]
+    assert actions[0] == {'p1': {0, 2}, 'p2': {0, 2}}
+    last = max(i for i, each in enumerate(actions) if each['p2'])
+    assert actions[last] == {'p1': {0, 2}, 'p2': {2}}
+    assert actions[-1] == {'p1': {0, 2}, 'p2': set()}
+    pictures = [deserialise(x.data, IMAGE_TYPE) for x in outputs if x.topic == OVERLAY]
+    assert len(pictures) == len(arrays) == 7
+    first, *_, final = map(decode_image, pictures)
+    assert cv2.absdiff(first, final).max() > 40
+
+
 def test_identities_stay_through_a_crossing(session, outputs, small_camera):
     one = started(session(), small_camera)
     for i in range(11):
         people = [somebody_at(12 + 4 * i), somebody_at(52 - 4 * i)]
         show(one, small_camera, i, *(people if i % 2 else people[::-1]))
-    found = people_of_message(deserialise(outputs[-1].data, PEOPLE_2D), 0.0)
+    last = [x for x in outputs if x.topic == PEOPLE][-1]
+    found = people_of_message(deserialise(last.data, PEOPLE_2D), 0.0)
     columns = {x.name: float(np.nanmean(x.keypoints.pixels[:, 0])) for x in found}
     # In the first image the second one came first.
     assert columns['p1'] == pytest.approx(12, abs=4)
