@@ -25,6 +25,7 @@ import numpy as np
 
 from hmt_ros.body import Camera
 from hmt_ros.body.camera_pose import CameraPose
+from hmt_ros.core import elementary
 from hmt_ros.image.association import (
     GATE,
     ImageTrack,
@@ -382,7 +383,7 @@ class PeopleSession(TrackingSession):
             for person in dict.fromkeys((*self._marked, *modes)):
                 joints, weights = nobody
                 if person in modes:
-                    joints, weights = modes[person][0], np.exp(modes[person][1].log_weights)
+                    joints, weights = modes[person][0], elementary.exp(modes[person][1].log_weights)
                 own = skeleton_markers(
                     self._messages, joints, names, edges, weights, stamp, frame,
                     ranks=ranks, namespace=person,
@@ -397,7 +398,7 @@ class PeopleSession(TrackingSession):
         if self._wanted(OVERLAY):
             picture = waiting.image
             for joints, found in modes.values():
-                weights = np.exp(found.log_weights)
+                weights = elementary.exp(found.log_weights)
                 picture = draw_modes(picture, camera, joints, bones, weights, OVERLAY_MODES)
             notes = [f'{len(modes)} of {self._detected} people', *notes_of(self.parameters)]
             message = compressed_image_message(
