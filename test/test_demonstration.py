@@ -79,7 +79,7 @@ def test_it_leaves_a_bag_and_a_report(output):
 
 
 def told(printed):
-    """What is told of the poses, by its name, and the other lines."""
+    """The values about the poses, by name, and the other lines."""
     head, table, rest = printed.split('\n\n', 2)
     rows = {line[:60].strip(): line[60:] for line in table.splitlines()}
     return rows, [*head.splitlines(), *rest.splitlines()]

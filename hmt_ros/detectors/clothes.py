@@ -1,4 +1,4 @@
-"""The colours of a person's clothes, torso and legs apart, by which people are told apart.
+"""The colours of a person's clothes, torso and legs apart, which tell people apart.
 
 A part is the area between its landmarks: the quadrangle of shoulders and hips, and limbs as wide as
 a share of the trunk is long. Its colours are a histogram; two parts differ by Hellinger's distance
@@ -13,14 +13,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.core import bin_colours, count_colours
+from hmt_ros.core import count_colours
+from hmt_ros.image.person_colours import BINS, binned
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image
 
 TORSO = ('left_shoulder', 'right_shoulder', 'right_hip', 'left_hip')
 LEGS = (('left_hip', 'left_knee', 'left_ankle'), ('right_hip', 'right_knee', 'right_ankle'))
-# Bins of a channel; the fewest pixels of a part; the width of a leg over the length of the trunk.
-BINS, FEWEST, WIDTH = 8, 40, 0.22
+# The fewest pixels of a part; the width of a leg over the length of the trunk.
+FEWEST, WIDTH = 40, 0.22
 # Visibility from which a landmark counts; side to which a person is reduced, px.
 VISIBLE, SIDE = 0.5, 96
 
@@ -60,14 +61,12 @@ class Clothes:
                     cv2.polylines(labels, [places(leg)], False, 2, wide)
             if all(seen[x] for x in TORSO):
                 cv2.fillConvexPoly(labels, cv2.convexHull(trunk), 1)
-            bins = np.empty(small.shape[:2], np.uint16)
-            bin_colours(np.ascontiguousarray(small), BINS, bins)
-            count_colours(bins, labels, counts)
+            count_colours(binned(np.asarray(small, np.uint8)), labels, counts)
         sizes = counts[1:].sum(1, keepdims=True)
         return cls(np.where(sizes >= FEWEST, counts[1:] / np.maximum(sizes, 1), np.nan))
 
     def distance(self, other: Clothes) -> float:
-        """Mean distance of the parts that both have, 0 to 1; NaN: there is none."""
+        """Mean distance of the parts that both have, 0 to 1; NaN without such a part."""
         each = 1.0 - np.sqrt(self.shares * other.shares).sum(1)
         return float(np.nanmean(each)) if np.isfinite(each).any() else np.nan
 

@@ -190,7 +190,7 @@ class PeopleSession(TrackingSession):
         self._scene: Silhouettes | None = None
         self._watch = SceneWatch()
         self._next, self._detected, self._begun = 1, 0, False
-        # Those of whom markers are shown.
+        # People whose markers are shown.
         self._marked: tuple[str, ...] = ()
 
     def restart(self, start: TrackStart | None = None) -> None:
@@ -367,6 +367,8 @@ class PeopleSession(TrackingSession):
 
     def _show_people(self, waiting: WaitingImage, camera: Camera) -> None:
         """Markers and an overlay with everybody, for those who look at them."""
+        if not (self._wanted(MARKERS) or self._wanted(OVERLAY)):
+            return
         stamp, frame = waiting.stamp_ns, waiting.frame_id
         tracked = {x.person: x.tracker for x in self.tracks if x.begun and x.tracker is not None}
         body = self.start.body

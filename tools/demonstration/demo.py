@@ -39,7 +39,7 @@ from msg_tools import BagReader
 JOINTS = tuple(name for name in EVALUATED_JOINTS if name != 'neck')
 REPORT = 'report'
 RESULTS = Path(__file__).resolve().parents[2] / 'benchmarks' / 'results' / 'tracking.md'
-# What is told.
+# Names of the lines.
 DETECTORS, OURS, SMOOTHED = (
     "error of the detector's own 3D",
     'error of the most probable pose',
