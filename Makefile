@@ -78,7 +78,9 @@ soak:
 figures:
 	@$(WORKSPACE) ros test core build
 	@$(WITH_DETECTOR)
+	@mkdir -p build/demo
 	@$(SOURCED) for papers in sampling smoothing experts; do python docs/figures_$$papers.py; done
+	@$(SOURCED) python tools/demonstration/demo.py bags/living_room -o build/demo --live && python docs/figures_demonstration.py
 
 learn:
 	@$(WORKSPACE) ros test core build

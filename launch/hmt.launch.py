@@ -395,7 +395,10 @@ def _installed(package: str, argument: str) -> str:
     try:
         get_package_share_directory(package)
     except LookupError:
-        raise ValueError(f'{argument}: package {package} is not installed') from None
+        raise ValueError(
+            f'{argument}: package {package} is not installed; run "sudo apt install '
+            f'ros-jazzy-{package.replace("_", "-")}", or start without {argument}'
+        ) from None
     return package
 
 

@@ -82,6 +82,7 @@ def told(printed):
     """The values about the poses, by name, and the other lines."""
     head, table, rest = printed.split('\n\n', 2)
     rows = {line[:60].strip(): line[60:] for line in table.splitlines()}
+    assert rows.pop('') == 'all images'
     return rows, [*head.splitlines(), *rest.splitlines()]
 
 

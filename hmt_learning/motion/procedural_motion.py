@@ -101,6 +101,20 @@ def procedural_motion(
     """
     if name not in PROCEDURAL_MOTIONS:
         raise ValueError(f'no motion {name!r}: wanted one of {sorted(PROCEDURAL_MOTIONS)}')
+    rng = np.random.default_rng([seed, sorted(PROCEDURAL_MOTIONS).index(name)])
+    return poses_of(PROCEDURAL_MOTIONS[name], body, duration, fps, rng, heading, viewpoint)
+
+
+def poses_of(
+    motion: Motion,
+    body: Body,
+    duration: float,
+    fps: float,
+    rng: np.random.Generator,
+    heading: float | None = None,
+    viewpoint: Viewpoint | None = None,
+) -> Array:
+    """Poses (T, d) of any motion; arguments, result and errors are those of `procedural_motion`."""
     if not (np.isfinite(duration) and np.isfinite(fps) and fps > 0 and duration * fps >= 1):
         raise ValueError(f'a motion needs one frame at least, saw {duration} s at {fps} fps')
     missing = {'root_tx', 'root_z', 'left_shoulder_z', 'left_knee'} - set(body.dof_names)
@@ -112,8 +126,7 @@ def procedural_motion(
     fine = int(np.ceil(PLANNING_RATE / fps))
     margin = int(np.ceil(MARGIN * fps))
     time = np.arange(-margin * fine, (frames + margin) * fine) / (fps * fine)
-    rng = np.random.default_rng([seed, sorted(PROCEDURAL_MOTIONS).index(name)])
-    plan = PROCEDURAL_MOTIONS[name](body, time, duration, heading, rng)
+    plan = motion(body, time, duration, heading, rng)
     chosen = slice(margin * fine, (margin + frames) * fine, fine)
     return _poses(body, plan, fps * fine, chosen, viewpoint)
 
@@ -165,8 +178,8 @@ def walk(
     forth, back = (
         arm_posture(
             body,
-            [_hanging(forwards, 9 * DEGREE * sign) for sign in SIGNS],
-            [_hanging(forwards + bend, 4 * DEGREE * sign) for sign in SIGNS],
+            [hanging(forwards, 9 * DEGREE * sign) for sign in SIGNS],
+            [hanging(forwards + bend, 4 * DEGREE * sign) for sign in SIGNS],
         )
         for forwards, bend in ((swing, 30 * DEGREE), (-swing, 14 * DEGREE))
     )
@@ -183,8 +196,8 @@ def reach(
     scale, facing = body.scale, 20 * DEGREE if heading is None else heading
     rest = arm_posture(
         body,
-        [_hanging(4 * DEGREE, 9 * DEGREE * sign) for sign in SIGNS],
-        [_hanging(24 * DEGREE, 4 * DEGREE * sign) for sign in SIGNS],
+        [hanging(4 * DEGREE, 9 * DEGREE * sign) for sign in SIGNS],
+        [hanging(24 * DEGREE, 4 * DEGREE * sign) for sign in SIGNS],
     )
     times, postures = [-10.0, 0.15], [rest | dict.fromkeys(BENDING, 0.0)] * 2
     kinds: list[str] = []
@@ -199,7 +212,7 @@ def reach(
         arrival = times[-1] + rng.uniform(1.0, 1.35)
         times += [arrival, arrival + rng.uniform(0.05, 0.25)]
         postures += [posture, posture]
-    angles = _between(time, times, postures)
+    angles = between(time, times, postures)
     angles['root_z'] = np.full(len(time), facing)
     # As the head goes forwards the pelvis goes back.
     back = -0.22 * scale * np.sin(-angles['root_x'])
@@ -274,19 +287,19 @@ def dance(
     postures = [reaching_posture(body, None, {}, DANCING_WRISTS, rng)]
     for _ in times[1:]:
         postures.append(reaching_posture(body, postures[-1], {}, DANCING_WRISTS, rng))
-    return pelvis, angles | _between(clock, times, postures), feet
+    return pelvis, angles | between(clock, times, postures), feet
 
 
 PROCEDURAL_MOTIONS: dict[str, Motion] = {'walk': walk, 'reach': reach, 'dance': dance}
 
 
-def _hanging(forwards: float, outwards: float) -> Array:
+def hanging(forwards: float, outwards: float) -> Array:
     """Direction of an arm that hangs, turned forwards, and to the right, rad."""
     flat = np.cos(outwards)
     return np.array([np.sin(outwards), flat * np.sin(forwards), -flat * np.cos(forwards)])
 
 
-def _between(time: Array, times: list[float], postures: list[Posture]) -> dict[str, Array]:
+def between(time: Array, times: list[float], postures: list[Posture]) -> dict[str, Array]:
     """Angles (T,) that go from posture to posture."""
     return {name: rests(time, times, [p[name] for p in postures]) for name in postures[0]}
 

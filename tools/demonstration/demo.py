@@ -3,9 +3,9 @@
     python tools/demonstration/demo.py bags/reach -o build/demo --live
 
 Errors are those of the joints of the arms and legs that the detector has, with the middle of the
-hips in its true place. Beside them stand how often the truth lies in the region that shall hold it
-with 90 %, how often nobody is said to be there though somebody is, and the mean over the clips of
-other people, from `benchmarks/results`.
+hips in its true place, over the images in which both have an answer. Beside them stand how often
+the truth lies in the region that shall hold it with 90 %, how often nobody is said to be
+there though somebody is, and the mean over the clips of other people, from `benchmarks/results`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -89,16 +89,15 @@ class _Poses:
         """The poses of the mixtures on a topic."""
         return _Poses(layer.joint_names, {t: x.joints for t, x in layer.mixtures.items()})
 
-    def errors(self, truth: Truth) -> Array:
-        """Mean errors (T, 2) of the heaviest pose and of the best, mm."""
+    def errors(self, truth: Truth, stamps: Iterable[int]) -> Array:
+        """Errors (T,) of the heaviest pose at some stamps, mm: means over joints."""
         joints = [x for x in JOINTS if x in self.names and x in truth.joint_names]
         result = []
-        for stamp in sorted(self.joints.keys() & truth.joints.keys()):
-            own = relative_positions(self.joints[stamp], self.names, joints, HIPS)
+        for stamp in stamps:
+            own = relative_positions(self.joints[stamp][:1], self.names, joints, HIPS)
             true = relative_positions(truth.joints[stamp], truth.joint_names, joints, HIPS)
-            each = 1e3 * np.linalg.norm(own - true, axis=-1).mean(-1)
-            result.append((each[0], each.min()))
-        return np.array(result).reshape(-1, 2)
+            result.append(1e3 * np.linalg.norm(own[0] - true, axis=-1).mean())
+        return np.array(result)
 
 
 def _demonstrate(arguments: argparse.Namespace) -> int:
@@ -121,13 +120,23 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
         ReportOptions(target, page, overwrite=True, images=source, truth=truth)
     )
     if shown.truth is not None:
-        print('\n'.join(('', *_told(shown, shown.truth, rate), *_told_of_clips())))
+        scenes = _scenes(source / 'truth.npz')
+        print('\n'.join(('', *_told(shown, shown.truth, rate, scenes), *_told_of_clips())))
     print(f'\nresults\n{target}: bag with {", ".join(_topics(target))}\n{written}')
     print(f'\nopen in a browser: {page / PAGE}')
     return 0
 
 
-def _told(shown: Content, truth: Truth, rate: float) -> Iterator[str]:
+def _scenes(truth: Path) -> dict[str, int]:
+    """What is done, and until which stamp; one scene where nothing says so."""
+    if truth.is_file():
+        with np.load(truth) as content:
+            if {'scenes', 'until'} <= {*content}:
+                return dict(zip(content['scenes'].tolist(), content['until'].tolist()))
+    return {'all images': np.iinfo(np.int64).max}
+
+
+def _told(shown: Content, truth: Truth, rate: float, scenes: dict[str, int]) -> Iterator[str]:
     """How far poses are off, how well that is known, and how fast they came."""
     found = {layer.kind: _Poses.of(layer) for layer in shown.mixtures.layers if layer.joint_names}
     poses = {OURS: found['posterior']}
@@ -136,8 +145,15 @@ def _told(shown: Content, truth: Truth, rate: float) -> Iterator[str]:
         poses = {DETECTORS: _Poses(shown.detector.joint_names, joints), **poses}
     if 'smoothed' in found:
         poses[SMOOTHED] = found['smoothed']
+    # All at the images in which each has an answer.
+    common = sorted(truth.joints.keys() & set.intersection(*({*x.joints} for x in poses.values())))
+    parts = np.split(np.array(common), np.searchsorted(common, [*scenes.values()])[:-1])
+    names = ''.join(f'{name:20s}' for name in scenes)
+    yield _row('', names.rstrip())
     for what, each in poses.items():
-        yield _row(what, f'{each.errors(truth)[:, 0].mean():.0f} mm')
+        errors = (each.errors(truth, part.tolist()) for part in parts)
+        found = (f'{x.mean():.0f} mm' if len(x) else '-' for x in errors)
+        yield _row(what, ''.join(f'{x:20s}' for x in found).rstrip())
     scores = next(iter(shown.scores.values())).scores.summary()
     yield _row(REGIONS, f'{100 * scores["joint_coverage_90"]:.0f} %')
     wrong = [t for t in shown.mixtures.empty if t in truth.joints]

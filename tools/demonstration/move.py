@@ -1,6 +1,6 @@
-"""Moves the avatar by a motion of this package, with an own body of the avatar's lengths.
+"""Moves the avatar through the scenes, led by an own body of the avatar's lengths.
 
-    python move.py MPFB2 MOTION SEED SECONDS OUT.npz
+    python move.py MPFB2 OUT.npz
 
 OUT gets the vertices of all images in the world, z up, the true joints, the camera, and the poses
 of the body that led the avatar.
@@ -14,14 +14,15 @@ from pathlib import Path
 
 import numpy as np
 from avatar import Avatar
+from scenes import DESK, SCENES, SEAT, SECONDS, STOOL, demonstration
 from scipy.spatial.transform import Rotation
 
-from hmt_learning.motion.procedural_motion import procedural_motion
+from hmt_learning.motion.procedural_motion import poses_of
 from hmt_learning.motion.viewpoint import Viewpoint
 from hmt_ros.body import load_body
 from hmt_ros.body.kinematics import forward
 
-FPS = 15.0
+FPS = 10.0
 SOLE = 0.012  # m, of a shoe
 WIDTH, HEIGHT = 480, 360
 HALF_ANGLE = np.radians(24.0)  # of view, horizontal
@@ -44,9 +45,9 @@ BONES = {
 def main(argv: list[str]) -> int:
     """Writes the motion of the avatar."""
     avatar = Avatar(Path(argv[0]))
-    motion, seed, seconds = argv[1], int(argv[2]), float(argv[3])
     body = load_body('human37').with_segment_lengths(lengths_of(avatar))
-    poses = procedural_motion(motion, body, seconds, FPS, seed, viewpoint=VIEWPOINT)
+    rng = np.random.default_rng(0)
+    poses = poses_of(demonstration, body, SECONDS, FPS, rng, viewpoint=VIEWPOINT)
     turns = turns_of(avatar, body.skeleton.segment_names, body, poses)
     heads = heads_of(avatar, turns)
     hips = VIEWPOINT.to_world(body.joint_positions(poses))[
@@ -66,14 +67,18 @@ def main(argv: list[str]) -> int:
     joints = {joint: heads[bone] for joint, bone in BONES.items()}
     joints['neck'] = 0.5 * (heads['LeftShoulder'] + heads['RightShoulder'])
     np.savez_compressed(
-        argv[4],
+        argv[1],
         vertices=(vertices + up).astype(np.float32),
         joint_names=np.array(body.joint_names),
         joints=np.stack([joints[name] for name in body.joint_names], axis=1) + up,
         poses=poses,
         lengths=np.array([body.segment_lengths[x] for x in body.skeleton.length_names]),
-        motion=motion,
+        motion='demonstration',
         fps=FPS,
+        scenes=[*SCENES],
+        until=[*SCENES.values()],
+        desk=DESK,
+        stool=[*STOOL, SEAT],
         size=[WIDTH, HEIGHT],
         half_angle=HALF_ANGLE,
         rotation=VIEWPOINT.rotation,

@@ -44,6 +44,9 @@ def main(argv: list[str]) -> int:
     viewpoint = Viewpoint(*motion['place'].tolist())
     joints = viewpoint.to_camera(motion['joints'])
     stamps = START_NS + np.round(np.arange(len(joints)) * 1e9 / motion['fps']).astype(np.int64)
+    pixels = camera.project(joints)
+    # Where no joint is in the image nobody is.
+    seen = ((pixels > -0.5) & (pixels < np.array([width, height]) - 0.5)).all(2).any(1)
     messages, detector, rng = RosbagsMessages(), BlazePose(), np.random.default_rng(0)
     with BagWriter(target) as bag:
         write_camera_place(bag, messages, viewpoint, START_NS)
@@ -58,24 +61,27 @@ def main(argv: list[str]) -> int:
             bag.write('camera_info', stamp, info)
             found = detector.detect(decode_image(message), stamp)
             if found is not None:
-                seen = keypoints_message(messages, found, stamp, FRAME_ID)
-                bag.write('keypoints', stamp, seen)
+                keypoints = keypoints_message(messages, found, stamp, FRAME_ID)
+                bag.write('keypoints', stamp, keypoints)
                 lifted = positions_message(messages, found, stamp, FRAME_ID)
                 bag.write('keypoints_3d', stamp, lifted)
-            true = ground_truth(messages, body, motion['poses'][number], joints[number], stamp)
-            bag.write('ground_truth', stamp, true)
+            if seen[number]:
+                true = ground_truth(messages, body, motion['poses'][number], joints[number], stamp)
+                bag.write('ground_truth', stamp, true)
     take = Take(str(motion['motion']), body, motion['poses'], float(motion['fps']))
-    subject = subject_text(take, camera, camera.project(joints[:1])[0], 0)
+    subject = subject_text(take, camera, pixels[0], 0)
     (target / 'subject.yaml').write_text(subject, 'utf-8')
     cv2.imwrite(str(target / 'background.png'), empty)
     np.savez_compressed(
         target / 'truth.npz',
         stamps=stamps,
         joint_names=motion['joint_names'],
-        joints=joints,
-        pixels=camera.project(joints),
+        joints=np.where(seen[:, None, None], joints, np.nan),
+        pixels=pixels,
         K=camera.matrix,
         fps=motion['fps'],
+        scenes=motion['scenes'],
+        until=stamps[0] + np.round(motion['until'] * 1e9).astype(np.int64),
         gravity=np.tile(true_gravity(viewpoint), (len(joints), 1)),
         camera_height=np.full(len(joints), viewpoint.height),
     )

@@ -24,7 +24,7 @@ def main(argv: list[str]) -> int:
     """Renders all images of a motion."""
     avatar, motion, folder = Avatar(Path(argv[0])), np.load(argv[1]), Path(argv[2])
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    furnish(np.random.default_rng(SEED))
+    furnish(np.random.default_rng(SEED), motion)
     light()
     parts = dress(avatar)
     settings(motion)
@@ -160,7 +160,7 @@ def cylinder(radius, height, place, look, top=None) -> None:
     bpy.ops.object.shade_smooth()
 
 
-def furnish(rng: np.random.Generator) -> None:
+def furnish(rng: np.random.Generator, motion) -> None:
     """A living room: floor, walls, shelf with books, sofa, picture, plant, rug and table."""
     bpy.ops.mesh.primitive_plane_add(size=14)
     bpy.context.object.data.materials.append(boards())
@@ -210,6 +210,17 @@ def furnish(rng: np.random.Generator) -> None:
         for y in (-0.5, 0.1):
             box((0.05, 0.05, 0.44), (x, y, 0.22), dark)
     cylinder(0.04, 0.1, (2.2, -0.1, 0.52), white)
+    # The desk has a front that hides legs.
+    (x, y), wide, deep = motion['desk'].tolist(), 1.1, 0.6
+    box((wide, deep, 0.03), (x, y, 0.735), oak, bevel=0.005)
+    box((wide - 0.06, 0.02, 0.56), (x, y + 0.24, 0.44), oak, bevel=0)
+    for side in (-0.53, 0.53):
+        box((0.03, 0.56, 0.72), (x + side, y, 0.36), oak, bevel=0)
+    x, y, seat = motion['stool'].tolist()
+    cylinder(0.17, 0.04, (x, y, seat - 0.02), dark)
+    for aside in (-0.1, 0.1):
+        for ahead in (-0.1, 0.1):
+            cylinder(0.015, seat - 0.04, (x + aside, y + ahead, 0.5 * seat - 0.02), dark)
 
 
 def light() -> None:

@@ -205,7 +205,7 @@ def test_bags_of_the_repository(tmp_path, content):
         f'bags/{folder.name}' for folder in (ROOT / 'bags').iterdir() if folder.is_dir()
     )
     for name in rendered:
-        assert sum(path.stat().st_size for path in (ROOT / name).iterdir()) < 2_000_000
+        assert sum(path.stat().st_size for path in (ROOT / name).iterdir()) < 3_000_000
     for line in lines:
         arguments = line[line.index('make-bag') + 1 :]
         kept = ROOT / arguments[arguments.index('-o') + 1]
