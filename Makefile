@@ -4,6 +4,7 @@
 # make clean  restores the state of a clone            make detector  MediaPipe Pose alone
 # make core   compiles the core of the sources         make sanitize  its tests, with sanitizers
 # make learn  learns everything again from DATA=...   make figures  those of the papers, in docs/
+# make camera VIDEO=/dev/video0 FOV=65 PEOPLE=1: tracks who is there, and shows it in RViz
 #
 # Each works as the first command after a clone: it installs its requirements into .venv and builds
 # the packages once. See CONTRIBUTING.md.
@@ -11,7 +12,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -e -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup core detector demo test lint sanitize bench soak learn figures clean lock
+.PHONY: help setup core detector demo camera test lint sanitize bench soak learn figures clean lock
 
 # Small matrices: a second BLAS thread costs more than it saves.
 export OMP_NUM_THREADS := 1
@@ -26,6 +27,9 @@ TEST_PROCESSES ?= 2
 SOAK_MINUTES ?= 10
 CORE := hmt_ros/core
 DATA ?= $(or $(HMT_SHARED),../shared)
+VIDEO ?= /dev/video0
+FOV ?=
+PEOPLE ?= 1
 DEMO_BAG ?= $(patsubst %/metadata.yaml,%,$(firstword $(wildcard bags/*/metadata.yaml)))
 
 help:
@@ -47,6 +51,11 @@ demo:
 	@rm -rf build/demo && mkdir -p build/demo
 	@echo 'starting the demonstration'
 	@$(SOURCED) python tools/demonstration/demo.py $(DEMO_BAG) -o build/demo --live
+
+camera:
+	@$(WORKSPACE) ros core build
+	@$(WITH_DETECTOR)
+	@tools/camera.sh $(VIDEO) "$(FOV)" $(PEOPLE)
 
 test:
 	@$(WORKSPACE) ros test core build

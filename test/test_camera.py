@@ -1,0 +1,69 @@
+"""tools/camera.sh: from a video file to tracked people, without launch files."""
+
+import os
+import subprocess
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import pytest
+
+from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
+from msg_tools import BagReader
+from msg_tools.messages.images import decode_image
+
+ROOT = Path(__file__).parent.parent
+DETECTOR = DETECTORS[USUAL_DETECTOR]
+
+
+@pytest.fixture(scope='module')
+def video(tmp_path_factory):
+    """Three seconds of the demonstration."""
+    path = tmp_path_factory.mktemp('camera') / 'room.avi'
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 10, (480, 360))
+    with BagReader(ROOT / 'bags' / 'living_room') as bag:
+        for stored in islice(bag.messages(['image/compressed']), 30):
+            writer.write(decode_image(stored.message))
+    writer.release()
+    return path
+
+
+def camera(*arguments, domain):
+    return subprocess.run(
+        [ROOT / 'tools' / 'camera.sh', *arguments],
+        env=os.environ | {'ROS_DOMAIN_ID': str(domain), 'ROS_FROM_APT': '/nowhere'},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.skipif(not DETECTOR.is_installed(), reason=f'{DETECTOR.title} is not installed')
+@pytest.mark.skipif(not (ROOT / 'install').is_dir(), reason='the packages are not built')
+@pytest.mark.parametrize(
+    ('options', 'node', 'domain'),
+    [(['51'], 'humans.bodies.p1.filter_node', 71), (['', '2'], 'people_node', 72)],
+)
+def test_people_in_a_video_are_tracked_until_it_ends(video, options, node, domain):
+    done = camera(video, *options, domain=domain)
+    assert done.returncode == 0, done.stderr
+    assert '30 images shown; the file is over' in done.stderr
+    assert any(f'[{node}]' in x and 'track 1 starts' in x for x in done.stderr.splitlines())
+    assert 'RViz is not in /nowhere (sudo apt install ros-jazzy-rviz2)' in done.stderr
+    assert 'Traceback' not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['nothing.mp4'], 'camera: nothing.mp4 is not there: wanted a webcam such as /dev/video0'),
+        ([__file__, '60', 'all'], 'camera: PEOPLE: wanted a number from 1 to 20, saw all'),
+        ([], 'usage: tools/camera.sh VIDEO [FOV [PEOPLE]]'),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_line(arguments, message):
+    done = camera(*arguments, domain=73)
+    assert done.returncode == 1
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
