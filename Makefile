@@ -84,12 +84,9 @@ soak:
 	@$(WORKSPACE) ros test core build
 	@$(SOURCED) python -m benchmarks soak --minutes $(SOAK_MINUTES) $(ARGS)
 
-figures:
-	@$(WORKSPACE) ros test core build
-	@$(WITH_DETECTOR)
-	@mkdir -p build/demo
-	@$(SOURCED) for papers in sampling smoothing experts; do python docs/figures_$$papers.py; done
-	@$(SOURCED) python tools/demonstration/demo.py bags/living_room -o build/demo --live && python docs/figures_demonstration.py
+figures: demo
+	@$(WORKSPACE) test
+	@$(SOURCED) for papers in sampling smoothing experts demonstration; do python docs/figures_$$papers.py; done
 
 learn:
 	@$(WORKSPACE) ros test core build

@@ -14,12 +14,12 @@ from typing import Any
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
+from body_pictures import add_skeleton
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 
 from hmt_ros.app.report.mixtures import Layer, Moment, read_mixtures
-from hmt_ros.app.report.skeletons import STYLE, bones_of
+from hmt_ros.app.report.skeletons import STYLE, bones_of, save_picture
 from hmt_ros.app.truth import read_truth
 from hmt_ros.inference.arrays import Array
 from msg_tools import BagReader
@@ -32,7 +32,7 @@ MOMENT, AFTER = 1.4, 1.9  # s
 WRIST, BODY = 'right_wrist', 'neck'
 FIRST, LAST = 0.8, 6.0  # s, of the animation
 SIDE = 260  # px, width of the view from the side in it
-GREY = '#8a8a8a'
+GREY = '#cccccc'
 
 
 def main() -> int:
@@ -65,7 +65,12 @@ def nearest(stamps: Any, seconds: float) -> int:
 def draw_picture(layers: dict[Any, Layer[Moment]], images: dict[int, Array], truth: Any) -> None:
     """`docs/overview.png`."""
     figure, axes = plt.subplots(
-        1, 5, figsize=(12.6, 3.9), width_ratios=[1.0, 0.85, 0.85, 1.0, 0.85], layout='constrained'
+        1,
+        5,
+        figsize=(12.6, 3.9),
+        width_ratios=[1.0, 0.85, 0.85, 1.0, 0.85],
+        layout='constrained',
+        dpi=110,
     )
     posterior, smoothed = layers['posterior'], layers['smoothed']
     stamp, later = (nearest(posterior.mixtures, x) for x in (MOMENT, AFTER))
@@ -82,7 +87,7 @@ def draw_picture(layers: dict[Any, Layer[Moment]], images: dict[int, Array], tru
     share = after.joints[:, names.index(WRIST), 2] < after.joints[:, names.index(BODY), 2]
     axes[4].set_title(f'{100 * float(after.weights[share].sum()):.0f} %: in front')
     show_side(axes[4], smoothed.joint_names, after.joints[0], truth, later)
-    figure.savefig(ROOT / 'docs' / 'overview.png', dpi=110)
+    save_picture(figure, ROOT / 'docs' / 'overview.png')
     plt.close(figure)
 
 
@@ -96,20 +101,12 @@ def show_image(axes: Axes, image: Array, title: str) -> None:
 def show_side(axes: Axes, names: tuple[str, ...], joints: Array, truth: Any, stamp: int) -> None:
     """A pose and, wide and grey, the true one, pelvis on pelvis; the camera is to the right."""
     true = truth.joints[stamp]
-    for own, which, solid in ((truth.joint_names, true, False), (names, joints, True)):
-        middle = which[own.index('pelvis')]
-        for a, b, usual in bones_of(own):
-            colour = usual if solid else GREY
-            line = [(-(which[i, 2] - middle[2]), -(which[i, 1] - middle[1])) for i in (a, b)]
-            axes.add_collection(
-                LineCollection(
-                    [line],
-                    colors=colour,
-                    linewidths=3.0 if solid else 7.0,
-                    capstyle='round',
-                    alpha=1.0 if solid else 0.4,
-                )
-            )
+    for own, which, colour, width in (
+        (truth.joint_names, true, GREY, 7.0),
+        (names, joints, None, 3.0),
+    ):
+        flat = (which[own.index('pelvis')] - which)[:, [2, 1]]
+        add_skeleton(axes, flat, own, colour, width)
     axes.set_xlim(-0.55, 0.75)
     axes.set_ylim(-1.1, 0.95)
     axes.set_aspect('equal')

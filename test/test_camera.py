@@ -28,10 +28,10 @@ def video(tmp_path_factory):
     return path
 
 
-def camera(*arguments, domain):
+def camera(*arguments):
     return subprocess.run(
         [ROOT / 'tools' / 'camera.sh', *arguments],
-        env=os.environ | {'ROS_DOMAIN_ID': str(domain), 'ROS_FROM_APT': '/nowhere'},
+        env=os.environ | {'ROS_FROM_APT': '/nowhere'},
         capture_output=True,
         text=True,
         timeout=120,
@@ -42,15 +42,24 @@ def camera(*arguments, domain):
 @pytest.mark.skipif(not DETECTOR.is_installed(), reason=f'{DETECTOR.title} is not installed')
 @pytest.mark.skipif(not (ROOT / 'install').is_dir(), reason='the packages are not built')
 @pytest.mark.parametrize(
-    ('options', 'node', 'domain'),
-    [(['51'], 'humans.bodies.p1.filter_node', 71), (['', '2'], 'people_node', 72)],
+    ('options', 'node'), [(['51'], 'humans.bodies.p1.filter_node'), (['', '2'], 'people_node')]
 )
-def test_people_in_a_video_are_tracked_until_it_ends(video, options, node, domain):
-    done = camera(video, *options, domain=domain)
+def test_people_in_a_video_are_tracked_until_it_ends(video, options, node):
+    done = camera(video, *options)
     assert done.returncode == 0, done.stderr
     assert '30 images shown; the file is over' in done.stderr
     assert any(f'[{node}]' in x and 'track 1 starts' in x for x in done.stderr.splitlines())
     assert 'RViz is not in /nowhere (sudo apt install ros-jazzy-rviz2)' in done.stderr
+    assert 'unknown parameter' not in done.stderr
+    assert 'Traceback' not in done.stderr
+
+
+@pytest.mark.skipif(not (ROOT / 'install').is_dir(), reason='the packages are not built')
+def test_a_camera_that_fails_ends_all():
+    done = camera(__file__)
+    assert done.returncode == 1
+    assert 'camera_node: ' in done.stderr
+    assert 'is not a video' in done.stderr
     assert 'Traceback' not in done.stderr
 
 
@@ -63,7 +72,7 @@ def test_people_in_a_video_are_tracked_until_it_ends(video, options, node, domai
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(arguments, message):
-    done = camera(*arguments, domain=73)
+    done = camera(*arguments)
     assert done.returncode == 1
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1

@@ -228,10 +228,9 @@ def stamp_of(message):
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-@pytest.fixture(scope='module')
-def demonstration(tmp_path_factory):
-    """The bag of the demonstration, tracked."""
-    source, target = ROOT / 'bags' / 'living_room', tmp_path_factory.mktemp('demo') / 'tracked'
+def tracked(name, folder):
+    """A bag of the repository, tracked."""
+    source, target = ROOT / 'bags' / name, folder / 'tracked'
     options = ReplayOptions(
         subject=source / 'subject.yaml',
         background=source / 'background.png',
@@ -240,6 +239,24 @@ def demonstration(tmp_path_factory):
     )
     replay_bag(source, target, options, tell=print)
     return target
+
+
+@pytest.fixture(scope='module')
+def demonstration(tmp_path_factory):
+    return tracked('living_room', tmp_path_factory.mktemp('demo'))
+
+
+def test_raised_hands_are_seen(tmp_path):
+    """Of somebody who has a hand above the head in 12 of 60 images."""
+    with BagReader(tracked('reach', tmp_path)) as bag:
+        mixtures = [x.message for x in bag.messages(['pose_mixture'])]
+    with np.load(ROOT / 'bags' / 'reach' / 'truth.npz') as truth:
+        names, joints = list(truth['joint_names']), truth['joints']
+    hands = joints[:, [names.index(x) for x in ('left_wrist', 'right_wrist')], 1]
+    above = hands.min(1) < joints[:, names.index('head'), 1]
+    raised = example('raised_hand')['raised_hand']
+    wrong = np.array([raised(x) > 0.5 for x in mixtures]) != above
+    assert (above.sum(), wrong.sum() <= 3) == (12, True), wrong.sum()
 
 
 def test_examples_tell_what_the_demonstration_shows(demonstration):

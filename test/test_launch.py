@@ -102,15 +102,20 @@ def description():
     return with_stand_ins(FILE)
 
 
+def defaults(description):
+    """All arguments of a launch file, by name."""
+    *declared, _ = description['generate_launch_description']().arguments[0]
+    return {one.arguments[0]: one.options['default_value'] for one in declared}
+
+
 @pytest.fixture
 def actions(description, tmp_path, monkeypatch):
     """Makes the options of all actions, by their executable."""
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
 
     def make(**given):
-        entities = description['generate_launch_description']().arguments[0]
-        *declared, function = entities
-        context = {one.arguments[0]: one.options['default_value'] for one in declared}
+        function = description['generate_launch_description']().arguments[0][-1]
+        context = defaults(description)
         assert given.keys() <= context.keys()
         # One by one, unless a test is about the process of all.
         made = function.options['function']({**context, 'one_process': 'false', **given})
@@ -380,6 +385,17 @@ def test_several_people_before_a_webcam(monkeypatch):
     monkeypatch.setitem(names, 'DETECTOR', detector(False))
     with pytest.raises(ValueError, match=r'people: 3 people need .*; run "ros2 run hmt_ros '):
         made(given, ROOT / 'hmt_ros', {'people': '3'})
+
+
+def test_what_is_not_installed_is_named_with_the_command_that_installs_it(description, monkeypatch):
+    def missing(package):
+        raise LookupError(package)
+
+    names = description['_installed'].__globals__
+    monkeypatch.setitem(names, 'get_package_share_directory', missing)
+    wanted = 'rviz: package tf2_ros is not installed; run "sudo apt install ros-jazzy-tf2-ros"'
+    with pytest.raises(ValueError, match=re.escape(wanted)):
+        description['actions_of'](defaults(description) | {'rviz': 'true'}, ROOT)
 
 
 def test_rviz_shows_topics_of_the_nodes_relative_to_a_namespace():

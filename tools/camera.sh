@@ -11,23 +11,26 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 video=${1:?usage: tools/camera.sh VIDEO [FOV [PEOPLE]]} fov=${2:-} people=${3:-1}
 ros=${ROS_FROM_APT:-/opt/ros/jazzy}
 say() { printf 'camera: %s\n' "$*" >&2; }
-[ -e "$video" ] || { say "$video is not there: wanted a webcam such as /dev/video0, or a video file"; exit 1; }
+[[ -e $video || $video =~ ^[0-9]+$ ]] || { say "$video is not there: wanted a webcam such as /dev/video0, or a video file"; exit 1; }
 [[ $people =~ ^([1-9]|1[0-9]|20)$ ]] || { say "PEOPLE: wanted a number from 1 to 20, saw $people"; exit 1; }
 # The files of a workspace read variables that are not set.
 set +u
 source tools/environment.bash
 set -u
 export FASTRTPS_DEFAULT_PROFILES_FILE=${FASTRTPS_DEFAULT_PROFILES_FILE:-$PWD/hmt_ros/config/fastdds.xml}
-lens=()
-[ -n "$fov" ] || lens=(-p focal_length_sigma:=0.2)
+tracker=filter_node lens=()
+[ "$people" = 1 ] || tracker=people_node
+[ -n "$fov" ] || lens=(-p "$tracker:focal_length_sigma:=$(python -c \
+  'from hmt_ros.sessions.focal_length import USUAL_SIGMA as sigma; print(sigma)')")
 
 running=()
 stop() {
   trap - EXIT INT TERM
-  [ ${#running[@]} -eq 0 ] || kill -INT "${running[@]}" 2>/dev/null || true
+  [ ${#running[@]} -eq 0 ] || kill -TERM "${running[@]}" 2>/dev/null || true
   wait || true
 }
 trap stop EXIT INT TERM
+# The first that ends, camera, node or RViz, ends all.
 start() {
   "$@" &
   running+=($!)
@@ -60,4 +63,5 @@ fi
 
 wait_for=''
 for name in $nodes; do wait_for="$wait_for $space/$name"; done
-python -m hmt_ros.nodes.camera_node "$video" ${fov:+--fov "$fov"} --ros-args -r __ns:=/camera -p wait_for:="${wait_for# }"
+start python -m hmt_ros.nodes.camera_node "$video" ${fov:+--fov "$fov"} --ros-args -r __ns:=/camera -p wait_for:="${wait_for# }"
+wait -n

@@ -175,18 +175,7 @@ def walk(
         'trunk_y': -2.0 * DEGREE * sway,
         'trunk_z': -2.0 * twist,
     }
-    forth, back = (
-        arm_posture(
-            body,
-            [hanging(forwards, 9 * DEGREE * sign) for sign in SIGNS],
-            [hanging(forwards + bend, 4 * DEGREE * sign) for sign in SIGNS],
-        )
-        for forwards, bend in ((swing, 30 * DEGREE), (-swing, 14 * DEGREE))
-    )
-    for name in forth:  # an arm swings with the leg of the other side
-        share = 0.5 - 0.5 * np.cos(wave) * (1.0 if name.startswith('left') else -1.0)
-        angles[name] = back[name] + share * (forth[name] - back[name])
-    return pelvis, angles, feet
+    return pelvis, angles | swinging_arms(body, swing, np.cos(wave)), feet
 
 
 def reach(
@@ -253,11 +242,8 @@ def dance(
         beats = np.arange(k, count, 2)
         places = scale * (middle[beats] + 0.13 * sign * ahead(stance[beats] - np.pi / 2))
         # A foot leaves the floor a little after the other has landed.
-        at = np.stack([beats - 0.85, beats], axis=1).ravel()[1:]
-        x, y, yaws[k] = (rests(clock, at, np.repeat(v, 2)[:-1]) for v in (*places.T, stance[beats]))
-        floor[k] = np.stack([x, y], axis=1)
-        share = np.clip((clock[:, None] - beats[1:] + 0.85) / 0.85, 0.0, 1.0)
-        up = np.sin(np.pi * share) ** 2 @ lift[beats[1:]]
+        landings = beats.astype(np.float64)
+        floor[k], yaws[k], up = steps(clock, landings, 0.85, places, stance[beats], lift[beats[1:]])
         pitch = -np.clip(up / (0.13 * scale), 0.0, 1.0) * 30 * DEGREE
         feet.append(standing_foot(body, floor[k], up, pitch, yaws[k] - sign * 10 * DEGREE))
 
@@ -297,6 +283,46 @@ def hanging(forwards: float, outwards: float) -> Array:
     """Direction of an arm that hangs, turned forwards, and to the right, rad."""
     flat = np.cos(outwards)
     return np.array([np.sin(outwards), flat * np.sin(forwards), -flat * np.cos(forwards)])
+
+
+def swinging_arms(body: Body, swing: float, lead: Array) -> dict[str, Array]:
+    """Angles (T,) of arms that swing, each with the leg of the other side.
+
+    Args:
+        swing: how far the upper arms swing forwards and back, rad.
+        lead: (T,) from -1, the right leg is in front, to 1, the left one.
+    """
+    forth, back = (
+        arm_posture(
+            body,
+            [hanging(forwards, 9 * DEGREE * sign) for sign in SIGNS],
+            [hanging(forwards + bend, 4 * DEGREE * sign) for sign in SIGNS],
+        )
+        for forwards, bend in ((swing, 30 * DEGREE), (-swing, 14 * DEGREE))
+    )
+    angles = {}
+    for name in forth:
+        share = 0.5 - 0.5 * lead * (1.0 if name.startswith('left') else -1.0)
+        angles[name] = back[name] + share * (forth[name] - back[name])
+    return angles
+
+
+def steps(
+    time: Array, landings: Array, air: float, places: Array, headings: Array, lift: Array
+) -> tuple[Array, Array, Array]:
+    """Place (T, 2) on the floor, heading (T,) and height (T,) of a foot that steps.
+
+    Args:
+        time: (T,).
+        landings: (n,) times, increasing; before the second the foot rests at the first place.
+        air: time in the air before a landing.
+        places, headings: (n, 2), (n,) at the landings.
+        lift: (n - 1,) heights of the steps.
+    """
+    at = np.stack([landings - air, landings], axis=1).ravel()[1:]
+    x, y, heading = (rests(time, at, np.repeat(v, 2)[:-1]) for v in (*places.T, headings))
+    share = np.clip((time[:, None] - landings[1:] + air) / air, 0.0, 1.0)
+    return np.stack([x, y], axis=1), heading, np.sin(np.pi * share) ** 2 @ lift
 
 
 def between(time: Array, times: list[float], postures: list[Posture]) -> dict[str, Array]:

@@ -148,12 +148,10 @@ def _told(shown: Content, truth: Truth, rate: float, scenes: dict[str, int]) -> 
     # All at the images in which each has an answer.
     common = sorted(truth.joints.keys() & set.intersection(*({*x.joints} for x in poses.values())))
     parts = np.split(np.array(common), np.searchsorted(common, [*scenes.values()])[:-1])
-    names = ''.join(f'{name:20s}' for name in scenes)
-    yield _row('', names.rstrip())
+    yield _row('', *scenes)
     for what, each in poses.items():
         errors = (each.errors(truth, part.tolist()) for part in parts)
-        found = (f'{x.mean():.0f} mm' if len(x) else '-' for x in errors)
-        yield _row(what, ''.join(f'{x:20s}' for x in found).rstrip())
+        yield _row(what, *(f'{x.mean():.0f} mm' if len(x) else '-' for x in errors))
     scores = next(iter(shown.scores.values())).scores.summary()
     yield _row(REGIONS, f'{100 * scores["joint_coverage_90"]:.0f} %')
     wrong = [t for t in shown.mixtures.empty if t in truth.joints]
@@ -173,11 +171,11 @@ def _told_of_clips() -> Iterator[str]:
         ours, theirs = means.get('images + keypoints'), means.get('MediaPipe 3D')
         if ours and theirs and {'heaviest', 'point'} <= {*head}:
             mine, other = ours[head.index('heaviest')], theirs[head.index('point')]
-            yield _row(CLIPS, f"{mine} mm, and {other} of the detector's 3D")
+            yield _row(CLIPS, f"{mine} mm; detector's 3D {other}")
 
 
-def _row(what: str, value: str) -> str:
-    return f'  {what:58s}{value}'
+def _row(what: str, *values: str) -> str:
+    return f'  {what:56s}{"".join(f"{value:8s}" for value in values)}'.rstrip()
 
 
 def _track(source: Path, target: Path, options: ReplayOptions, inputs: str) -> float:

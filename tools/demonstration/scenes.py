@@ -7,17 +7,33 @@ down behind a desk that hides their legs.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
-from hmt_learning.motion.limb_motions import SIGNS, ahead, arm_posture, sole, standing_foot
-from hmt_learning.motion.procedural_motion import DEGREE, Plan, between, hanging, rests
+from hmt_learning.motion.limb_motions import (
+    SIGNS,
+    Posture,
+    ahead,
+    arm_posture,
+    sole,
+    standing_foot,
+)
+from hmt_learning.motion.procedural_motion import (
+    DEGREE,
+    Plan,
+    between,
+    hanging,
+    rests,
+    steps,
+    swinging_arms,
+)
 from hmt_ros.body.body import Body
 from hmt_ros.inference.arrays import Array
 
 SECONDS = 15.0
-# What is done, and until when, s.
-SCENES = {'points': 4.4, 'walks out and back': 11.5, 'sits at a desk': SECONDS}
+# What is done, and until when, s: points, walks out of the image and back, sits at the desk.
+SCENES = {'points': 4.4, 'walks': 11.5, 'sits': SECONDS}
 STOOL, SEAT = (0.85, -0.40), 0.45  # its place on the floor, and its height, m
 DESK = (0.85, 0.62)  # its place on the floor, m
 # The way on the floor: time, s; place, m; heading, deg.
@@ -27,8 +43,8 @@ WAY = np.array([
     [7.6, -2.70, -0.15, -80], [8.2, -2.25, -0.15, -90], [10.3, 0.62, -0.10, -86],
     [10.8, 0.84, -0.06, -30], [11.2, 0.85, -0.05, 0], [17.0, 0.85, -0.05, 0],
 ])  # fmt: skip
-STEP = 0.45  # s, of one step; a foot is in the air for nearly all of it
-WALKS = ((4.5, 11.4),)  # s, when the feet step
+STEP, AIR = 0.45, 0.95 * 0.45  # s, of one step, and of that in the air
+WALK = (4.5, 11.4)  # s, when the feet step
 APART, LIFT = 0.085, 0.06  # m, from the way to a foot, and of a foot in the air
 SITS = (11.3, 12.4)  # s
 # Directions of the right upper arm and forearm: to the person's right, ahead, up.
@@ -67,21 +83,15 @@ def way(time: Array | float) -> tuple[Array, Array]:
 
 def _foot(body: Body, time: Array, side: int) -> tuple[Array, Array]:
     """Ankle and toe (T, 3) of a foot that lands beside the way where the body will soon be."""
-    landings = [-1.0]
-    for start, end in WALKS:
-        landings += np.arange(start + STEP * (1 + side), end + STEP, 2 * STEP).tolist()
-    at = np.array(landings)
-    soon = np.minimum(at + 0.5 * STEP, WAY[-1, 0])
-    place, heading = way(soon)
-    place = place + (SIGNS[side] * APART * ahead(heading - np.pi / 2).T).T
-    # It rests until it lifts for the next landing.
-    times = np.sort(np.concatenate([at[:1], at[1:] - 0.95 * STEP, at[1:]]))
-    x, y, yaw = (rests(time, times, np.repeat(v, 2)[:-1]) for v in (*place.T, heading))
-    share = np.clip((time[:, None] - at[1:] + 0.95 * STEP) / (0.95 * STEP), 0.0, 1.0)
-    far = np.minimum(np.linalg.norm(np.diff(place, axis=0), axis=1) / 0.5, 1.0)
-    up = np.sin(np.pi * share) ** 2 @ (LIFT * (0.4 + 0.6 * far))
+    start, end = WALK
+    landings = np.append(-1.0, np.arange(start + STEP * (1 + side), end + STEP, 2 * STEP))
+    places, headings = way(landings + 0.5 * STEP)
+    places = places + SIGNS[side] * APART * ahead(headings - np.pi / 2)
+    far = np.minimum(np.linalg.norm(np.diff(places, axis=0), axis=1) / 0.5, 1.0)
+    lift = LIFT * (0.4 + 0.6 * far)
+    floor, yaw, up = steps(time, landings, AIR, places, headings, lift)
     pitch = -np.clip(up / LIFT, 0.0, 1.0) * 25 * DEGREE
-    return standing_foot(body, np.stack([x, y], axis=1), up, pitch, yaw - SIGNS[side] * 6 * DEGREE)
+    return standing_foot(body, floor, up, pitch, yaw - SIGNS[side] * 6 * DEGREE)
 
 
 def _arms(body: Body, time: Array) -> dict[str, Array]:
@@ -89,42 +99,31 @@ def _arms(body: Body, time: Array) -> dict[str, Array]:
     rest_upper = [hanging(3 * DEGREE, 9 * DEGREE * sign) for sign in SIGNS]
     rest_fore = [hanging(18 * DEGREE, 4 * DEGREE * sign) for sign in SIGNS]
 
-    def right(upper: tuple[float, ...], fore: tuple[float, ...]) -> dict[str, float]:
+    def right(upper: ArrayLike, fore: ArrayLike) -> Posture:
         return arm_posture(body, [rest_upper[0], _unit(upper)], [rest_fore[0], _unit(fore)])
 
-    def both(upper: Array, fore: Array) -> dict[str, float]:
-        sides = ([_unit(x * [sign, 1, 1]) for sign in SIGNS] for x in (upper, fore))
-        return arm_posture(body, *sides)
+    def both(*parts: ArrayLike) -> Posture:
+        return arm_posture(
+            body, *([_unit(np.multiply(x, [sign, 1, 1])) for sign in SIGNS] for x in parts)
+        )
 
     rest = arm_posture(body, rest_upper, rest_fore)
     camera, aside = right(*AT_CAMERA), right(*ASIDE)
-    table = both(np.array([0.25, 0.45, -0.85]), np.array([-0.15, 0.95, 0.0]))
-    far = both(np.array([0.15, 0.75, -0.62]), np.array([-0.25, 0.96, 0.05]))
+    table = both((0.25, 0.45, -0.85), (-0.15, 0.95, 0.0))
+    far = both((0.15, 0.75, -0.62), (-0.25, 0.96, 0.05))
     angles = between(
         time,
         [-1, 1.0, 1.8, 2.8, 3.5, 3.8, 4.6, 11.8, 12.6, 13.2, 13.9, 14.3, 15.2],
         [rest, rest, camera, camera, aside, aside, rest, rest, table, table, far, far, table],
     )
-    # An arm swings with the leg of the other side.
-    start, end = WALKS[0]
+    start, end = WALK
     swing = rests(time, [start + 0.3, start + 0.9, end - 0.9, end - 0.3], [0.0, 1.0, 1.0, 0.0])
-    wave = swing * np.cos(np.pi * (time - start - STEP) / STEP)
-    forth, back = (
-        arm_posture(
-            body,
-            [hanging(forwards, 9 * DEGREE * sign) for sign in SIGNS],
-            [hanging(forwards + bend, 4 * DEGREE * sign) for sign in SIGNS],
-        )
-        for forwards, bend in ((20 * DEGREE, 30 * DEGREE), (-20 * DEGREE, 14 * DEGREE))
-    )
-    for name in rest:
-        share = 0.5 - 0.5 * wave * (1.0 if name.startswith('left') else -1.0)
-        walking = back[name] + share * (forth[name] - back[name])
+    lead = swing * np.cos(np.pi * (time - start - STEP) / STEP)
+    for name, walking in swinging_arms(body, 20 * DEGREE, lead).items():
         angles[name] = angles[name] + swing * (walking - rest[name])
     return angles
 
 
-def _unit(direction: Array | tuple[float, ...]) -> Array:
+def _unit(direction: ArrayLike) -> Array:
     """A direction with the length 1."""
-    found = np.asarray(direction, dtype=np.float64)
-    return found / np.linalg.norm(found)
+    return np.asarray(direction / np.linalg.norm(direction))
