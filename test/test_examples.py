@@ -386,7 +386,8 @@ def check_answers(standing, programs):
         for _ in range(4):
             executor.spin_once(timeout_sec=0.05)
     for process in processes:
-        process.terminate()
+        # rclpy.spin misses one SIGTERM of some hundreds.
+        process.kill()
         process.wait()
     node.destroy_node()
     rclpy.shutdown(context=context)

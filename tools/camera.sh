@@ -26,8 +26,12 @@ tracker=filter_node lens=()
 running=()
 stop() {
   trap - EXIT INT TERM
-  [ ${#running[@]} -eq 0 ] || kill -TERM "${running[@]}" 2>/dev/null || true
-  wait || true
+  [ ${#running[@]} -eq 0 ] && return
+  kill -TERM "${running[@]}" 2>/dev/null || true
+  # What has not ended after 10 s never will.
+  { sleep 10 && kill -KILL "${running[@]}"; } 2>/dev/null &
+  wait "${running[@]}" || true
+  kill $! 2>/dev/null || true
 }
 trap stop EXIT INT TERM
 # The first that ends, camera, node or RViz, ends all.
