@@ -40,6 +40,9 @@ from hmt_ros.inference.linear_algebra import product, unit
 # clips 8 is better for the pelvis. Tails are for those who bend.
 TRUNK_LEAN, TRUNK_SIGMA = 0.0, (np.radians(5.0), np.radians(9.0))
 PELVIS_LEAN, PELVIS_SIGMA = np.radians(-8.0), (np.radians(8.0), np.radians(14.0))
+# The same of the shanks of hidden legs: who stands and who sits has them upright. Legs that an
+# image shows lean as it says.
+SHANK_LEAN, SHANK_SIGMA = np.radians(5.0), (np.radians(8.0), np.radians(20.0))
 # Depth below the floor that costs 1/2, with an exact plane, m.
 FLOOR_SIGMA = 0.02
 # Degrees of freedom nu of the heavy tails, of the lean and of the floor.
@@ -137,18 +140,20 @@ class GroundTerm:
         body: of the poses.
         settings: weights; a weight of 0 leaves a term out.
         plane: gravity and floor.
+        hidden: segments that something hides from the camera.
     """
 
     body: Body
     settings: GroundSettings
     plane: FloorPlane
+    hidden: tuple[int, ...] = ()
 
     @cached_property
     def compiled(self) -> Constants:
         """As compiled code reads it."""
         body, plane = self.body, self.plane
         skeleton, feet = body.skeleton, soles(body)
-        upright = upright_segments(skeleton)
+        upright = upright_segments(skeleton, self.hidden)
         weights = self.settings.weights
         weights[0] *= len(upright.segments) > 0
         weights[1] *= len(feet) > 0 and plane.height is not None and plane.measured
@@ -187,8 +192,12 @@ class Upright(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def upright_segments(skeleton: Skeleton) -> Upright:
-    """Pelvis and trunk of a skeleton whose root turns about z, y and x; nothing of another."""
+def upright_segments(skeleton: Skeleton, hidden: tuple[int, ...] = ()) -> Upright:
+    """Pelvis and trunk of a skeleton whose root turns about z, y and x; nothing of another.
+
+    Args:
+        hidden: segments that something hides; shanks among these are upright, too.
+    """
     if not len(_root_turns(skeleton)) or 'neck' not in skeleton.joint_names:
         return Upright(np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     neck = skeleton.joint_index(('neck',))[0]
@@ -198,11 +207,22 @@ def upright_segments(skeleton: Skeleton) -> Upright:
     known = [(trunk, spine, TRUNK_LEAN, TRUNK_SIGMA)]
     if skeleton.segment_dofs[trunk]:
         known.append((0, columns[0, 2], PELVIS_LEAN, PELVIS_SIGMA))
+    for knee, ankle in zip(*(_sided(skeleton, x) for x in ('knee', 'ankle')), strict=True):
+        shank = int(skeleton.joint_segments[knee])
+        if shank in hidden:
+            known.append((shank, joints[knee] - joints[ankle], SHANK_LEAN, SHANK_SIGMA))
     return Upright(
         np.array([segment for segment, *_ in known], dtype=np.intp),
         np.array([_axes(columns, segment, up, lean) for segment, up, lean, _ in known]),
         np.array([[aside, ahead, ahead] for *_, (aside, ahead) in known]),
     )
+
+
+def _sided(skeleton: Skeleton, kind: str) -> list[int]:
+    """The left and the right joint of a kind; none where one of them is missing."""
+    names = [f'left_{kind}', f'right_{kind}']
+    known = {*names} <= {*skeleton.joint_names}
+    return [int(i) for i in skeleton.joint_index(names)] if known else []
 
 
 @lru_cache(maxsize=16)

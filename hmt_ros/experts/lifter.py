@@ -524,4 +524,4 @@ def lifted_positions(camera: Camera, keypoints: Keypoints) -> LiftedPoses | None
     ray = camera.rays(keypoints.pixels[seen].mean(0, keepdims=True))
     axes = ray_rotations(ray)[0].T
     deviations = position_deviations(keypoints.scheme)
-    return from_positions(keypoints.names, keypoints.positions, axes, deviations)
+    return from_positions(keypoints.names, keypoints.positions, axes, deviations, seen)

@@ -21,7 +21,7 @@ import numpy as np
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, other_side
 from hmt_ros.core import elementary, resize_bones
-from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_algebra import product
 
 WHOLE = {
@@ -148,7 +148,11 @@ def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
 
 
 def from_positions(
-    joints: Sequence[str], positions: Array, axes: Array, deviations: Mapping[str, float]
+    joints: Sequence[str],
+    positions: Array,
+    axes: Array,
+    deviations: Mapping[str, float],
+    seen: Mask | None = None,
 ) -> LiftedPoses | None:
     """The one pose that a network guesses; None: it has no hips, or nothing else.
 
@@ -158,6 +162,7 @@ def from_positions(
         positions: (n, 3) m, along the axes of the camera from any origin; NaN: unknown.
         axes: (3, 3) of the person's view, in rows, camera frame.
         deviations: of the depths of joints, by their kind, m.
+        seen: (n,) joints that the network has seen; the others may be anywhere. None: all.
     """
     known: dict[str, int] = {}
     for i in np.flatnonzero(np.isfinite(positions).all(1)).tolist():
@@ -170,6 +175,8 @@ def from_positions(
     places = positions[[known[name] for name in names]] - middle
     lengths = np.linalg.norm(bones(names, places, np.zeros(3)), axis=1)
     spread = np.array([deviations[name.rpartition('_')[2]] for name in names])
+    if seen is not None:
+        spread[~seen[[known[name] for name in names]]] = UNKNOWN
     return LiftedPoses(
         names,
         np.zeros(1),

@@ -31,7 +31,7 @@ from hmt_ros.core import RECORDED, record_residuals
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of
-from hmt_ros.image.terms.image_term import NO_FACTORS, TermSettings, Weighting
+from hmt_ros.image.terms.image_term import TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
 from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.inference.arrays import Array
@@ -147,7 +147,7 @@ class ImageLikelihood:
             usual_exchanges() if exchanges is None else exchanges,
             None if beliefs is None else beliefs.keypoints,
             lifted_share,
-            NO_FACTORS if beliefs is None else beliefs.of_segments('keypoints'),
+            observation.factors('keypoints'),
         )
 
     @cached_property
@@ -243,7 +243,7 @@ def _inputs(settings: LikelihoodSettings, observation: Observation) -> dict[str,
             float(s.scale),
             float(observation.magnification),
             float(s.growth),
-            NO_FACTORS if beliefs is None else beliefs.of_segments(term.name),
+            observation.factors(term.name),
         )
         result.append(term.inputs(weighting, evidence))
     running = [term for term, one in zip(TERMS, result, strict=True) if one.term.weight > 0]

@@ -64,6 +64,8 @@ class Observation:
         depths: m, believed or not; None: unknown.
         flow: from the image before, two channels, px; None: there is none.
         others: (H, W) pixels that somebody else covers or may cover; None: there are none.
+        hidden: (S,) segments that something else covers, of which the image says nothing; None:
+            none.
         beliefs: in the cues; None: all are believed.
         magnification: px for a metre at the distance of the person; 0: unknown, the contours of
             people are taken to be as the model's.
@@ -76,8 +78,16 @@ class Observation:
     depths: ImageMap | None = None
     flow: ImageMap | None = None
     others: Mask | None = None
+    hidden: Mask | None = None
     beliefs: Beliefs | None = None
     magnification: float = 0.0
+
+    def factors(self, name: str) -> Array:
+        """Factors (S,) on the energies of a term at each segment; (0,): all are 1."""
+        believed = NO_FACTORS if self.beliefs is None else self.beliefs.of_segments(name)
+        if self.hidden is None:
+            return believed
+        return np.where(self.hidden, 0.0, believed if len(believed) else 1.0)
 
     @property
     def outline(self) -> Outline | None:

@@ -2,10 +2,16 @@
 
 A limb is shown as far out as a keypoint or the silhouette finds its joints. Without keypoints, and
 in the image, edges and flow may show it.
+
+A leg is hidden, by furniture or by the border of the image, where a detector is sure of none of its
+joints beyond the hip. What the detector says of it is a guess from what legs usually do, and that
+no silhouette is where the leg may be says nothing either. An arm that a detector is not sure of is
+mostly behind its own trunk, where guesses are good.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -15,10 +21,14 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, sided_pairs
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
+from hmt_ros.inference.error_model import seconds
 
 # Confidence below which a keypoint is a guess.
 GUESSED = 0.02
+# Confidence from which a detector sees a keypoint more likely than not.
+SEEN = 0.5
 # Time for which it still matters where an unseen limb may be, s.
 SHORT = 1.0
 # Error of an unseen joint for each bone of its limb, as a share of its length: by the lengths
@@ -32,10 +42,37 @@ class UnseenLimbs:
     Attributes:
         times: (S,) s; 0: the last image shows the joint at its start, or one further out, or it is
             no segment of a limb; inf: no image has.
+        hidden: (S,) that something hides from the detector; None: nothing does.
     """
 
     def __init__(self, body: Body) -> None:
         self.times: Array = np.zeros(len(body.skeleton.parents))
+        self.hidden: Mask | None = None
+        self._answered = 0
+
+    def without_guesses(
+        self, body: Body, keypoints: Keypoints | None, stamp: int
+    ) -> Keypoints | None:
+        """Keypoints of which those of hidden segments have no confidence.
+
+        Args:
+            body: of the person.
+            keypoints: of an image; None: the detector has not answered. What it hid a short time
+                ago is still hidden.
+            stamp: of the image, ns.
+        """
+        if keypoints is None:
+            if seconds(stamp - self._answered) > SHORT:
+                self.hidden = None
+            return None
+        self._answered, hidden = stamp, hidden_segments(body.skeleton, keypoints)
+        self.hidden = hidden if hidden.any() else None
+        if self.hidden is None:
+            return keypoints
+        segments = body.skeleton.joint_segments[body.skeleton.joint_index(keypoints.names)]
+        return replace(
+            keypoints, confidences=np.where(hidden[segments], 0.0, keypoints.confidences)
+        )
 
     def look(
         self, body: Body, camera: Camera, observation: Observation, pose: Array, dt: float
@@ -75,6 +112,18 @@ def _told(body: Body, hidden: tuple[bool, ...]) -> Body:
         away[own] = np.cumsum((skeleton.offsets[own] ** 2).sum(1))
     more = ALONG_LIMB**2 * (away * hidden)[skeleton.joint_segments]
     return body.with_beliefs(joint_errors=np.sqrt(body.joint_errors**2 + more))
+
+
+def hidden_segments(skeleton: Skeleton, keypoints: Keypoints) -> Mask:
+    """Segments (S,) of legs, below the knee, that something hides from a detector."""
+    hidden = np.zeros(len(skeleton.parents), dtype=np.bool_)
+    segments = skeleton.joint_segments[skeleton.joint_index(keypoints.names)]
+    sure = keypoints.seen & (keypoints.confidences >= SEEN)
+    for own in skeleton.chains.values():
+        beyond = np.isin(segments, own[1:])
+        if skeleton.parents[own[0]] == 0 and beyond.any() and not sure[beyond].any():
+            hidden[list(own[1:])] = True
+    return hidden
 
 
 def shown_segments(body: Body, camera: Camera, observation: Observation, pose: Array) -> Mask:

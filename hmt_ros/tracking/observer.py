@@ -50,6 +50,7 @@ class View(NamedTuple):
             background.
         changed: share of the pixels that differ from the background.
         unsure: (H, W) pixels of the person or of a shadow; None: none.
+        hidden: (S,) segments that something else covers; None: none.
     """
 
     image: Image
@@ -64,6 +65,7 @@ class View(NamedTuple):
     anywhere: Mask | None = None
     changed: float = 0.0
     unsure: Mask | None = None
+    hidden: Mask | None = None
 
 
 class Observer:
@@ -168,6 +170,7 @@ class Observer:
             found,
             evidence=evidence,
             foreground=view.silhouette,
+            hidden=view.hidden,
             depths=depths,
             magnification=magnification,
         )

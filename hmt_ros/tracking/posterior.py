@@ -165,16 +165,19 @@ class Posterior:
             else known_exchanges(exchanges)
         )
         seen = self.likelihood.seen(observation, exchanges, share, lifted_share)
-        return (*seen, *self.likelihood.priors, *self.known)
+        return (*seen, *self.likelihood.priors, *self.known(observation))
 
-    @property
-    def known(self) -> tuple[FrameTerm | GroundTerm, ...]:
+    def known(self, observation: Observation) -> tuple[FrameTerm | GroundTerm, ...]:
         """Terms besides those of image and body: those that were added, gravity and floor."""
         if self.ground is None:
             return self.extra
-        plane = self.ground.plane
-        if self._ground_term is None or self._ground_term.plane is not plane:
-            self._ground_term = GroundTerm(self.person, self.settings.ground, plane)
+        plane, last = self.ground.plane, self._ground_term
+        hidden = (
+            () if observation.hidden is None else tuple(observation.hidden.nonzero()[0].tolist())
+        )
+        if last is None or (last.plane is not plane or last.hidden != hidden):
+            self._ground_term = GroundTerm(self.person, self.settings.ground, plane, hidden)
+        assert self._ground_term is not None
         return (*self.extra, self._ground_term)
 
     def given(

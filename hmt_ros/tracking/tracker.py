@@ -278,8 +278,10 @@ class Tracker:
                 self._given = relevelled(before, self._given, body)
         known = silhouettes.scene.known and not silhouettes.doubted
         ground.still = self._camera_path.known or (known and not ground.turning)
-        keypoints = self._landmarks.applied(given.keypoints)
-        given = given._replace(keypoints=self._lifted(keypoints, given.stamp))
+        limbs = self._track.limbs
+        keypoints = limbs.without_guesses(self._track.body, given.keypoints, given.stamp)
+        keypoints = self._lifted(self._landmarks.applied(keypoints), given.stamp)
+        given = given._replace(keypoints=keypoints, hidden=limbs.hidden)
         found = self._state.begun and not self._state.validity.lost
         near = self._track.modes.poses if found else None
         doubted = silhouettes.doubted
@@ -489,7 +491,7 @@ class Tracker:
         state.stamp, foreseen = stamp, state.begun and observation is None
         shown = None
         if observation is not None:
-            shown = SeenImage(posterior.likelihood, observation, posterior.known)
+            shown = SeenImage(posterior.likelihood, observation, posterior.known(observation))
         if foreseen:
             observation = Observation()
             # The modes are kept as they are.

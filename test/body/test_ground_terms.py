@@ -145,3 +145,21 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
     square = 0.01**2 * (TRUNK_SIGMA[1] ** -2 + bends * PELVIS_SIGMA[1] ** -2)
     assert small == pytest.approx(0.5 * (LEAN_TAILS + 2) / LEAN_TAILS * square, rel=0.03)
     assert turned < 16.0
+
+
+@pytest.mark.parametrize('angle', [-1.2, 0.9])
+def test_a_hidden_shank_is_upright_and_another_leans_as_it_likes(body, angle):
+    """Against a leg that is shown; the gradient is that of differences."""
+    hip = body.skeleton.dof_index(('left_hip_x',))[0]
+    shank = body.skeleton.chains['left_leg'][1]
+    poses = np.zeros((2, body.dimension))
+    poses[:, 2], poses[1, hip] = 3.0, angle
+    shown = GroundTerm(body, only('upright'), FloorPlane(LEVEL, 0.0, None, np.inf))
+    hidden = replace(shown, hidden=(shank,))
+    costs = [[energy_of(term, body, pose).value for pose in poses] for term in (shown, hidden)]
+    assert costs[0][1] - costs[0][0] == pytest.approx(0.0, abs=1e-9)
+    assert costs[1][1] - costs[1][0] > 2.0
+    found = energy_of(hidden, body, poses[1]).gradient[0, hip]
+    moved = [poses[1] + s * 1e-6 * np.eye(body.dimension)[hip] for s in (1.0, -1.0)]
+    differences = [energy_of(hidden, body, pose).value[0] for pose in moved]
+    assert found == pytest.approx((differences[0] - differences[1]) / 2e-6, rel=1e-5)

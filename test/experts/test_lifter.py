@@ -352,6 +352,10 @@ def test_one_guess_has_the_depths_of_its_joints():
     # Exchanged, the right knee would be the left one.
     assert not {'left_knee', 'right_knee'} & {*other.joints}
     assert other.exchanged().joints == other.joints
+    unseen = np.array(['left_knee' in x for x in JOINTS])
+    guess = from_positions(JOINTS, joints[which], axes, kinds, ~unseen)
+    wide = [x for x, s in zip(guess.joints, guess.deviations[0, :, 2], strict=True) if s > 0.1]
+    assert wide == ['left_knee']
 
 
 def test_opinions_are_pooled():

@@ -157,6 +157,24 @@ def test_factors_of_one_change_no_byte(shot, observation):
         assert np.array_equal(found, wanted)
 
 
+def test_an_image_says_nothing_of_hidden_segments(shot, observation):
+    own = believed(shot, observation)
+    hidden = np.zeros(len(shot.body.skeleton.parents), dtype=bool)
+    hidden[list(shot.body.skeleton.chains['left_leg'][1:])] = True
+    names = ('coverage', 'edges', 'keypoints')
+    factors = {
+        x: np.where(hidden, 0.0, own.factors(x) if len(own.factors(x)) else 1.0) for x in names
+    }
+    told = replace(own, beliefs=replace(own.beliefs, segments=factors))
+    likelihood, poses = ImageLikelihood(shot.body, shot.camera), shot.near(6, 2, spread=0.5)
+    found, wanted, other = (
+        PoseEnergy(likelihood, likelihood.seen(x)).energy(poses).value
+        for x in (replace(own, hidden=hidden), told, own)
+    )
+    assert np.array_equal(found, wanted)
+    assert (found < other - 0.1).all()
+
+
 # Derivatives.
 
 

@@ -1,5 +1,7 @@
 """Which limbs an image shows: by keypoints, or by being in it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -96,3 +98,40 @@ def test_unseen_joints_err_by_the_lengths_of_their_bones(body, pose):
     assert of['left_knee'] == pytest.approx(0.08 * thigh)
     assert of['right_ankle'] == pytest.approx(0.08 * np.hypot(thigh, shin))
     assert of['left_hip'] == of['left_wrist'] == of['head'] == 0.0
+
+
+def sure_of(made, *kinds):
+    """Keypoints of which the detector is sure only where a name has one of these parts."""
+    sure = [any(x in name for x in kinds) for name in made.names]
+    return replace(made, confidences=np.where(sure, 0.9, 0.3))
+
+
+TRUNK_AND_ARMS = ('hip', 'shoulder', 'elbow', 'wrist', 'head')
+
+
+def test_a_leg_is_hidden_where_a_detector_is_sure_of_nothing_beyond_its_hip(body, pose):
+    limbs, said = UnseenLimbs(body), keypoints(body, pose)
+    assert limbs.without_guesses(body, said, 0) is said
+    assert limbs.hidden is None
+    found = limbs.without_guesses(body, sure_of(said, *TRUNK_AND_ARMS, 'left_ankle'), 1)
+    lost = {x for x, c in zip(found.names, found.confidences, strict=True) if c == 0.0}
+    assert lost == {'right_knee', 'right_ankle', 'right_toe'}
+    _, shank, foot = body.skeleton.chains['right_leg']
+    assert limbs.hidden.nonzero()[0].tolist() == [shank, foot]
+    # A limb without any keypoint may be one that the detector does not know.
+    arms = said[np.flatnonzero([any(y in x for y in TRUNK_AND_ARMS) for x in said.names])]
+    assert limbs.without_guesses(body, arms, 2) is arms
+
+
+def test_an_arm_that_a_detector_guesses_is_not_hidden(body, pose):
+    limbs, said = UnseenLimbs(body), sure_of(keypoints(body, pose), 'hip', 'knee', 'shoulder')
+    assert limbs.without_guesses(body, said, 0) is said
+
+
+def test_legs_stay_hidden_between_answers_of_a_slow_detector(body, pose):
+    limbs, said = UnseenLimbs(body), sure_of(keypoints(body, pose), *TRUNK_AND_ARMS)
+    limbs.without_guesses(body, said, 10**9)
+    assert limbs.without_guesses(body, None, 15 * 10**8) is None
+    assert limbs.hidden.sum() == 4
+    limbs.without_guesses(body, None, 21 * 10**8)
+    assert limbs.hidden is None

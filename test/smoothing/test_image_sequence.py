@@ -64,7 +64,7 @@ def believed(walk):
         seen = observe(picture, mask, image.observation.keypoints)
         beliefs = Beliefs(0.7, np.array([0.9, 0.6, 0.8]), 0.5)
         seen = replace(seen, beliefs=beliefs, magnification=100.0)
-        images.append(SeenImage(posterior.likelihood, seen, posterior.known))
+        images.append(SeenImage(posterior.likelihood, seen, posterior.known(seen)))
     return posterior, images
 
 
@@ -88,7 +88,7 @@ def test_energies_are_those_by_which_the_filter_weighs(walk, believed):
 def test_derivatives_are_those_of_the_energy(walk, believed):
     # Of keypoints and priors: the points of a contour slide along the flesh as the pose changes.
     body, sequence, poses = walk
-    images = [replace(one, known=believed[0].known) for one in sequence.images]
+    images = [replace(one, known=believed[0].known(one.observation)) for one in sequence.images]
     sequence = ImageSequence.of(images, STAMPS)
     rng = np.random.default_rng(4)
     x = np.clip(poses[1:3] + 0.05 * rng.normal(size=(2, body.dimension)), body.lower, body.upper)

@@ -74,7 +74,7 @@ def find_limb(
     explained = others.by_cue(pose[None], derivatives=False).outline_costs
     seen = ObservedImage(of_limb, observation, explained)
     keypoints = posterior.likelihood.seen(observation)[1:]
-    terms = (seen, *keypoints, posterior.likelihood.pose_prior, *posterior.known)
+    terms = (seen, *keypoints, posterior.likelihood.pose_prior, *posterior.known(observation))
     motion = Student(pose[own], inverse(block), LIMB_TAILS)
     term = PoseEnergy(of_limb, terms, motion, pose, own)
     best = samples[np.argsort(term.values(samples), kind='stable')[: plan.refined]]
