@@ -190,9 +190,12 @@ def test_layers_modes_and_play(page, tmp_path):
           x.textContent.trim() || x.getAttribute('aria-label') || (x.labels && x.labels.length)
         ));
         seen.title = get('title').textContent;
+        seen.onPelvis = get('align').checked;
         """,
         tmp_path,
     )
+    # Beside a truth.
+    assert seen['onPelvis'] is True
     views = ['first', 'both', 'without truth', 'ways', 'aligned', 'alone']
     assert len({seen[name] for name in views}) == len(views)
     assert seen['again'] == seen['all'] == seen['first']
@@ -421,11 +424,21 @@ def test_motions_are_switched_on_and_off(page, body, poses, tmp_path):
         get('chosen').value = 0; get('chosen').dispatchEvent(new Event('change'));
         seen.kept = on();
         get('motion-0').click(); get('motion-1').click(); look('all again');
+        const hands = {
+          identities: [[5, 8, 5]], weights: [[0.5, 0.3, 0.2]], starts: [0, 3],
+          joints: ['pelvis', 'right_hand'], roots: [0],
+          positions: [0, 0, 0, 0.1, 0.2, 0.5,  1, 0, 0, 1, 0, -0.2,  0, 0, 0, 0.1, 0.2, 0.3],
+        };
+        seen.called = [5, 8].map((identity) => nameOfMotion(hands, { identity, weights: [0.5] }));
+        hands.identities = [[5, 5, 5]];
+        seen.alone = nameOfMotion(hands, { identity: 5, weights: [1] });
     """
     seen = visit(make(out, tmp_path / 'report'), steps, tmp_path)
-    names = [name.partition(',')[0] for name in seen['names']]
-    span = f'0.0 to {(STAMPS[-1] - STAMPS[0]) * 1e-9:.1f} s'
-    assert names == [span, span, 'without identity']
+    names = [name.partition(':')[0] for name in seen['names']]
+    assert len({*names}) == 3
+    assert names[2] == 'without identity'
+    assert seen['called'] == ['right hand nearer, 0.0 s', 'right hand farther, 0.0 s']
+    assert seen['alone'] == 'the only one, 0.0 s'
     assert sorted(seen['motions']) == sorted(names)
     views = ['all', 'without the first', 'without both']
     assert len({seen[name] for name in views}) == len(views)

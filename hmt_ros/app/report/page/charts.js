@@ -350,6 +350,12 @@ function calibrationChart(which) {
     x: [0, 1], y: [0, 1], labels: ['probability of the region', 'fraction of true positions in it'],
     draw(context, u, v) {
       curve(context, u, v, [0, 1], [0, 1], { colour: colour('axis'), width: 1 });
+      context.fillStyle = colour('muted');
+      context.textBaseline = 'middle';
+      [['left', 0.04, 0.95, 'above: too vague'], ['right', 0.97, 0.06, 'below: too sure']].forEach(([align, x, y, text]) => {
+        context.textAlign = align;
+        context.fillText(text, u(x), v(y));
+      });
       Object.values(report.scores.topics).forEach((topic, i) => {
         const covered = topic.calibration[which];
         if (covered) curve(context, u, v, report.scores.probabilities, covered, { colour: colour(`series-${i % 6}`) });

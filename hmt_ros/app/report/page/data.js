@@ -84,15 +84,40 @@ function motionsOf(layer) {
   return [...found.values()].sort((a, b) => b.total - a.total);
 }
 
-/** What a motion is called: the times at which it is there. */
-function nameOfMotion({ identity, weights }) {
+const DIRECTIONS = [['to the left', 'to the right'], ['lower', 'higher'], ['farther', 'nearer']];
+
+/** The mean place of a joint from the pelvis, m, over the modes of a time that belong to a motion, or to the others. */
+function meanPlace(layer, t, joint, identity, own) {
+  const sum = [0, 0, 0, 0];
+  layer.identities[t].forEach((each, rank) => {
+    if ((each === identity) !== own) return;
+    const weight = layer.weights[t][rank];
+    const at = (j, axis) => layer.positions[((layer.starts[t] + rank) * layer.joints.length + j) * 3 + axis];
+    [0, 1, 2].forEach((axis) => {
+      const root = layer.roots.reduce((total, j) => total + at(j, axis), 0) / layer.roots.length;
+      sum[axis] += weight * (at(joint, axis) - root);
+    });
+    sum[3] += weight;
+  });
+  return sum[3] > 0 ? sum.slice(0, 3).map((x) => x / sum[3]) : null;
+}
+
+/** What a motion is called: where it is heaviest, how it differs most from the others at that time. */
+function nameOfMotion(layer, { identity, weights }) {
   if (!identity) return 'without identity';
-  const there = TIMES.filter((_, t) => weights[t] !== null);
-  return `${there[0].toFixed(1)} to ${there[there.length - 1].toFixed(1)} s`;
+  const t = weights.reduce((best, weight, i) => (weight > (weights[best] || 0) ? i : best), 0);
+  const differences = layer.joints.flatMap((name, joint) => {
+    const [own, others] = [true, false].map((which) => meanPlace(layer, t, joint, identity, which));
+    return own && others ? [0, 1, 2].map((axis) => ({ name, axis, by: own[axis] - others[axis] })) : [];
+  }).filter(({ by }) => Number.isFinite(by));
+  const at = `${TIMES[t].toFixed(1)} s`;
+  if (!differences.length) return `the only one, ${at}`;
+  const { name, axis, by } = differences.reduce((most, one) => (Math.abs(one.by) > Math.abs(most.by) ? one : most));
+  return `${name.replaceAll('_', ' ')} ${DIRECTIONS[axis][by > 0 ? 1 : 0]}, ${at}`;
 }
 layers.forEach((layer) => {
   layer.motions = motionsOf(layer);
-  layer.motionNames = new Map(layer.motions.map((motion) => [motion.identity, nameOfMotion(motion)]));
+  layer.motionNames = new Map(layer.motions.map((motion) => [motion.identity, nameOfMotion(layer, motion)]));
 });
 
 /** One skeleton at each time for which it is known, with its number or -1. */

@@ -119,7 +119,7 @@ function tellModes() {
     bar.append(made('span'));
     bar.firstChild.style.width = `${100 * weight}%`;
     row.append(first, made('td', `${(100 * weight).toFixed(1)} %`), bar);
-    if (motions) row.append(made('td', layer.motionNames.get(motions[shown.time][rank])));
+    if (motions) row.append(made('td', layer.motionNames.get(motions[shown.time][rank]), { class: 'motion' }));
     if (errorsKnown()) row.append(made('td', errors ? fixed(errors[rank]) : '-'));
     return row;
   });
@@ -143,7 +143,8 @@ function choose(index) {
   element('errors-figure').hidden = !errorsKnown();
   if (errorsKnown()) {
     element('errors-caption').replaceChildren(
-      ...keys(ERRORS), `of ${name}: mean over the evaluated joints, pelvis on pelvis.`,
+      ...keys(ERRORS), `of ${name}: mean over the evaluated joints, pelvis on pelvis. Lower is better; where the heaviest is far above the best, `
+      + 'a mode of less weight was right.',
     );
     element('errors').setAttribute('aria-label', `Errors of ${name} over time`);
   }
@@ -155,7 +156,7 @@ function choose(index) {
   if (beliefsKnown()) {
     const text = Object.keys(chosen().layer.cues).length
       ? `How far each cue of the images is believed in ${name}: the probability that it shows the person; `
-        + 'of the track, that some mode is about where the person is.'
+        + 'of the track, that some mode is about where the person is. Near 1 is usual; a cue that falls is left out.'
       : `The probability in ${name}.`;
     element('beliefs-caption').replaceChildren(...keys(beliefCurves(chosen().layer)), made('div', text));
   }
@@ -170,17 +171,18 @@ function tellMotions() {
   const boxes = [];
   for (let i = 0; i < layer.motions.length; i += i < TOLD_MOTIONS ? 1 : layer.motions.length) {
     const some = layer.motions.slice(i, i < TOLD_MOTIONS ? i + 1 : undefined);
-    const what = i < TOLD_MOTIONS ? nameOfMotion(some[0]) : `${some.length} others`;
+    const what = i < TOLD_MOTIONS ? layer.motionNames.get(some[0].identity) : 'all others';
     const share = some.reduce((total, motion) => total + motion.total, 0) / sum;
     boxes.push(toggle(
-      `motion-${i}`, `${what}, ${percent(share)}`, !some.every(({ identity }) => hidden.has(identity)),
+      `motion-${i}`, `${what}: ${percent(share)}`, !some.every(({ identity }) => hidden.has(identity)),
       [i < TOLD_MOTIONS ? `series-${i}` : 'grid'],
       (on) => some.forEach(({ identity }) => { if (on) hidden.delete(identity); else hidden.add(identity); }),
     ));
   }
   element('motions-boxes').replaceChildren(...boxes);
-  element('motions-caption').textContent = `Weights of the motions of ${name}, which modes keep from image to image; `
-    + 'the share is of all weights. A motion that is switched off is not drawn.';
+  element('motions-caption').textContent = `Weights of the motions of ${name}. Each is called by the joint that `
+    + 'differs most from the others where it is heaviest; shares are of all weights. Where the image is ambiguous several share the weight, '
+    + 'and one should be left soon after. A motion that is switched off is not drawn.';
 }
 
 /** The heights and angles that can be shown over time. */
@@ -201,7 +203,7 @@ function buildBands() {
   element('bands-caption').replaceChildren(
     ...keys(compared.filter((layer) => layer.bands).map((layer) => ({ name: `${nameOf(layer)} (${layer.topic})`, series: comparedColour(layer) }))),
     ...(truth ? keys([{ name: 'truth (heights)', series: 'ink' }]) : []),
-    made('div', `Median, and the interval between the 5th and the 95th percentile, of the whole mixture. Heights are above ${from}.`),
+    made('div', `Median, and the interval between the 5th and the 95th percentile, of the whole mixture: 90 % of the truth should lie in it. Heights are above ${from}.`),
   );
 }
 
@@ -280,7 +282,7 @@ function tell() {
     element('with-modes').closest('div').hidden = report.images.drawn_on;
     element('image-caption').textContent = report.images.drawn_on
       ? 'Overlay of the tracker: the heaviest modes on the image.'
-      : 'The modes on the image from which they are estimated.';
+      : 'The modes on the image from which they are estimated: all should cover the person.';
   } else {
     element('image-figure').hidden = true;
     element('stage').classList.add('without-image');
@@ -321,9 +323,9 @@ function tellScores() {
   element('scores-section').hidden = !report.scores;
   if (!report.scores) return;
   element('scores-about').textContent = `Against ${report.scores.truth}, ${report.scores.truth_frames} frames. `
-    + 'Errors are mean distances of joints, pelvis on pelvis. The last five columns give the fraction of frames whose '
-    + 'truth lies in the smallest region with 50 or 90 percent of the probability: 50 and 90 percent for a calibrated '
-    + 'mixture, less for an overconfident one, more for a vague one.';
+    + 'Errors are mean distances of joints, pelvis on pelvis. The last five columns say how often the truth lies in the smallest '
+    + 'region that holds 50 or 90 % of the probability. That should be 50 and 90 %: less is too sure, more is too vague. The pictures '
+    + 'show the same for every region: a good line stays near the diagonal.';
   const head = made('tr');
   ['topic', ...COLUMNS.map(([name]) => name)].forEach((name) => head.append(made('th', name, { scope: 'col' })));
   element('scores').tHead.append(head);
@@ -341,7 +343,7 @@ function tellScores() {
     key.append(line);
   });
   const line = made('div');
-  line.append(swatch('axis'), 'calibrated');
+  line.append(swatch('axis'), 'as often as it says');
   key.append(line);
   element('together').setAttribute('aria-label', 'Calibration for all joints together; the table has the numbers');
   element('each').setAttribute('aria-label', 'Calibration for each joint alone; the table has the numbers');
@@ -411,6 +413,8 @@ element('with-modes').addEventListener('change', () => {
   film.withModes = element('with-modes').checked;
   film.draw();
 });
+space.together = Boolean(truth) && !several;
+element('align').checked = space.together;
 element('follow').checked = space.follow;
 element('follow').addEventListener('change', () => { space.follow = element('follow').checked; space.draw(); });
 element('align').addEventListener('change', () => { space.together = element('align').checked; space.draw(); });
