@@ -1,11 +1,13 @@
 #!/usr/bin/env python3
-"""Slows a robot down near a person, and stops it where nothing is known.
+"""Slows a robot down near people, and stops it where nothing is known.
 
     python examples/keep_distance.py --ros-args -r __ns:=/humans/bodies/p1
+    python examples/keep_distance.py --ros-args -p people:=true
 
 It takes `keep_out` (hmt_msgs/KeepOut) and publishes `speed_scale` (std_msgs/Float64), 10 times a
 second: 1 where the space to keep out of is `FREE` m away from the origin of its frame or more, 0
 where it is nearer than `STOP`, and 0 where the person was not seen for `UNSEEN` s or nothing comes.
+With `people`, it takes those of everybody on the list `people` of people_node: the nearest counts.
 Set `fixed_frame` of the filter, and measure from your robot in that frame, where the camera is not
 on the robot.
 """
@@ -46,27 +48,67 @@ def speed_scale(message: Any) -> float:
     return float(np.clip((distance - STOP) / (FREE - STOP), 0.0, 1.0))
 
 
+class Nearest:
+    """Share of the usual speed near several people, of whom messages come at any time.
+
+    Attributes:
+        listed: names of the people who are there, and since when they are known, s.
+        scales: by the name of a person, the last `speed_scale`, and when it came, s.
+    """
+
+    def __init__(self) -> None:
+        self.listed: tuple[list[str], float] = [], -math.inf
+        self.scales: dict[str, tuple[float, float]] = {}
+
+    def scale(self, now: float) -> float:
+        """The least share; 0 where the list is old, or nothing came of somebody on it."""
+        names, since = self.listed
+        new = {name: x for name, (x, at) in self.scales.items() if now - at <= SILENCE}
+        if now - since > SILENCE or not new.keys() >= {*names}:
+            return 0.0
+        return min(new.values(), default=1.0)
+
+
 def main() -> None:
     """Runs until it is interrupted."""
     import rclpy
-    from hmt_msgs.msg import KeepOut
+    from hmt_msgs.msg import KeepOut, People2D
     from rclpy.executors import ExternalShutdownException
     from std_msgs.msg import Float64
 
     rclpy.init()
     node = rclpy.create_node('keep_distance')
     publisher = node.create_publisher(Float64, 'speed_scale', 10)
-    newest = {'scale': 0.0, 'at': -math.inf}
+    nearest, subscribed = Nearest(), {}
 
-    def hear(message: KeepOut) -> None:
-        newest.update(scale=speed_scale(message), at=time.monotonic())
+    def subscribe(name: str, topic: str) -> None:
+        def hear(message: KeepOut) -> None:
+            nearest.scales[name] = speed_scale(message), time.monotonic()
 
-    def tell() -> None:
-        silent = time.monotonic() - newest['at'] > SILENCE
-        publisher.publish(Float64(data=0.0 if silent else newest['scale']))
+        subscribed[name] = node.create_subscription(KeepOut, topic, hear, 10)
 
-    node.create_subscription(KeepOut, 'keep_out', hear, 10)
-    node.create_timer(0.1, tell)
+    def list_people(message: People2D) -> None:
+        nearest.listed = list(message.ids), time.monotonic()
+        for name in message.ids:
+            if name not in subscribed:
+                subscribe(name, f'humans/bodies/{name}/keep_out')
+        for name in [*subscribed]:
+            # Somebody who has left is known for some seconds.
+            if name not in message.ids and not node.count_publishers(subscribed[name].topic_name):
+                node.destroy_subscription(subscribed.pop(name))
+
+    def publish() -> None:
+        now = time.monotonic()
+        if not several:
+            nearest.listed = [''], now
+        publisher.publish(Float64(data=nearest.scale(now)))
+
+    several = node.declare_parameter('people', False).value
+    if several:
+        node.create_subscription(People2D, 'people', list_people, 10)
+    else:
+        subscribe('', 'keep_out')
+    node.create_timer(0.1, publish)
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
 

@@ -22,6 +22,7 @@ from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, RosbagsMessages
 from msg_tools.messages.cdr import serialise
+from msg_tools.messages.detections import NO_KEYPOINTS, DetectedPerson, people_message
 from msg_tools.messages.keep_out import KeepOut, KeepOutState, keep_out_message
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
@@ -80,6 +81,26 @@ def test_a_robot_slows_down_and_stops_where_nothing_is_known():
         (keep_out(KeepOutState.LOST, 9.0, 0.6), 0.0),
     ):
         assert scale(message) == pytest.approx(wanted)
+
+
+def test_the_nearest_of_several_people_counts():
+    nearest = example('keep_distance')['Nearest']()
+    # Without a list nothing is known.
+    assert nearest.scale(0.0) == 0.0
+    nearest.listed = [], 10.0
+    assert nearest.scale(10.1) == 1.0
+    nearest.listed = ['p1', 'p2'], 10.2
+    nearest.scales = {'p1': (0.8, 10.1)}
+    assert nearest.scale(10.3) == 0.0
+    nearest.scales['p2'] = 0.4, 10.2
+    assert nearest.scale(10.3) == 0.4
+    # Somebody who is not on the list any more counts for as long as messages come.
+    nearest.listed = ['p1'], 10.4
+    assert nearest.scale(10.5) == 0.4
+    nearest.scales['p1'] = 0.7, 10.8
+    nearest.listed = ['p1'], 10.8
+    assert nearest.scale(10.9) == 0.7
+    assert nearest.scale(11.5) == 0.0
 
 
 def mixture(*heights, weights=(0.75, 0.25)):
@@ -334,9 +355,11 @@ def standing():
     content = PoseMixture.of_body(
         body, posterior, MixtureKind.POSTERIOR, 10**9, 'odom', state=TrackState.TRACKING
     )
+    people = [DetectedPerson(name, NO_KEYPOINTS, None) for name in ('p1', 'p2')]
     return {
         'pose_mixture': pose_mixture_message(MESSAGES, content),
         'keep_out': keep_out(KeepOutState.TRACKING, 1.25, frame='odom'),
+        'people': people_message(MESSAGES, people, 10**9, 'eye'),
     }
 
 
@@ -348,9 +371,10 @@ def check_answers(standing, programs):
     """
     import rclpy
     from hmt_msgs.msg import KeepOut as KeepOutOfRos
+    from hmt_msgs.msg import People2D as PeopleOfRos
     from hmt_msgs.msg import PoseMixture as MixtureOfRos
 
-    kinds = {'pose_mixture': MixtureOfRos, 'keep_out': KeepOutOfRos}
+    kinds = {'pose_mixture': MixtureOfRos, 'keep_out': KeepOutOfRos, 'people': PeopleOfRos}
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node('robot', context=context)
@@ -369,6 +393,12 @@ def check_answers(standing, programs):
         node.create_subscription(kind, f'/{name}_lab/{topic}', partial(hear, name), 10)
         publisher = node.create_publisher(kinds[source], f'/{name}_lab/{source}', 10)
         publishers.append((publisher, serialise(standing[source])))
+        if source == 'people':
+            for person, away in (('p1', 1.25), ('p2', 0.875)):
+                place = f'/{name}_lab/humans/bodies/{person}/keep_out'
+                message = keep_out(KeepOutState.TRACKING, away, frame='odom')
+                publisher = node.create_publisher(KeepOutOfRos, place, 10)
+                publishers.append((publisher, serialise(message)))
         words = ['--ros-args', '-r', f'__ns:=/{name}_lab']
         processes.append(subprocess.Popen([*command, *words]))
 
@@ -406,4 +436,7 @@ def test_examples_answer(standing):
         'pointing': ('pose_mixture', 'pointing', Float64MultiArray, 1.0),
         'keep_out_grid': ('keep_out', 'keep_out_grid', OccupancyGrid, LYING),
     }
-    check_answers(standing, {name: (python(name), *rest) for name, rest in programs.items()})
+    programs = {name: (python(name), *rest) for name, rest in programs.items()}
+    of_people = [*python('keep_distance'), '--ros-args', '-p', 'people:=true']
+    programs['keep_distance_from_people'] = (of_people, 'people', 'speed_scale', Float64, 0.25)
+    check_answers(standing, programs)

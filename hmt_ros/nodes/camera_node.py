@@ -6,8 +6,9 @@
 
 It publishes `image_raw` and `camera_info`, as sensor data. The stamp of an image is the time at
 which it was read, or is due in the file. Where nothing tells the field of view it is taken to be
-that of a common camera. A file begins once the nodes of the parameter `wait_for` are active or,
-without names, once somebody subscribes to its images; the node ends with it.
+that of a common camera. A device that is unplugged is opened again as soon as it is back. A file
+begins once the nodes of the parameter `wait_for` are active or, without names, once somebody
+subscribes to its images; the node ends with it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,8 +50,8 @@ NAME = 'camera_node'
 FRAME_ID = 'camera_optical_frame'
 # Images a second of a file that does not give its rate.
 _USUAL_RATE = 30.0
-# Time without an image after which a device counts as gone, s.
-_PATIENCE = 5.0
+# Time without an image after which a device counts as gone, and between attempts to open it, s.
+_PATIENCE, _REOPENED = 2.0, 1.0
 _GLANCE, _CONNECTING = 0.05, 0.5
 # Time within which a node that is active is found among the subscribers, s: participants announce
 # themselves every 3 s.
@@ -96,7 +97,8 @@ class Video:
         self._source, self._loop, self._speed = source, loop, speed
         if self.is_file and not Path(source).is_file():
             raise ValueError(f'{source}: no such file; wanted a video, or /dev/video0')
-        self._capture = open_video(Path(source)) if self.is_file else cv2.VideoCapture(int(number))
+        self._device = -1 if self.is_file else int(number)
+        self._capture = open_video(Path(source)) if self.is_file else cv2.VideoCapture(self._device)
         if not self._capture.isOpened():
             raise ValueError(f'{source} can not be opened; wanted a webcam that nobody uses')
         if self.is_file and is_mirrored(display_matrix(Path(source)) or STORED):
@@ -108,13 +110,16 @@ class Video:
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         self._rate = rate if math.isfinite(rate) and rate > 0.0 else _USUAL_RATE
 
-    def images(self, stopped: threading.Event) -> Iterator[tuple[Image, int | None]]:
+    def images(
+        self, stopped: threading.Event, warn: Callable[[str], Any]
+    ) -> Iterator[tuple[Image, int | None]]:
         """The images, (H, W, 3) BGR, and when they are due after the first of a file, ns.
 
-        Raises:
-            ValueError: a device gives none any more.
+        Args:
+            stopped: ends them.
+            warn: takes a line when a device is gone, and when it is back.
         """
-        start, number, seen, again = time.monotonic(), 0, time.monotonic(), 0
+        start, number, seen, again, gone = time.monotonic(), 0, time.monotonic(), 0, False
         while not stopped.is_set():
             read, image = self._capture.read()
             if read:
@@ -123,6 +128,9 @@ class Video:
                     stopped.wait(max(at - time.monotonic(), 0.0))
                 due = round(number * SECOND_NS / self._rate) if self.is_file else None
                 number, seen = number + 1, time.monotonic()
+                if gone:
+                    warn(f'{self._source} is back')
+                    gone = False
                 yield image, due  # type: ignore[misc]
             elif self.is_file and self._loop and number > again:
                 again = number
@@ -130,7 +138,15 @@ class Video:
             elif self.is_file:
                 return
             elif time.monotonic() - seen > _PATIENCE:
-                raise ValueError(f'{self._source} has given no image for {_PATIENCE:g} s')
+                if not gone:
+                    warn(
+                        f'{self._source} has given no image for {_PATIENCE:g} s: is it plugged in, '
+                        'and does nobody else use it? It goes on as soon as it is back'
+                    )
+                    gone = True
+                self._capture.release()
+                stopped.wait(_REOPENED)
+                self._capture.open(self._device)
             else:
                 stopped.wait(_GLANCE)
 
@@ -242,7 +258,7 @@ def _show(
         # The other side may not know yet that it is connected.
         stopped.wait(_CONNECTING)
     camera, messages, count, first = None, RosbagsMessages(), 0, 0
-    for image, due in video.images(stopped):
+    for image, due in video.images(stopped, node.get_logger().warn):
         if due is None or camera is None:
             first = node.get_clock().now().nanoseconds
         stamp = first + (due or 0)

@@ -6,6 +6,7 @@ import itertools
 import struct
 import subprocess
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
@@ -165,7 +166,7 @@ def clip(walk_video, monkeypatch):
         stopped = SimpleNamespace(is_set=lambda: False, wait=waits.append)
         monkeypatch.setattr(camera_node.time, 'monotonic', lambda: 0.0)
         video = camera_node.Video(str(walk_video / 'walk.mp4'), **options)
-        shown = list(itertools.islice(video.images(stopped), count))
+        shown = list(itertools.islice(video.images(stopped, pytest.fail), count))
         video.close()
         return [image for image, _ in shown], [due * 1e-9 for _, due in shown], waits
 
@@ -201,3 +202,44 @@ def test_parameters_are_described_and_checked(ended):
         (line,) = errors.splitlines()
         assert line.startswith('camera_node: ')
         assert text in line
+
+
+class Webcam:
+    """Gives two images, is then unplugged, and gives others when it was opened the third time."""
+
+    def __init__(self, device):
+        self.opened, self.left = [device], 2
+
+    def isOpened(self):  # noqa: N802
+        return True
+
+    def get(self, _):
+        return 30.0
+
+    def read(self):
+        self.left -= 1
+        return (True, np.zeros((4, 6, 3), np.uint8)) if self.left >= 0 else (False, None)
+
+    def release(self):
+        self.left = 0
+
+    def open(self, device):
+        self.opened.append(device)
+        self.left = 2 if len(self.opened) == 3 else 0
+        return self.left > 0
+
+
+def test_a_webcam_that_is_plugged_in_again_goes_on(monkeypatch):
+    monkeypatch.setattr(camera_node.cv2, 'VideoCapture', Webcam)
+    monkeypatch.setattr(camera_node, '_PATIENCE', 0.1)
+    monkeypatch.setattr(camera_node, '_REOPENED', 0.01)
+    video, lines = camera_node.Video('/dev/video2'), []
+    stopped = threading.Event()
+    images = video.images(stopped, lines.append)
+    assert [due for _, due in itertools.islice(images, 4)] == [None] * 4
+    assert video._capture.opened == [2, 2, 2]
+    assert [line.partition(':')[0] for line in lines] == [
+        '/dev/video2 has given no image for 0.1 s', '/dev/video2 is back',
+    ]  # fmt: skip
+    stopped.set()
+    assert list(images) == []
