@@ -35,8 +35,8 @@ class PeopleNode(TrackingNode):
     DEFAULTS = PeopleParameters()
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        # The thread that estimates opens topics, that of the executor closes them.
-        self._opening = threading.Lock()
+        # The thread that estimates opens and uses topics, that of the executor closes them.
+        self._opening = threading.RLock()
         self._left: dict[str, int] = {}
         super().__init__(*args, **options)
 
@@ -54,18 +54,18 @@ class PeopleNode(TrackingNode):
     # Called by the thread that estimates.
 
     def _publish(self, output: Output) -> None:
-        self._open(output.topic)
-        super()._publish(output)
+        with self._opening:
+            self._open(output.topic)
+            super()._publish(output)
 
     def _is_wanted(self, topic: str) -> bool:
-        self._open(topic)
-        return super()._is_wanted(topic)
+        with self._opening:
+            self._open(topic)
+            return super()._is_wanted(topic)
 
     def _open(self, topic: str) -> None:
-        """Opens a topic of a person, once."""
-        with self._opening:
-            if topic in self._outputs:
-                return
+        """Opens a topic of a person, once; the caller holds the lock."""
+        if topic not in self._outputs:
             publisher = self._new_publisher(topic, *published_with(published_topic(topic)))
             publisher.on_activate(None)
             # Others may be going through the old ones.

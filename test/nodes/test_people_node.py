@@ -77,6 +77,20 @@ def test_topics_come_and_go_with_the_people(world, small_camera):
     one.assert_described(PeopleParameters(), 'filter_node')
 
 
+def test_a_detector_that_is_killed_and_started_again(world, small_camera):
+    """Images without detections are named as such, and the person is the same afterwards."""
+    one = world(small_camera)
+    show(one, small_camera, 0, somebody_at(15, 'anna'))
+    one.spin_until(lambda: one.is_heard('humans/bodies/anna/pose_mixture'))
+    for index in range(1, 9):
+        one.send('image', small_camera.image(index))
+    show(one, small_camera, 9, somebody_at(15, 'anna'))
+    assert any(text.startswith('no detections came for the image of') for text in one.warnings())
+    one.spin_until(lambda: one.diagnosis()[2]['faults: no detections'] == '8', 'all images')
+    assert one.found[-1].ids == ['anna']
+    assert len(StubTracker.made) == 1
+
+
 def test_reset_drops_all_tracks(world, small_camera):
     from hmt_msgs.srv import Reset
     from sensor_msgs.msg import RegionOfInterest
